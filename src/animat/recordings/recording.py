@@ -1,0 +1,207 @@
+"""What was measured: spikes on channels, and the stimuli between them, as immutable arrays."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import UnusableData
+from animat.recordings.protocol import Presentation
+
+UNKNOWN = -1
+"""Stands for an unknown electrode or pattern, and pads `Stimuli.electrodes`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """The table of recording channels: row i says where channel i sits.
+
+    A *channel* is a row of this table; its `label` is what the rig called it (a channel number, a sorted unit's
+    number), its `electrode` the site on the array that it reads. The three are never interchangeable.
+
+    Attributes:
+        label: the rig's own name of each channel, unique, shape (channels,), strings.
+        electrode: the electrode each channel reads, `UNKNOWN` where it is not known, shape (channels,).
+        x_um, y_um: the electrode's position in micrometres, NaN where it is not known, shape (channels,).
+    """
+
+    label: np.ndarray[Any, np.dtype[np.str_]]
+    electrode: Int64[np.ndarray, " channels"]
+    x_um: Float64[np.ndarray, " channels"]
+    y_um: Float64[np.ndarray, " channels"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "the channel table", label=np.str_, electrode=np.int64, x_um=np.float64, y_um=np.float64)
+        labels, counts = np.unique(self.label, return_counts=True)
+        if np.any(counts > 1):
+            raise UnusableData(f"channels.label: expected each label once, got {labels[counts > 1][0]!r} twice or more")
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    @property
+    def has_positions(self) -> bool:
+        """Whether every channel's position is known."""
+        return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
+
+
+@dataclass(frozen=True, eq=False)
+class Stimuli:
+    """The table of stimulation pulses, one row a pulse, in the order of time.
+
+    Attributes:
+        time_s: start of each pulse on the recording's clock, shape (stimuli,).
+        frequency_hz: the stimulus frequency it was presented at, NaN where it is not known, shape (stimuli,).
+        pattern: index of the stimulation pattern, `UNKNOWN` where it is not known, shape (stimuli,).
+        electrodes: electrodes pulsed together, padded with `UNKNOWN`, shape (stimuli, electrodes).
+        presentation: number of the presentation each pulse belongs to; a response is read after the last pulse of a
+            presentation, shape (stimuli,).
+    """
+
+    time_s: Float64[np.ndarray, " stimuli"]
+    frequency_hz: Float64[np.ndarray, " stimuli"]
+    pattern: Int64[np.ndarray, " stimuli"]
+    electrodes: Int64[np.ndarray, "stimuli electrodes"]
+    presentation: Int64[np.ndarray, " stimuli"]
+
+    def __post_init__(self) -> None:
+        kinds = {"time_s": np.float64, "frequency_hz": np.float64, "pattern": np.int64, "presentation": np.int64}
+        _freeze(self, "the stimulus table", **kinds, electrodes=np.int64)
+        if self.electrodes.ndim != 2:
+            raise UnusableData(
+                f"stimuli.electrodes: expected shape (stimuli, electrodes), padded with -1, got {self.electrodes.shape}"
+            )
+        _check_times("stimuli.time_s", self.time_s)
+        known = self.frequency_hz[~np.isnan(self.frequency_hz)]
+        if np.any((known <= 0) | np.isinf(known)):
+            bad = known[(known <= 0) | np.isinf(known)][0]
+            raise UnusableData(f"stimuli.frequency_hz: expected positive frequencies in Hz, or NaN, got {bad:g}")
+        if np.any(np.diff(self.presentation) < 0):
+            raise UnusableData("stimuli.presentation: expected numbers that do not fall as time goes on")
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def is_last_of_presentation(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether a pulse is the last one of its presentation, the one whose response is read; shape (stimuli,)."""
+        last = np.ones(len(self), dtype=bool)
+        last[:-1] = self.presentation[1:] != self.presentation[:-1]
+        return last
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One recording of a culture: its spikes, channels and stimuli. Arrays are read-only.
+
+    All times are in seconds on the recording's own clock, which may start below zero; `start_min` places the
+    recording on the culture's clock.
+
+    Attributes:
+        spike_times_s: times of all spikes, rising, shape (spikes,).
+        spike_channels: the row in `channels` of each spike, shape (spikes,).
+        channels: the channel table.
+        stimuli: the stimulus table.
+        sampling_rate_hz: of the raw signal the spikes were detected in, NaN where it is not known.
+        start_s: start of the recording on its own clock.
+        duration_s: from `start_s`; all spikes and stimuli lie within.
+        start_min: start on the culture's clock, in minutes.
+        presentation: how stimuli were presented, None where it is not known.
+        provenance: where the recording came from, words by words.
+
+    Raises:
+        UnusableData: for times that are not finite or do not rise, or rows that no table names.
+    """
+
+    spike_times_s: Float64[np.ndarray, " spikes"]
+    spike_channels: Int64[np.ndarray, " spikes"]
+    channels: Channels
+    stimuli: Stimuli
+    sampling_rate_hz: float
+    start_s: float
+    duration_s: float
+    start_min: float = 0.0
+    presentation: Presentation | None = None
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _freeze(self, "spikes", spike_times_s=np.float64, spike_channels=np.int64)
+        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        _check_times("spike_times_s", self.spike_times_s)
+        outside = (self.spike_channels < 0) | (self.spike_channels >= len(self.channels))
+        if np.any(outside):
+            raise UnusableData(
+                f"spike_channels: expected rows of the channel table (0 to {len(self.channels) - 1}), "
+                f"got {self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
+            )
+        if not (np.isfinite(self.start_s) and np.isfinite(self.duration_s) and self.duration_s >= 0):
+            raise UnusableData(
+                f"start_s, duration_s: expected finite seconds, got {self.start_s:g} and {self.duration_s:g}"
+            )
+        for name, times in (("spike_times_s", self.spike_times_s), ("stimuli.time_s", self.stimuli.time_s)):
+            if len(times) and (times[0] < self.start_s or times[-1] > self.stop_s):
+                raise UnusableData(
+                    f"{name}: expected times within the recording ({self.start_s:g} to {self.stop_s:g} s), "
+                    f"got {times[0]:g} to {times[-1]:g} s"
+                )
+
+    @property
+    def stop_s(self) -> float:
+        """End of the recording on its own clock, in seconds."""
+        return self.start_s + self.duration_s
+
+    def equals(self, other: Recording) -> bool:
+        """Whether every array and every value of the two recordings is the same (NaN equals NaN)."""
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the recording as NWB; the file is complete or absent (see `animat.recordings.formats.nwb`)."""
+        from animat.recordings.formats.nwb import write_nwb
+
+        write_nwb(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Recording:
+        """Read a recording in any format that is known (see `animat.recordings.reading.read_recording`)."""
+        from animat.recordings.reading import read_recording
+
+        return read_recording(path)
+
+
+def _freeze(table: object, name: str, **dtypes: Any) -> None:
+    """Turn the named attributes into read-only arrays of these types and of one length."""
+    length = None
+    for attribute, dtype in dtypes.items():
+        array = np.array(getattr(table, attribute), dtype=dtype)
+        if array.ndim == 0 or (length is not None and len(array) != length):
+            raise UnusableData(
+                f"{attribute}: expected {length if length is not None else 'a column of'} values in {name}, "
+                f"got shape {array.shape}"
+            )
+        length = len(array)
+        array.setflags(write=False)
+        object.__setattr__(table, attribute, array)
+
+
+def _check_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
+    if not np.all(np.isfinite(times_s)):
+        bad = np.count_nonzero(~np.isfinite(times_s))
+        raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
+    if np.any(np.diff(times_s) < 0):
+        raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.shape == b.shape and bool(np.array_equal(a, b, equal_nan=a.dtype.kind == "f"))
+    if isinstance(a, Channels | Stimuli) and type(a) is type(b):
+        return all(_same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    if isinstance(a, float) and isinstance(b, float):
+        return a == b or (np.isnan(a) and np.isnan(b))
+    return bool(a == b)

@@ -1,0 +1,52 @@
+"""Files that are either complete or absent: written beside their place, then renamed into it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from animat.errors import InvalidFile
+
+
+@contextmanager
+def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success rename it to `path`, on any error remove it.
+
+    Whatever stood at `path` stays whole until the new file is complete and on disk, also when the disk fills up or
+    the process is killed. Missing parent folders are made.
+
+    Raises:
+        InvalidFile: if the file cannot be written (no permission, a full disk); the old file is untouched.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=f".partial{path.suffix}")
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error
+    os.close(handle)
+    beside = Path(name)
+    try:
+        yield beside
+        with beside.open("rb") as file:
+            os.fsync(file.fileno())
+        beside.chmod(0o666 & ~_umask())
+        beside.replace(path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise InvalidFile(
+            f"{path}: cannot be written: {error.strerror or error}; what stood there before is unchanged"
+        ) from error
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    # The only way to read the umask is to set it; mkstemp ignores it and makes files private.
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

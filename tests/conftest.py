@@ -1,0 +1,17 @@
+"""Fixtures that every test may use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real recordings beside the project, or where ANIMAT_REAL_DATA points; skips where it is absent."""
+    folder = Path(os.environ.get("ANIMAT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings at {folder}: set ANIMAT_REAL_DATA to the folder that holds them")
+    return folder
