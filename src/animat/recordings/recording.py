@@ -105,7 +105,8 @@ class Recording:
 
     Attributes:
         spike_times_s: times of all spikes, rising, shape (spikes,).
-        spike_channels: the row in `channels` of each spike, shape (spikes,).
+        spike_channels: the row in `channels` of each spike, shape (spikes,). Spikes given at one and the same time
+            are put in the order of their channels, so that one set of spikes has one order.
         channels: the channel table.
         stimuli: the stimulus table.
         sampling_rate_hz: of the raw signal the spikes were detected in, NaN where it is not known.
@@ -140,6 +141,7 @@ class Recording:
                 f"spike_channels: expected rows of the channel table (0 to {len(self.channels) - 1}), "
                 f"got {self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
             )
+        self._order_simultaneous_spikes()
         if not (np.isfinite(self.start_s) and np.isfinite(self.duration_s) and self.duration_s >= 0):
             raise UnusableData(
                 f"start_s, duration_s: expected finite seconds, got {self.start_s:g} and {self.duration_s:g}"
@@ -150,6 +152,14 @@ class Recording:
                     f"{name}: expected times within the recording ({self.start_s:g} to {self.stop_s:g} s), "
                     f"got {times[0]:g} to {times[-1]:g} s"
                 )
+
+    def _order_simultaneous_spikes(self) -> None:
+        # Files keep spikes by channel: without one order for ties, a recording would not read back equal.
+        ties_fall = (np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)
+        if np.any(ties_fall):
+            channels = self.spike_channels[np.lexsort((self.spike_channels, self.spike_times_s))]
+            channels.setflags(write=False)
+            object.__setattr__(self, "spike_channels", channels)
 
     @property
     def stop_s(self) -> float:
