@@ -1,0 +1,147 @@
+"""From a response to a motor command: thresholds at percentiles of the responses, or a line between their ends."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any, TypeAlias, final
+
+import numpy as np
+
+from animat.errors import InvalidArgument
+
+N_PERCENTILES = 11
+"""P0 (the smallest response), P10, ..., P90, P100 (the largest): what every mapping is given."""
+
+Numbers: TypeAlias = Any
+"""A number, or a numpy or JAX array of numbers: the commands come back as the same kind, in the same shape."""
+
+
+class Mapping(abc.ABC):
+    """Turns a response x into a motor command u in [-1, 1], given the percentiles of the non-burst responses.
+
+    The same code runs on numpy arrays and on JAX arrays, also under `jit` and `vmap`, and needs no JAX to be loaded.
+    Implementations are frozen dataclasses: two mappings are equal if they compute the same.
+    """
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """The name that `mapping_named` knows it by; all that a file needs to hold to give it back."""
+
+    @abc.abstractmethod
+    def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
+        """The motor command that answers the response `x`.
+
+        Args:
+            x: firing rate per channel in the response window, in Hz, any shape.
+            percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, rising,
+                shape (11,).
+
+        Returns:
+            u in [-1, 1], never falling as x rises, in the shape of `x`.
+        """
+
+
+@final
+@dataclass(frozen=True)
+class Thresholds(Mapping):
+    """Commands in steps, cut at percentiles of the responses; a response on a threshold counts as above it.
+
+        1 threshold:   u = +1 if x >= P50, else -1
+        9 thresholds:  P10 ... P90 cut the axis into ten; u = -1.0, -0.8, -0.6, -0.4, -0.2, +0.2, ..., +1.0
+
+    There is no zero among the ten: the published end points and step leave it out. Where percentiles are tied (many
+    equal responses), a response on the tie passes all of them at once, and the commands between are never given.
+
+    Args:
+        count: 1 or 9.
+
+    Raises:
+        InvalidArgument: for any other count.
+
+    Source: Sawada et al. 2022, the mappings with 1 and 9 thresholds.
+    """
+
+    count: int
+
+    def __post_init__(self) -> None:
+        if isinstance(self.count, bool) or self.count not in (1, 9):
+            raise InvalidArgument(f"count: expected 1 or 9 thresholds, got {self.count!r}")
+
+    @property
+    def name(self) -> str:
+        """`1-threshold` or `9-thresholds`."""
+        return "1-threshold" if self.count == 1 else f"{self.count}-thresholds"
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """The commands it can give, rising; there is one more than thresholds."""
+        half = (self.count + 1) // 2
+        return tuple(n / half for n in range(-half, half + 1) if n != 0)
+
+    @property
+    def percentile_indices(self) -> tuple[int, ...]:
+        """Which of the eleven percentiles are the thresholds, rising."""
+        return (5,) if self.count == 1 else tuple(range(1, 10))
+
+    def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
+        """The level between the thresholds that `x` falls in (see `Mapping.command`)."""
+        half = (self.count + 1) // 2
+        # Times 1 before adding: the sum of two numpy booleans would be a boolean.
+        n_passed = sum(1 * (x >= percentiles[i]) for i in self.percentile_indices)
+        # The middle threshold is passed by a step of two, over the zero. Dividing whole numbers rounds each level
+        # to the float nearest to it, so numpy and JAX give the same ones.
+        return (n_passed - half + (x >= percentiles[5])) / half
+
+
+@final
+@dataclass(frozen=True)
+class Linear(Mapping):
+    """Commands in proportion to the response, between the smallest and the largest one measured.
+
+        u = clip((2 x - (a + b)) / (a - b), -1, 1),    a = P100, b = P0
+
+    Where all measured responses are equal (a = b) there is no scale to read a response on, and u = 0.
+
+    Source: prepared by the authors of Sawada et al. 2022 and left out of the paper.
+    """
+
+    @property
+    def name(self) -> str:
+        """`linear`."""
+        return "linear"
+
+    def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
+        """The place of `x` between the ends of the measured responses (see `Mapping.command`)."""
+        smallest, largest = percentiles[0], percentiles[N_PERCENTILES - 1]
+        span = largest - smallest
+        # Clipped before dividing: the ends are then exactly -1 and +1, and a span of zero leaves 0 / 1.
+        xp = _namespace(x, percentiles)
+        return xp.clip(2 * x - (largest + smallest), -span, span) / (span + (span == 0))
+
+
+_KNOWN: dict[str, Mapping] = {mapping.name: mapping for mapping in (Thresholds(1), Thresholds(9), Linear())}
+
+MAPPING_NAMES: tuple[str, ...] = tuple(_KNOWN)
+"""The names that `mapping_named` knows."""
+
+
+def mapping_named(name: str) -> Mapping:
+    """The mapping called `1-threshold`, `9-thresholds` or `linear`.
+
+    Raises:
+        InvalidArgument: for any other name.
+    """
+    try:
+        return _KNOWN[name]
+    except (KeyError, TypeError):
+        raise InvalidArgument(f"mapping: expected one of {', '.join(MAPPING_NAMES)}, got {name!r}") from None
+
+
+def _namespace(*arrays: Numbers) -> Any:
+    """numpy, or the array library of the first array that is of another."""
+    for array in arrays:
+        if not isinstance(array, np.ndarray | np.generic) and hasattr(array, "__array_namespace__"):
+            return array.__array_namespace__()
+    return np

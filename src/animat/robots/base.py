@@ -1,0 +1,123 @@
+"""What a robot is: a body with a task, as pure functions of its state and as data."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, final
+
+from jaxtyping import Bool, Float
+
+from animat.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from jax import Array
+
+State = TypeVar("State")
+"""A robot's state: a NamedTuple of float32 scalars; batches of robots are `jax.vmap` outside."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """One number of an observation.
+
+    Attributes:
+        name: what it is, `cart_position`.
+        unit: what it is measured in, `m`.
+        scale: how large it usually is, in that unit; a learner divides by it.
+        low, high: bounds in that unit that no observation of an episode passes, the last one included.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    low: float = -math.inf
+    high: float = math.inf
+
+
+class Robot(abc.ABC, Generic[State]):
+    """A body with a task, driven by one motor command u in [-1, 1] an iteration.
+
+    Implementations are frozen dataclasses whose fields are all parameters, with units in their names: they compare,
+    hash (so they are static under `jax.jit`) and go to JSON. JAX is imported when the robot first moves, not before:
+    a robot can be named, compared and stored without it.
+
+    `terminated` says that the task ended (fell, arrived). That an episode reached `episode_limit` is truncation;
+    whoever runs the episode counts, and a robot never says so.
+    """
+
+    name: ClassVar[str]
+    """What `animat.robots.robot_named` knows it by."""
+
+    noise_size: ClassVar[int]
+    """How many uniform random numbers in [0, 1) one iteration consumes."""
+
+    episode_limit: int
+    """Iterations after which an episode is cut off."""
+
+    @property
+    @abc.abstractmethod
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What the numbers of an observation are, in order."""
+
+    @abc.abstractmethod
+    def reset(self, key: Array) -> State:
+        """The state at the start of an episode."""
+
+    @abc.abstractmethod
+    def advance(
+        self, uniforms: Float[Array, " noise_size"], state: State, u: Float[Array, ""]
+    ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
+        """One iteration, with its random numbers given: no random generator runs inside.
+
+        Args:
+            uniforms: random numbers in [0, 1), shape (noise_size,).
+            state: before the iteration.
+            u: the motor command, in [-1, 1].
+
+        Returns:
+            the state after the iteration, the reward in the task's own units, and whether the task ended.
+        """
+
+    @abc.abstractmethod
+    def observe(self, state: State) -> Float[Array, " observations"]:
+        """What a controller sees of `state`, in the units of `quantities`, float32, shape (observations,)."""
+
+    @final
+    def step(self, key: Array, state: State, u: Float[Array, ""]) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
+        """One iteration, its random numbers drawn from `key`; arguments and results as in `advance`."""
+        import jax
+
+        return self.advance(jax.random.uniform(key, (self.noise_size,)), state, u)
+
+    def caveats(self) -> tuple[str, ...]:
+        """What a user should know before trusting results with these parameters, a sentence each; mostly nothing."""
+        return ()
+
+
+def check_parameters(robot: Any, **allowed: tuple[float, float]) -> None:
+    """Turn a robot's parameters into the plain numbers they are declared as, and check them.
+
+    Args:
+        robot: a frozen dataclass; fields declared `int` become int, all others float.
+        allowed: the smallest and the largest value of a field, both allowed; others need only be finite.
+
+    Raises:
+        InvalidArgument: for a parameter that is no finite number, or outside what is allowed.
+    """
+    for field in dataclasses.fields(robot):
+        value = getattr(robot, field.name)
+        is_whole = field.type in ("int", int)
+        low, high = allowed.get(field.name, (-math.inf, math.inf))
+        expected = f"a {'whole' if is_whole else 'finite'} number" + (
+            f" from {low:g} to {high:g}" if field.name in allowed else ""
+        )
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        is_number = math.isfinite(number) and not isinstance(value, bool | str)
+        if not is_number or not low <= number <= high or (is_whole and number != int(number)):
+            raise InvalidArgument(f"{robot.name}: {field.name}: expected {expected}, got {value!r}")
+        object.__setattr__(robot, field.name, int(number) if is_whole else number)

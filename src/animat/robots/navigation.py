@@ -1,0 +1,148 @@
+"""Navigation: steer a robot that never stops to a goal in a walled arena."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, final
+
+from jaxtyping import Bool, Float
+
+from animat.robots.base import Quantity, Robot, check_parameters
+
+if TYPE_CHECKING:
+    from jax import Array
+
+_TINY, _HUGE = 1e-9, 1e9
+
+
+class NavigationState(NamedTuple):
+    """Where the robot is and where it looks, seen from above: x to the right, y down from the top-left corner.
+
+    The heading is 0 to the right and grows clockwise, as y points down; it lies in (-pi, pi].
+    """
+
+    x_m: Float[Array, ""]
+    y_m: Float[Array, ""]
+    heading_rad: Float[Array, ""]
+
+
+@final
+@dataclass(frozen=True)
+class Navigation(Robot[NavigationState]):
+    """A robot that turns by the command, then moves ahead; 50 at the goal, else a small cost that falls as it nears.
+
+        heading += turn_rad u,    position += stride_m (cos heading, sin heading), clipped to the arena
+        reward   = reward_goal if d <= R (and the episode ends), else R / d - 1
+
+    with d the distance to the goal after the move and R the goal's radius. An episode starts in the top-left corner,
+    facing right.
+
+    The paper prints 20 iterations an episode, in which the goal cannot be reached (`fewest_iterations_to_goal` is 36);
+    the default here is 100. `Navigation.as_printed()` is the paper taken at its word, and its `caveats` say so.
+
+    Attributes:
+        turn_rad: turn of one iteration at u = 1.
+        goal_x_m, goal_y_m: from the top-left corner, to the right and down.
+
+    Raises:
+        InvalidArgument: for a parameter that is not finite or has no meaning, or a goal outside the arena.
+
+    Source: Sawada et al. 2022, the navigation task.
+    """
+
+    arena_width_m: float = 1.0
+    arena_height_m: float = 1.0
+    stride_m: float = 0.025
+    turn_rad: float = math.pi / 10
+    goal_x_m: float = 0.7
+    goal_y_m: float = 0.7
+    goal_radius_m: float = 0.1
+    reward_goal: float = 50.0
+    episode_limit: int = 100
+
+    name: ClassVar[str] = "navigation"
+    noise_size: ClassVar[int] = 0
+
+    def __post_init__(self) -> None:
+        positive = (_TINY, _HUGE)
+        check_parameters(self, arena_width_m=positive, arena_height_m=positive)
+        check_parameters(
+            self,
+            stride_m=positive,
+            # One turn never passes half a circle, so one correction brings the heading back into (-pi, pi].
+            turn_rad=(0.0, math.pi),
+            goal_x_m=(0.0, self.arena_width_m),
+            goal_y_m=(0.0, self.arena_height_m),
+            goal_radius_m=positive,
+            episode_limit=(1, _HUGE),
+        )
+
+    @classmethod
+    def as_printed(cls) -> Navigation:
+        """The paper to the letter: 20 iterations an episode, too few to reach the goal."""
+        return cls(episode_limit=20)
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Position from the top-left corner, and heading."""
+        # The scales are one metre and one radian for an arena of a metre; the heading is an angle and jumps at pi.
+        return (
+            Quantity("x", "m", self.arena_width_m, 0.0, self.arena_width_m),
+            Quantity("y", "m", self.arena_height_m, 0.0, self.arena_height_m),
+            Quantity("heading", "rad", math.pi, -math.pi, math.pi),
+        )
+
+    @property
+    def fewest_iterations_to_goal(self) -> int:
+        """Iterations of a straight run from the start to the goal's edge: no episode can reach it in fewer."""
+        distance_m = max(0.0, math.hypot(self.goal_x_m, self.goal_y_m) - self.goal_radius_m)
+        # Off by rounding must not add an iteration, nor take one away from a goal exactly n strides away.
+        return max(1, math.ceil(distance_m / self.stride_m - 1e-9))
+
+    @property
+    def goal_reachable(self) -> bool:
+        """Whether an episode is long enough for a straight run to the goal; if not, no policy can reach it."""
+        return self.fewest_iterations_to_goal <= self.episode_limit
+
+    def reset(self, key: Array) -> NavigationState:
+        """In the top-left corner, facing right; `key` is not used."""
+        import jax.numpy as jnp
+
+        zero = jnp.zeros((), jnp.float32)
+        return NavigationState(zero, zero, zero)
+
+    def advance(
+        self, uniforms: Float[Array, " noise_size"], state: NavigationState, u: Float[Array, ""]
+    ) -> tuple[NavigationState, Float[Array, ""], Bool[Array, ""]]:
+        """One turn and one stride (see `Robot.advance` and the class)."""
+        import jax.numpy as jnp
+
+        turned = state.heading_rad + self.turn_rad * u
+        heading = jnp.where(turned > math.pi, turned - 2 * math.pi, turned)
+        heading = jnp.where(turned <= -math.pi, turned + 2 * math.pi, heading)
+        x = jnp.clip(state.x_m + self.stride_m * jnp.cos(heading), 0.0, self.arena_width_m)
+        y = jnp.clip(state.y_m + self.stride_m * jnp.sin(heading), 0.0, self.arena_height_m)
+
+        distance = jnp.sqrt((x - self.goal_x_m) ** 2 + (y - self.goal_y_m) ** 2)
+        terminated = distance <= self.goal_radius_m
+        # At the goal the distance may be zero; the larger of the two keeps R / d finite where it is not used.
+        cost = self.goal_radius_m / jnp.maximum(distance, self.goal_radius_m) - 1
+        reward = jnp.where(terminated, self.reward_goal, cost).astype(x.dtype)
+        return NavigationState(x, y, heading), reward, terminated
+
+    def observe(self, state: NavigationState) -> Float[Array, " observations"]:
+        """Position (m, m) from the top-left corner, and heading (rad)."""
+        import jax.numpy as jnp
+
+        return jnp.stack(state)
+
+    def caveats(self) -> tuple[str, ...]:
+        """Says so where the goal cannot be reached within an episode."""
+        if self.goal_reachable:
+            return ()
+        reach_m = self.episode_limit * self.stride_m
+        return (
+            f"navigation: the goal cannot be reached: {self.episode_limit} iterations of {self.stride_m:g} m cover "
+            f"{reach_m:g} m, and a straight run to its edge takes {self.fewest_iterations_to_goal} iterations",
+        )
