@@ -37,7 +37,7 @@ def robot_named(name: str, **parameters: float) -> Robot[Any]:
 
 
 def robot_to_dict(robot: Robot[Any]) -> dict[str, Any]:
-    """The robot as JSON data, all parameters named: `{"name": "cartpole", "parameters": {"pole_mass_kg": 0.055, ...}}`."""
+    """The robot as JSON data, all parameters named: `{"name": "cartpole", "parameters": {"force_n": 1.0, ...}}`."""
     return {"name": robot.name, "parameters": dataclasses.asdict(robot)}  # type: ignore[call-overload]
 
 
