@@ -1,0 +1,161 @@
+"""The post-stimulus time histogram: when after a stimulus the culture fires, and how it fires without one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from animat.errors import InvalidArgument
+from animat.recordings.recording import Recording
+
+# Spikes before a stimulus count as spontaneous from 100 ms after the previous one (the longest direct responses known
+# to us are over by then; a longer window moves it), until 20 ms before the next (filters smear artefacts backwards),
+# 200 ms at most.
+_SETTLED_MS = 100.0
+_ARTEFACT_MS = 20.0
+_QUIET_MS = 200.0
+_ARTEFACT_AFTER_MS = 2.0
+_SUSTAINED_BINS = 3
+_BINS_MS = (1.0, 2.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PostStimulusHistogram:
+    """Spikes of all channels by their time from the stimulus, summed over stimuli.
+
+    Attributes:
+        edges_ms: of the bins, from the stimulus, shape (bins + 1,).
+        count: spikes in each bin, over all stimuli, shape (bins,).
+        n_stimuli: stimuli that it is summed over.
+        n_channels: channels that it is summed over.
+    """
+
+    edges_ms: Float64[np.ndarray, " edges"]
+    count: Int64[np.ndarray, " bins"]
+    n_stimuli: int
+    n_channels: int
+
+    @property
+    def rate_hz(self) -> Float64[np.ndarray, " bins"]:
+        """Mean firing rate per channel in each bin, in Hz: count / (stimuli x bin width x channels)."""
+        exposure_s = self.n_stimuli * self.n_channels * np.diff(self.edges_ms) * 1e-3
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.count / exposure_s, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class ResponseTime:
+    """When after the stimulus the culture answers.
+
+    Attributes:
+        start_ms, end_ms: the first stretch of time in which it fires clearly above its spontaneous rate.
+        searched_ms: how far the search went.
+    """
+
+    start_ms: float
+    end_ms: float
+    searched_ms: float
+
+
+def post_stimulus_histogram(
+    recording: Recording,
+    from_ms: float = -20.0,
+    to_ms: float = 50.0,
+    bin_ms: float = 1.0,
+    stimuli: Bool[np.ndarray, " stimuli"] | None = None,
+) -> PostStimulusHistogram:
+    """Count spikes by their time from the stimulus.
+
+    Args:
+        recording: the spikes and stimuli.
+        from_ms, to_ms: the span, from the stimulus; negative is before it. It grows to a whole number of bins.
+        bin_ms: width of the bins, which are half-open and compared as in `count_spikes`, so that bins inside a window
+            add up to the spikes of that window.
+        stimuli: which pulses to take, shape (stimuli,); None for those that end a presentation.
+
+    Raises:
+        InvalidArgument: for a span that is empty, or bins that are not positive.
+    """
+    if not (math.isfinite(from_ms) and math.isfinite(to_ms) and from_ms < to_ms):
+        raise InvalidArgument(f"from_ms, to_ms: expected from_ms < to_ms, got {from_ms:g} and {to_ms:g}")
+    if not (math.isfinite(bin_ms) and bin_ms > 0):
+        raise InvalidArgument(f"bin_ms: expected a width above 0 ms, got {bin_ms:g}")
+    table = recording.stimuli
+    times_s = table.time_s[table.is_last_of_presentation if stimuli is None else stimuli]
+    # The small number keeps 70.000000001 bins from becoming 71.
+    n_bins = max(1, math.ceil((to_ms - from_ms) / bin_ms - 1e-9))
+    edges_ms = from_ms + bin_ms * np.arange(n_bins + 1)
+    spikes_before = [np.searchsorted(recording.spike_times_s, times_s + edge * 1e-3).sum() for edge in edges_ms]
+    return PostStimulusHistogram(
+        edges_ms, np.diff(np.array(spikes_before, dtype=np.int64)), len(times_s), len(recording.channels)
+    )
+
+
+def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float, float]:
+    """Spikes per second, on all channels together, in the quiet stretches before stimuli; and their total time in s.
+
+    Quiet is what lies 100 ms or more after the previous pulse, and 20 to 220 ms before the next one. At 10 Hz and
+    above nothing is: such stimuli do not count, since what comes before them is the response to the previous one.
+
+    Args:
+        recording: the spikes and stimuli.
+        after_ms: quiet begins this long after the previous pulse where that is more than 100 ms.
+
+    Returns:
+        The rate, NaN without quiet time, and the quiet time.
+    """
+    times_s = recording.stimuli.time_s
+    if not len(times_s):
+        return float("nan"), 0.0
+    settled_s = np.concatenate([[recording.start_s], times_s[:-1] + max(_SETTLED_MS, after_ms) * 1e-3])
+    to_s = times_s - _ARTEFACT_MS * 1e-3
+    from_s = np.maximum(np.maximum(settled_s, recording.start_s), to_s - _QUIET_MS * 1e-3)
+    quiet = to_s > from_s
+    quiet_s = float(np.sum((to_s - from_s)[quiet]))
+    spikes = np.searchsorted(recording.spike_times_s, to_s[quiet])
+    spikes -= np.searchsorted(recording.spike_times_s, from_s[quiet])
+    return (float(spikes.sum()) / quiet_s if quiet_s > 0 else float("nan")), quiet_s
+
+
+def find_response(recording: Recording, up_to_ms: float = 500.0) -> ResponseTime | None:
+    """When the culture first fires above its spontaneous rate after a stimulus; None where it does not, or is unknown.
+
+    The first stretch, from 2 ms on, that begins with three successive bins above b + 3 sqrt(b), b the spikes expected
+    spontaneously in a bin, and ends before three successive bins that are not. Bins are 1 ms wide, or up to 10 ms where
+    spikes are few. Only stimuli are used that no other pulse follows within the search; where there are few such, the
+    search is shortened to the upper quarter of the intervals.
+    """
+    table = recording.stimuli
+    rate_hz, _ = spontaneous_rate(recording)
+    read = table.is_last_of_presentation
+    if not read.any() or math.isnan(rate_hz):
+        return None
+    gap_ms = 1e3 * np.append(np.diff(table.time_s), np.inf)
+    gap_ms = np.minimum(gap_ms, 1e3 * (recording.stop_s - table.time_s))
+    if int(np.count_nonzero(read & (gap_ms >= up_to_ms))) < min(20, int(np.count_nonzero(read))):
+        up_to_ms = float(np.quantile(gap_ms[read], 0.75))
+    chosen = read & (gap_ms >= up_to_ms)
+    per_ms = rate_hz * 1e-3 * np.count_nonzero(chosen)
+    bin_ms = next((width for width in _BINS_MS if width * per_ms >= 5), _BINS_MS[-1])
+    n_bins = int((up_to_ms - _ARTEFACT_AFTER_MS) // bin_ms)
+    if n_bins < _SUSTAINED_BINS:
+        return None
+    to_ms = _ARTEFACT_AFTER_MS + n_bins * bin_ms
+    histogram = post_stimulus_histogram(recording, _ARTEFACT_AFTER_MS, to_ms, bin_ms, chosen)
+    expected = per_ms * bin_ms
+    above = histogram.count > expected + 3 * math.sqrt(max(expected, 1.0))
+    begins = np.flatnonzero(_successive(above))
+    if not len(begins):
+        return None
+    ends = np.flatnonzero(_successive(~above[begins[0] :]))
+    last = begins[0] + ends[0] if len(ends) else n_bins
+    return ResponseTime(float(histogram.edges_ms[begins[0]]), float(histogram.edges_ms[last]), to_ms)
+
+
+def _successive(flags: Bool[np.ndarray, " bins"]) -> Bool[np.ndarray, " starts"]:
+    """Whether a flag and the ones after it, three in all, are set."""
+    n = max(len(flags) - _SUSTAINED_BINS + 1, 0)
+    return np.asarray(np.logical_and.reduce([flags[i : i + n] for i in range(_SUSTAINED_BINS)]), dtype=bool)

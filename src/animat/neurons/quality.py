@@ -1,0 +1,250 @@
+"""What makes responses doubtful: every finding on a recording's responses, with what it means and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool
+
+from animat.neurons.bursts import BurstSeparation
+from animat.neurons.conditions import NO_CONDITION, Assignment
+from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
+from animat.recordings.findings import Finding
+from animat.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from animat.neurons.responses import Responses
+
+FEW_SAMPLES = 30
+"""Below this many non-burst responses of a condition, its distribution is little more than a guess."""
+LOW_SEPARABILITY = 0.6
+LOW_VALLEY = 0.5
+MANY_BURSTS = 0.25
+SMALL_DIFFERENCE = 0.1
+"""Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
+
+_WINDOW_PARTS = 8
+
+
+def findings_on(
+    responses: Responses,
+    recording: Recording,
+    assignment: Assignment,
+    bursts: BurstSeparation,
+    inside: Bool[np.ndarray, " stimuli"],
+) -> tuple[Finding, ...]:
+    """Everything there is to say about how far responses can be trusted.
+
+    Args:
+        responses: the responses.
+        recording: what they come from.
+        assignment: the condition of every pulse.
+        bursts: the burst separation.
+        inside: whether a pulse's window ends within the recording, shape (stimuli,).
+    """
+    if not len(recording.stimuli):
+        return (
+            Finding(
+                "no-stimuli",
+                "refuse",
+                "the recording holds no stimuli, so there is no response to learn from: "
+                "give the stimuli's times with the spikes",
+                0.0,
+            ),
+        )
+    return (
+        *_left_out(recording, assignment, inside),
+        *_timing(responses, recording),
+        *_conditions(responses),
+        *_bursts(responses, bursts),
+        *_difference(responses),
+    )
+
+
+def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndarray, " stimuli"]) -> Iterator[Finding]:
+    read = recording.stimuli.is_last_of_presentation
+    n_read = int(np.count_nonzero(read))
+    without = int(np.count_nonzero(read & (assignment.condition == NO_CONDITION)))
+    if without == n_read:
+        yield Finding(
+            "no-condition",
+            "refuse",
+            f"none of the {n_read} stimuli belongs to a condition: choose other conditions "
+            "(by frequency, interval, electrode or pattern)",
+            float(without),
+        )
+    elif without:
+        yield Finding(
+            "no-condition",
+            "note",
+            f"{without} of {n_read} stimuli belong to no condition and are left out",
+            float(without),
+        )
+    late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
+    if late:
+        yield Finding(
+            "window-past-end",
+            "warning",
+            f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out",
+            float(late),
+        )
+
+
+def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
+    start_ms, end_ms = responses.window_ms
+    stimuli = recording.stimuli
+    read = stimuli.is_last_of_presentation
+    gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
+    # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
+    overlapping = int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6)))
+    if overlapping:
+        yield Finding(
+            "stimuli-too-close",
+            "warning",
+            f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
+            f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window",
+            float(overlapping),
+        )
+    rate_hz, quiet_s = spontaneous_rate(recording, after_ms=end_ms)
+    response = find_response(recording)
+    if quiet_s * 1e3 < 10 * (end_ms - start_ms):
+        yield Finding(
+            "window-not-tested",
+            "note",
+            "stimuli follow each other too fast to see how the culture fires without them (no 100 ms of quiet before a "
+            "stimulus), so it is not known whether the window holds a response",
+        )
+        return
+    parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
+    # The busiest part is left out on both sides: an artefact that reaches into the window is not a response.
+    spikes = int(parts.count.sum() - parts.count.max())
+    expected = rate_hz * (end_ms - start_ms) * 1e-3 * parts.n_stimuli * (1 - 1 / _WINDOW_PARTS)
+    per_stimulus = expected / max(parts.n_stimuli, 1)
+    elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
+    if spikes <= expected:
+        yield Finding(
+            "dead-window",
+            "refuse",
+            f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes a "
+            f"stimulus (without its busiest eighth, where an artefact may be) against {per_stimulus:.2f} in as much "
+            f"time before the stimulus"
+            + (
+                f"; the response is at {response.start_ms:g} to {response.end_ms:g} ms: "
+                f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
+                if response
+                else "; no response was found elsewhere either: these stimuli do not make the culture fire"
+            ),
+            spikes / expected if expected else 0.0,
+        )
+    elif response and elsewhere:
+        yield Finding(
+            "response-elsewhere",
+            "warning",
+            f"the response is at {response.start_ms:g} to {response.end_ms:g} ms after a stimulus, outside the window "
+            f"from {start_ms:g} to {end_ms:g} ms: use --window-ms {response.start_ms:g} {response.end_ms:g}",
+            response.start_ms,
+        )
+    elif response:
+        yield Finding(
+            "response-time",
+            "note",
+            f"the culture fires above its spontaneous rate from {response.start_ms:g} to {response.end_ms:g} ms after "
+            f"a stimulus; the window is {start_ms:g} to {end_ms:g} ms",
+            response.start_ms,
+        )
+
+
+def _conditions(responses: Responses) -> Iterator[Finding]:
+    for i, condition in enumerate(responses.conditions):
+        n_all = int(np.count_nonzero(responses.condition == i))
+        n = len(responses.rates_of(i))
+        if not n:
+            what = "no stimulus" if not n_all else f"{n_all} stimuli, all of them bursts"
+            yield Finding(
+                "empty-condition",
+                "refuse",
+                f"condition {condition.label}: {what}; leave it out or choose other conditions",
+                0.0,
+            )
+        elif n < FEW_SAMPLES:
+            yield Finding(
+                "few-samples",
+                "warning",
+                f"condition {condition.label}: {n} non-burst responses; a distribution takes {FEW_SAMPLES} or more",
+                float(n),
+            )
+
+
+def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
+    n_bursts = int(np.count_nonzero(responses.is_burst))
+    if not n_bursts:
+        return
+    share = n_bursts / len(responses)
+    dropped = f"{n_bursts} of {len(responses)} responses ({100 * share:.1f} %) are set apart as bursts"
+    if bursts.separability < LOW_SEPARABILITY or bursts.valley < LOW_VALLEY:
+        yield Finding(
+            "bursts-not-separable",
+            "warning",
+            f"the burst separation separates nothing: the ratios of active channels form no two groups (separability "
+            f"{bursts.separability:.2f}, where one bell-shaped group gives 0.64; valley between the groups "
+            f"{bursts.valley:.2f} of 1), yet {dropped}: use --burst-threshold 1 to keep them",
+            bursts.separability,
+        )
+    elif share > MANY_BURSTS:
+        yield Finding(
+            "many-bursts",
+            "warning",
+            f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest stimuli that "
+            "failed: look at the panels of burst separation, and use --burst-threshold 1 to keep all",
+            share,
+        )
+    else:
+        yield Finding(
+            "bursts",
+            "note",
+            f"{dropped} (above {responses.threshold:.3f} of the channels active; separability "
+            f"{bursts.separability:.2f}, valley {bursts.valley:.2f})",
+            share,
+        )
+
+
+def _difference(responses: Responses) -> Iterator[Finding]:
+    shares = responses.shares_above_median()
+    # A share of three responses says nothing: conditions with few samples count only where there are no others.
+    n = np.array([len(responses.rates_of(i)) for i in range(len(shares))])
+    enough = n >= FEW_SAMPLES if np.count_nonzero(n >= FEW_SAMPLES) >= 2 else n > 0
+    known = [(c.label, float(p)) for c, p, ok in zip(responses.conditions, shares, enough, strict=True) if ok]
+    if len(known) < 2:
+        if len(responses.conditions) == 1:
+            yield Finding(
+                "one-condition",
+                "warning",
+                "there is one condition only, so an agent has nothing to choose: to train, sort the stimuli by "
+                "frequency, interval, electrode or pattern",
+                1.0,
+            )
+        return
+    lowest, highest = min(known, key=lambda item: item[1]), max(known, key=lambda item: item[1])
+    spread = highest[1] - lowest[1]
+    listed = ", ".join(f"{p:.2f} for {label}" for label, p in known[:8]) + (", ..." if len(known) > 8 else "")
+    reach = (
+        f"with one threshold the choice moves the mean command from {2 * lowest[1] - 1:+.2f} to "
+        f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
+    )
+    if spread < SMALL_DIFFERENCE:
+        yield Finding(
+            "no-difference",
+            "warning",
+            f"the conditions hardly differ: P(x >= P50) is {listed}; {reach}, the rest is chance, so no policy can "
+            "steer a robot much better than at random: stimulate in ways that differ more",
+            spread,
+        )
+    else:
+        yield Finding(
+            "difference",
+            "note",
+            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance",
+            spread,
+        )

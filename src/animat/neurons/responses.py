@@ -1,0 +1,156 @@
+"""The culture's responses: what a stimulus of each condition makes it do, one row a stimulus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from animat.errors import Mismatch, UnusableData
+from animat.neurons.bursts import separate_bursts
+from animat.neurons.conditions import NO_CONDITION, Condition, Conditions, default_conditions
+from animat.neurons.quality import findings_on
+from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, count_active_channels, count_spikes
+from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
+from animat.recordings.recording import Recording
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Responses to the stimuli of one recording, in the order of time. Arrays are read-only.
+
+    Attributes:
+        condition: index into `conditions`, shape (responses,).
+        rate_hz: x, spikes in the window per second and channel, shape (responses,).
+        active_ratio: share of channels with at least one spike in the window, shape (responses,).
+        is_burst: whether `active_ratio` is above `threshold`, shape (responses,).
+        conditions: what the agent can choose from, in the order of their index.
+        window_ms: start and end of the window, after the last pulse of each presentation.
+        n_channels: channels that x is a mean over.
+        threshold: of the active ratio, by Otsu's method unless it was given; NaN without responses.
+        separability: between-class over total variance of the active ratio (see `animat.neurons.bursts`).
+        presentation: how stimuli were presented, None where it is not known.
+        start_min: start of the recording on the culture's clock, in minutes.
+        findings: what was noticed about them.
+
+    Raises:
+        Mismatch: for columns of different lengths, or a condition that is not in the list.
+    """
+
+    condition: Int64[np.ndarray, " responses"]
+    rate_hz: Float64[np.ndarray, " responses"]
+    active_ratio: Float64[np.ndarray, " responses"]
+    is_burst: Bool[np.ndarray, " responses"]
+    conditions: tuple[Condition, ...]
+    window_ms: tuple[float, float]
+    n_channels: int
+    threshold: float
+    separability: float
+    presentation: Presentation | None = None
+    start_min: float = 0.0
+    findings: tuple[Finding, ...] = ()
+
+    def __post_init__(self) -> None:
+        columns: dict[str, Any] = {
+            "condition": np.int64,
+            "rate_hz": np.float64,
+            "active_ratio": np.float64,
+            "is_burst": np.bool_,
+        }
+        for name, dtype in columns.items():
+            array = np.array(getattr(self, name), dtype=dtype)
+            if array.shape != (len(self),):
+                raise Mismatch(f"responses.{name}: expected {len(self)} values, one a response, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if len(self) and not (self.condition.min() >= 0 and self.condition.max() < len(self.conditions)):
+            raise Mismatch(
+                f"responses.condition: expected indices of {len(self.conditions)} conditions, "
+                f"got {self.condition.min()} to {self.condition.max()}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.condition)
+
+    @property
+    def non_burst_rate_hz(self) -> Float64[np.ndarray, " non_bursts"]:
+        """x of the non-burst responses of all conditions together, in Hz."""
+        return np.asarray(self.rate_hz[~self.is_burst])
+
+    @property
+    def median_rate_hz(self) -> float:
+        """P50: the median of the non-burst responses of all conditions together, in Hz; NaN without any."""
+        rates_hz = self.non_burst_rate_hz
+        return float(np.median(rates_hz)) if len(rates_hz) else float("nan")
+
+    def rates_of(self, condition: int) -> Float64[np.ndarray, " non_bursts"]:
+        """x of the non-burst responses of one condition, in Hz."""
+        return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
+
+    def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
+        """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""
+        median_hz = self.median_rate_hz
+        rates_hz = (self.rates_of(i) for i in range(len(self.conditions)))
+        return np.array([np.mean(x >= median_hz) if len(x) else np.nan for x in rates_hz], dtype=np.float64)
+
+
+def extract_responses(
+    recording: Recording,
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    burst_threshold: float | None = None,
+) -> Responses:
+    """The response to the last pulse of every presentation that has a condition.
+
+        x = S / (T N)
+
+    with S the spikes from window_ms[0] up to, not including, window_ms[1] after the pulse (see
+    `animat.neurons.windows.count_spikes` for the edges), T the length of the window and N the number of channels.
+
+    Presentations without a condition, and ones whose window runs past the end of the recording, are left out and
+    counted in `findings`, where also everything else is said that makes the responses doubtful.
+
+    Args:
+        recording: the spikes and stimuli.
+        by: what makes a condition; by frequency where it is known, else all in one.
+        window_ms: start and end of the window after the pulse.
+        burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
+
+    Raises:
+        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        UnusableData: for a recording without channels.
+
+    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels).
+    """
+    check_window(window_ms)
+    n_channels = len(recording.channels)
+    if not n_channels:
+        raise UnusableData("channels: expected at least one, got a recording without any; x is a mean over channels")
+    stimuli = recording.stimuli
+    assignment = (by or default_conditions(stimuli)).assign(stimuli)
+    read = stimuli.is_last_of_presentation & (assignment.condition != NO_CONDITION)
+    # An end that is the last stimulus' or spike's own time is rounded like them.
+    inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
+    used = read & inside
+    from_s = stimuli.time_s[used] + window_ms[0] * 1e-3
+    to_s = stimuli.time_s[used] + window_ms[1] * 1e-3
+    spikes = count_spikes(recording, from_s, to_s)
+    active_ratio = count_active_channels(recording, from_s, to_s) / n_channels
+    bursts = separate_bursts(active_ratio, burst_threshold)
+    responses = Responses(
+        condition=assignment.condition[used],
+        rate_hz=spikes / ((window_ms[1] - window_ms[0]) * 1e-3 * n_channels),
+        active_ratio=active_ratio,
+        is_burst=bursts.is_burst,
+        conditions=assignment.conditions,
+        window_ms=window_ms,
+        n_channels=n_channels,
+        threshold=bursts.threshold,
+        separability=bursts.separability,
+        presentation=recording.presentation,
+        start_min=recording.start_min,
+    )
+    return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))
