@@ -1,0 +1,156 @@
+"""The contract that every registered robot keeps."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument
+from animat.robots import ROBOTS, Navigation, Robot, robot_from_dict, robot_named, robot_to_dict
+
+VARIANTS = [
+    *(robot_named(name) for name in ROBOTS),
+    *(ROBOTS[name].as_printed() for name in ROBOTS),  # type: ignore[attr-defined]
+]
+
+
+@pytest.fixture(params=VARIANTS, ids=lambda robot: f"{robot.name}-{robot.episode_limit}")
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return request.param
+
+
+def play(robot: Robot, policy: str, episodes: int, iterations: int, seed: int = 0):
+    """Observations, rewards and endings of many episodes, (iterations, episodes, ...), going on after an ending."""
+    key_reset, key_u, key_steps = jax.random.split(jax.random.key(seed), 3)
+    shape = (iterations, episodes)
+    u = {
+        "random": jax.random.uniform(key_u, shape, minval=-1.0, maxval=1.0),
+        "thrown": jnp.where(jax.random.uniform(key_u, shape) < 0.5, -1.0, 1.0),
+        "right": jnp.ones(shape),
+        "left": -jnp.ones(shape),
+    }[policy]
+    uniforms = jax.random.uniform(key_steps, (*shape, robot.noise_size))
+
+    def iterate(state, inputs):
+        state, reward, terminated = jax.vmap(robot.advance)(inputs[0], state, inputs[1])
+        return state, (jax.vmap(robot.observe)(state), reward, terminated)
+
+    start = jax.vmap(robot.reset)(jax.random.split(key_reset, episodes))
+    return jax.tree.map(np.asarray, jax.lax.scan(iterate, start, (uniforms, u))[1])
+
+
+def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
+    state = robot.reset(jax.random.key(0))
+    assert all(leaf.shape == () and leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(state))
+    after, reward, terminated = robot.step(jax.random.key(1), state, jnp.float32(0.3))
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    assert [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(after)] == [((), jnp.float32)] * len(state)
+    assert (reward.shape, reward.dtype) == ((), jnp.float32)
+    assert (terminated.shape, terminated.dtype) == ((), jnp.bool_)
+
+
+def test_observations_are_the_quantities_in_order(robot: Robot) -> None:
+    observation = robot.observe(robot.reset(jax.random.key(0)))
+    assert observation.shape == (len(robot.quantities),)
+    assert observation.dtype == jnp.float32
+    assert len({quantity.name for quantity in robot.quantities}) == len(robot.quantities)
+    for quantity in robot.quantities:
+        assert quantity.scale > 0 and np.isfinite(quantity.scale) and quantity.unit
+        assert quantity.low <= 0 <= quantity.high and np.isfinite([quantity.low, quantity.high]).all()
+
+
+def test_a_step_is_advance_with_uniforms_of_the_key(robot: Robot) -> None:
+    key, state = jax.random.key(5), robot.reset(jax.random.key(0))
+    by_step = robot.step(key, state, jnp.float32(-0.5))
+    by_advance = robot.advance(jax.random.uniform(key, (robot.noise_size,)), state, jnp.float32(-0.5))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), by_step, by_advance))
+    again = robot.step(key, state, jnp.float32(-0.5))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), by_step, again))
+
+
+def test_a_jitted_step_draws_no_random_numbers_in_advance(robot: Robot) -> None:
+    state = robot.reset(jax.random.key(0))
+    traced = str(jax.make_jaxpr(robot.advance)(jnp.zeros(robot.noise_size), state, jnp.float32(0)))
+    assert "random" not in traced and "threefry" not in traced
+
+
+def test_a_batch_steps_as_each_alone(robot: Robot) -> None:
+    u = jnp.linspace(-1, 1, 7)
+    keys = jax.random.split(jax.random.key(3), 7)
+    states = jax.vmap(robot.reset)(keys)
+    together = jax.vmap(robot.step)(keys, states, u)
+    for i in range(7):
+        alone = robot.step(keys[i], jax.tree.map(lambda leaf, i=i: leaf[i], states), u[i])
+        np.testing.assert_allclose([leaf[i] for leaf in jax.tree.leaves(together)], jax.tree.leaves(alone), rtol=1e-6)
+
+
+@pytest.mark.parametrize("policy", ["random", "thrown", "right", "left"])
+def test_no_observation_of_an_episode_passes_the_bounds(robot: Robot, policy: str) -> None:
+    observations, rewards, terminated = play(robot, policy, episodes=200, iterations=robot.episode_limit)
+    ended_before = np.cumsum(terminated, axis=0) - terminated > 0
+    in_episodes = observations[~ended_before]
+    low, high = np.array([(q.low, q.high) for q in robot.quantities], np.float32).T
+    assert np.all(in_episodes >= low) and np.all(in_episodes <= high)
+    assert np.all(np.isfinite(in_episodes)) and np.all(np.isfinite(rewards[~ended_before]))
+
+
+def test_the_episode_limit_is_never_a_termination(robot: Robot) -> None:
+    """The same robot with a limit of one iteration steps as before: the limit is the business of whoever counts."""
+    short = dataclasses.replace(robot, episode_limit=1)
+    for policy in ("random", "right"):
+        for a, b in zip(play(robot, policy, 20, 50), play(short, policy, 20, 50), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_robots_are_data(robot: Robot) -> None:
+    data = json.loads(json.dumps(robot_to_dict(robot)))
+    back = robot_from_dict(data)
+    assert back == robot and hash(back) == hash(robot) and pickle.loads(pickle.dumps(robot)) == robot
+    assert robot_named(robot.name, **data["parameters"]) == robot
+    longer = robot_named(robot.name, **(data["parameters"] | {"episode_limit": robot.episode_limit + 1}))
+    assert longer != robot
+    assert set(data["parameters"]) == {field.name for field in dataclasses.fields(robot)}
+
+
+def test_whole_numbers_from_json_are_the_same_robot() -> None:
+    assert robot_named("navigation", arena_width_m=1, episode_limit=100.0) == Navigation()
+    assert isinstance(robot_named("navigation", episode_limit=50.0).episode_limit, int)
+
+
+def test_parameters_may_be_static_under_jit(robot: Robot) -> None:
+    reset = jax.jit(lambda robot, key: robot.reset(key), static_argnums=0)
+    assert reset(robot, jax.random.key(0)) == robot.reset(jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "message"),
+    [
+        ("unicycle", {}, "robot: expected one of cartpole, navigation, got 'unicycle'"),
+        (3, {}, "robot: expected one of"),
+        ("cartpole", {"mass": 1.0}, "cartpole: expected parameters among gravity_m_per_s2, .*, got 'mass'"),
+        ("cartpole", {"pole_mass_kg": 0.0}, "cartpole: pole_mass_kg: expected a finite number from 1e-09 to 1e"),
+        ("cartpole", {"step_s": float("nan")}, "cartpole: step_s: expected a finite number"),
+        ("cartpole", {"force_n": "1"}, "cartpole: force_n: expected a finite number .*, got '1'"),
+        ("cartpole", {"episode_limit": 0}, "cartpole: episode_limit: expected a whole number from 1"),
+        ("cartpole", {"episode_limit": 1.5}, "cartpole: episode_limit: expected a whole number from 1"),
+        ("cartpole", {"episode_limit": True}, "cartpole: episode_limit: expected a whole number from 1"),
+        ("cartpole", {"force_n": None}, "cartpole: force_n: expected a finite number"),
+        ("navigation", {"turn_rad": 4.0}, "navigation: turn_rad: expected a finite number from 0 to 3.14159"),
+        ("navigation", {"goal_x_m": 1.2}, "navigation: goal_x_m: expected a finite number from 0 to 1, got 1.2"),
+    ],
+)
+def test_bad_parameters_are_refused_with_what_was_expected(name, parameters, message) -> None:
+    with pytest.raises(InvalidArgument, match=message):
+        robot_named(name, **parameters)
+
+
+@pytest.mark.parametrize("data", [{}, {"name": "cartpole"}, {"name": "cartpole", "parameters": 3}, None, "cartpole"])
+def test_data_of_another_form_are_refused(data: object) -> None:
+    with pytest.raises(InvalidArgument, match="robot: expected"):
+        robot_from_dict(data)  # type: ignore[arg-type]
