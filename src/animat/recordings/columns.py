@@ -1,0 +1,281 @@
+"""From plain columns, as any laboratory has them, to a `Recording`: what every plain file format goes through."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import UnusableData
+from animat.recordings.findings import Finding
+from animat.recordings.noticed import as_provenance
+from animat.recordings.protocol import Order, Presentation
+from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+
+Column = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class PlainColumns:
+    """Columns as a file brought them: unsorted, unchecked, most of them optional. `to_recording` checks them all.
+
+    Attributes:
+        spike_time_s: time of each spike in seconds, in any order, shape (spikes,).
+        spike_channel: the channel of each spike, shape (spikes,). Looked up in `channel_label` if it is text, or if
+            the labels are numbers too. Numbers are else rows of the channel columns. Without any channel column the
+            distinct values are the channels, those that fired.
+        stimulus_time_s: start of each pulse in seconds, in any order, shape (stimuli,).
+        channel_label: the rig's name of each channel, text or whole numbers, unique, shape (channels,).
+        channel_electrode: the electrode each channel reads, -1 for unknown, shape (channels,).
+        channel_xy_um: the electrode's position, NaN for unknown, shape (channels, 2).
+        stimulus_frequency_hz: NaN for unknown, shape (stimuli,).
+        stimulus_pattern: whole numbers, -1 for unknown, or names, which are numbered in alphabetical order,
+            shape (stimuli,).
+        stimulus_electrodes: electrodes pulsed together, padded with -1, shape (stimuli, electrodes) or (stimuli,).
+        stimulus_presentation: presentation of each pulse, shape (stimuli,); by default each pulse is one of its own.
+        sampling_rate_hz: of the raw signal, NaN for unknown.
+        start_min: start on the culture's clock in minutes.
+        start_s: start on the recording's clock; by default 0, or the first event if that is earlier.
+        duration_s: by default up to the last event.
+        presentation_order: `"blocked"` or `"mixed"`; by default not known.
+        presentation_pulses: pulses a presentation.
+    """
+
+    spike_time_s: Column
+    spike_channel: Column
+    stimulus_time_s: Column
+    channel_label: Column | None = None
+    channel_electrode: Column | None = None
+    channel_xy_um: Column | None = None
+    stimulus_frequency_hz: Column | None = None
+    stimulus_pattern: Column | None = None
+    stimulus_electrodes: Column | None = None
+    stimulus_presentation: Column | None = None
+    sampling_rate_hz: float = float("nan")
+    start_min: float = 0.0
+    start_s: float | None = None
+    duration_s: float | None = None
+    presentation_order: str | None = None
+    presentation_pulses: int | None = None
+
+    def to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...] = ()) -> Recording:
+        """Check and sort the columns and make a recording of them.
+
+        Args:
+            provenance: where the columns came from.
+            findings: what was noticed so far; these and what is noticed here go into the recording's provenance.
+
+        Raises:
+            UnusableData: naming the column, what was expected and what came.
+        """
+        noted = [*findings]
+        spike_time_s, spikes_in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
+        stimulus_time_s, stimuli_in_time = _in_time("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
+        channels, rows = self._channels(len(spike_time_s), noted)
+        patterns, names = self._patterns(len(stimulus_time_s))
+        start_s, duration_s = self._span(spike_time_s, stimulus_time_s)
+        if self.sampling_rate_hz <= 0:
+            raise UnusableData(f"sampling_rate_hz: expected a positive rate in Hz, got {self.sampling_rate_hz:g}")
+        if not np.isfinite(self.start_min):
+            raise UnusableData(f"start_min: expected finite minutes, got {self.start_min:g}")
+        stimuli = Stimuli(
+            time_s=stimulus_time_s,
+            frequency_hz=self._frequencies(len(stimulus_time_s))[stimuli_in_time],
+            pattern=patterns[stimuli_in_time],
+            electrodes=self._electrodes(len(stimulus_time_s))[stimuli_in_time],
+            presentation=self._presentations(len(stimulus_time_s), stimuli_in_time),
+        )
+        return Recording(
+            spike_times_s=spike_time_s,
+            spike_channels=rows[spikes_in_time],
+            channels=channels,
+            stimuli=stimuli,
+            sampling_rate_hz=float(self.sampling_rate_hz),
+            start_s=start_s,
+            duration_s=duration_s,
+            start_min=float(self.start_min),
+            presentation=self._presentation(),
+            provenance={**provenance, **names, **as_provenance(noted)},
+        )
+
+    def _channels(self, n_spikes: int, noted: list[Finding]) -> tuple[Channels, Int64[np.ndarray, " spikes"]]:
+        """The channel table, and the row of each spike in it."""
+        values = _column("spike_channel", self.spike_channel, n_spikes, "one channel a spike")
+        nameless = int(np.count_nonzero(values == "" if _is_text(values) else values != values))
+        if nameless:
+            raise UnusableData(f"spike_channel: expected a channel for each spike, got {nameless} without one")
+        if not _is_text(values):
+            values = _whole("spike_channel", values)
+        lengths = {
+            name: len(column)
+            for name in ("channel_label", "channel_electrode", "channel_xy_um")
+            if (column := getattr(self, name)) is not None and np.ndim(column) > 0
+        }
+        if not lengths:
+            fired, rows = np.unique(values, return_inverse=True)
+            noted.append(
+                Finding(
+                    "silent-channels-unknown",
+                    "warning",
+                    f"no table of channels: the {len(fired):,} that fired are taken for all; silent ones are not "
+                    "known, so rates per channel may be too high",
+                    float(len(fired)),
+                )
+            )
+            return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
+        if len(set(lengths.values())) > 1:
+            raise UnusableData(
+                "channel columns: expected one row a channel in each, got "
+                + ", ".join(f"{length} in {name}" for name, length in lengths.items())
+            )
+        n_channels = next(iter(lengths.values()))
+        labels = np.arange(n_channels) if self.channel_label is None else np.asarray(self.channel_label)
+        if not _is_text(labels):
+            labels = _whole("channel_label", labels)
+        table = _channel_table(labels.astype(np.str_), self.channel_electrode, self.channel_xy_um)
+        if self.channel_label is not None and (_is_text(values) or not _is_text(labels)):
+            return table, _looked_up(values.astype(np.str_), table.label)
+        if _is_text(values):
+            raise UnusableData("spike_channel: expected rows (whole numbers), as there is no channel_label; got text")
+        return table, values.astype(np.int64)
+
+    def _frequencies(self, n: int) -> Float64[np.ndarray, " stimuli"]:
+        if self.stimulus_frequency_hz is None:
+            return np.full(n, np.nan)
+        return _numbers("stimulus_frequency_hz", _column("stimulus_frequency_hz", self.stimulus_frequency_hz, n))
+
+    def _patterns(self, n: int) -> tuple[Int64[np.ndarray, " stimuli"], dict[str, str]]:
+        """The pattern of each stimulus, and the names behind the numbers as provenance."""
+        if self.stimulus_pattern is None:
+            return np.full(n, UNKNOWN), {}
+        patterns = _column("stimulus_pattern", self.stimulus_pattern, n)
+        if not _is_text(patterns):
+            return _whole("stimulus_pattern", patterns), {}
+        names, index = np.unique(patterns, return_inverse=True)
+        return index.reshape(-1).astype(np.int64), {
+            "patterns": ", ".join(f"{i}: {name}" for i, name in enumerate(names))
+        }
+
+    def _electrodes(self, n: int) -> Int64[np.ndarray, "stimuli electrodes"]:
+        if self.stimulus_electrodes is None:
+            return np.full((n, 1), UNKNOWN)
+        electrodes = np.asarray(self.stimulus_electrodes)
+        if electrodes.ndim == 1:
+            electrodes = electrodes[:, None]
+        if electrodes.ndim != 2 or len(electrodes) != n:
+            raise UnusableData(
+                f"stimulus_electrodes: expected shape ({n}, electrodes), padded with -1, got {electrodes.shape}"
+            )
+        return _whole("stimulus_electrodes", electrodes)
+
+    def _presentations(self, n: int, in_time: Int64[np.ndarray, " stimuli"]) -> Int64[np.ndarray, " stimuli"]:
+        if self.stimulus_presentation is not None:
+            column = _column("stimulus_presentation", self.stimulus_presentation, n)
+            return _whole("stimulus_presentation", column)[in_time]
+        if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
+            raise UnusableData(
+                f"stimulus_presentation: expected, to tell which {self.presentation_pulses} pulses belong to one "
+                "presentation; it is missing"
+            )
+        return np.arange(n)
+
+    def _presentation(self) -> Presentation | None:
+        if self.presentation_order is None:
+            if self.presentation_pulses is not None:
+                raise UnusableData("presentation_order: expected 'blocked' or 'mixed' beside presentation_pulses")
+            return None
+        order: Order = self.presentation_order  # type: ignore[assignment]
+        return Presentation(order, 1 if self.presentation_pulses is None else self.presentation_pulses)
+
+    def _span(
+        self, spike_time_s: Float64[np.ndarray, " spikes"], stimulus_time_s: Float64[np.ndarray, " stimuli"]
+    ) -> tuple[float, float]:
+        """Start and duration in seconds, such that start + duration does not round to before the last event."""
+        events_s = [times[i] for times in (spike_time_s, stimulus_time_s) if len(times) for i in (0, -1)]
+        start_s = float(min([0.0, *events_s])) if self.start_s is None else float(self.start_s)
+        if self.duration_s is not None:
+            return start_s, float(self.duration_s)
+        stop_s = float(max([start_s, *events_s]))
+        duration_s = stop_s - start_s
+        while start_s + duration_s < stop_s:
+            duration_s = float(np.nextafter(duration_s, np.inf))
+        return start_s, duration_s
+
+
+def _in_time(
+    name: str, column: Column, events: str, noted: list[Finding]
+) -> tuple[Float64[np.ndarray, " events"], Int64[np.ndarray, " events"]]:
+    """The times sorted, and the (stable) order that sorts them; what was out of order is noted."""
+    times_s = _numbers(name, np.asarray(column))
+    if times_s.ndim != 1:
+        raise UnusableData(f"{name}: expected one column of times in seconds, got shape {times_s.shape}")
+    wrong = np.count_nonzero(~np.isfinite(times_s))
+    if wrong:
+        raise UnusableData(f"{name}: expected finite times in seconds, got {wrong} of {len(times_s)} NaN or infinite")
+    order = np.argsort(times_s, kind="stable")
+    early = np.count_nonzero(np.diff(times_s) < 0)
+    if early:
+        noted.append(
+            Finding(
+                f"unsorted-{events}",
+                "note",
+                f"{early:,} of {len(times_s):,} {events} came after a later one in the file: sorted by time",
+                float(early),
+            )
+        )
+    return times_s[order], order
+
+
+def _channel_table(labels: Column, electrode: Column | None, xy_um: Column | None) -> Channels:
+    n = len(labels)
+    xy = np.full((n, 2), np.nan) if xy_um is None else _numbers("channel_xy_um", np.asarray(xy_um))
+    if xy.shape != (n, 2):
+        raise UnusableData(f"channel_xy_um: expected shape ({n}, 2) in micrometres, got {xy.shape}")
+    electrodes = np.full(n, UNKNOWN) if electrode is None else _whole("channel_electrode", np.asarray(electrode))
+    return Channels(label=labels, electrode=electrodes, x_um=xy[:, 0], y_um=xy[:, 1])
+
+
+def _looked_up(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
+    """The row of each value in the labels."""
+    distinct, which = np.unique(values, return_inverse=True)
+    row_of = {str(label): row for row, label in enumerate(labels)}
+    rows = np.array([row_of.get(str(value), UNKNOWN) for value in distinct], dtype=np.int64)
+    unknown = distinct[rows == UNKNOWN]
+    if len(unknown):
+        n_spikes = np.count_nonzero(np.isin(values, unknown))
+        raise UnusableData(
+            f"spike_channel: expected labels that channel_label names, got {n_spikes} spikes on "
+            f"{len(unknown)} unknown channels (such as {str(unknown[0])!r})"
+        )
+    return rows[which.reshape(-1)]
+
+
+def _column(name: str, column: Column, n: int, expected: str = "one value a stimulus") -> Column:
+    column = np.asarray(column)
+    if column.shape != (n,):
+        raise UnusableData(f"{name}: expected {expected}, shape ({n},), got {column.shape}")
+    return column
+
+
+def _is_text(column: Column) -> bool:
+    return np.asarray(column).dtype.kind in "US"
+
+
+def _numbers(name: str, column: Column) -> Float64[np.ndarray, "..."]:
+    if column.dtype.kind not in "fiub" and column.size:
+        raise UnusableData(f"{name}: expected numbers, got {column.dtype} (such as {column.flat[0]!r})")
+    return column.astype(np.float64) if column.size else np.empty(column.shape)
+
+
+def _whole(name: str, column: Column) -> Int64[np.ndarray, "..."]:
+    """The column as whole numbers; NaN is `UNKNOWN`."""
+    if column.dtype.kind in "iu":
+        return column.astype(np.int64)
+    numbers = np.where(np.isnan(values := _numbers(name, column)), UNKNOWN, values)
+    wrong = ~(np.abs(numbers) < 2**53) | (numbers != np.round(numbers))
+    if np.any(wrong):
+        raise UnusableData(f"{name}: expected whole numbers, got {numbers[wrong][0]:g}")
+    return numbers.astype(np.int64)

@@ -1,0 +1,121 @@
+"""NPZ: one compressed numpy archive of plain columns, the simplest way to bring a recording.
+
+Keys are those of `animat.recordings.columns.PlainColumns`; `spike_time_s`, `spike_channel` and `stimulus_time_s` are
+required. Other names that are understood: `stim_...` for `stimulus_...`; for spike-sorted data `spike_unit` for
+`spike_channel` and `unit_...` for `channel_...` (each unit is then a channel); `stim_tag` for `stimulus_pattern`. Where
+units have positions but no electrodes, `mapping_electrode` and `mapping_xy_um` (the array's routing) name the electrode
+at each position, and `mapping_channel` is not needed. Any other key is left out, which is noted.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.findings import Finding
+from animat.recordings.recording import UNKNOWN, Recording
+
+REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
+KEYS = tuple(field.name for field in fields(PlainColumns))
+WORDS = ("presentation_order",)
+SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", "presentation_pulses", *WORDS)
+OTHER_NAMES = {
+    "stim_tag": "stimulus_pattern",
+    "spike_unit": "spike_channel",
+    **{key.replace("stimulus_", "stim_"): key for key in KEYS if key.startswith("stimulus_")},
+    **{key.replace("channel_", "unit_"): key for key in KEYS if key.startswith("channel_")},
+}
+ROUTING = ("mapping_electrode", "mapping_xy_um")
+
+
+def read_npz(path: str | os.PathLike[str]) -> Recording:
+    """Read a recording from a numpy archive of plain columns; nothing in it is ever unpickled.
+
+    Args:
+        path: the file, as `numpy.savez` or `numpy.savez_compressed` writes it.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged, holds pickled objects, or lacks a required key.
+        UnusableData: if a column is not what it should be.
+    """
+    path = Path(path)
+    columns, routing, left_out = _loaded(path)
+    missing = [key for key in REQUIRED if key not in columns]
+    if missing:
+        found = ", ".join([*columns, *routing, *left_out]) or "none"
+        raise InvalidFile(
+            f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {found}"
+        )
+    provenance = {"source": path.name, "format": "NPZ"}
+    if columns.pop("sorted_units", False):
+        provenance["channels"] = "sorted units"
+    if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
+        columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
+        provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
+    findings = []
+    if left_out:
+        sentence = f"keys that are not known were left out: {', '.join(left_out)}"
+        findings.append(Finding("keys-left-out", "note", sentence, float(len(left_out))))
+    return PlainColumns(**columns).to_recording(provenance, tuple(findings))
+
+
+def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
+    """What the archive holds: values by our names, the array's routing, and the names of what is left out."""
+    columns: dict[str, Any] = {}
+    routing: dict[str, Column] = {}
+    left_out = []
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            for key in archive.files:
+                name = OTHER_NAMES.get(key, key)
+                if name in columns:
+                    raise InvalidFile(f"{path}: expected {name} once, got it under two names (one is {key})")
+                if name in SINGLE:
+                    columns[name] = _single(path, key, archive[key])
+                elif name in KEYS:
+                    columns[name] = archive[key]
+                elif key in ROUTING:
+                    routing[key] = archive[key]
+                else:
+                    left_out.append(key)
+            if "spike_unit" in archive.files:
+                columns["sorted_units"] = True
+    except FileNotFoundError as error:
+        raise InvalidFile(f"{path}: no such file") from error
+    except ValueError as error:
+        # numpy's only other ValueErrors are about damaged headers; both mean that the file cannot be read as it is.
+        pickled = "Object arrays" in str(error)
+        what = "pickled objects, which are never read" if pickled else f"a damaged array ({error})"
+        raise InvalidFile(f"{path}: expected plain arrays of numbers or text, got {what}; save it anew") from error
+    except (OSError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise InvalidFile(
+            f"{path}: expected a whole NPZ archive, but it is cut off or damaged ({error}); copy or save it again"
+        ) from error
+    return columns, {key: routing[key] for key in ROUTING if key in routing}, left_out
+
+
+def _single(path: Path, key: str, array: Column) -> Any:
+    """The one value of an array, a number or a word."""
+    if array.size != 1:
+        raise InvalidFile(f"{path}: {key}: expected one value, got shape {array.shape}")
+    value = array.reshape(-1)[0].item()
+    name = OTHER_NAMES.get(key, key)
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    if isinstance(value, str) is not (name in WORDS):
+        raise InvalidFile(f"{path}: {key}: expected {'a word' if name in WORDS else 'a number'}, got {value!r}")
+    return value
+
+
+def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) -> Column:
+    """The electrode routed at each position, unknown where there is none."""
+    at = {tuple(xy): e for xy, e in zip(electrode_xy_um.tolist(), electrode.tolist(), strict=False)}
+    return np.array([at.get(tuple(xy), UNKNOWN) for xy in xy_um.tolist()], dtype=np.int64)

@@ -1,0 +1,299 @@
+"""Made-up recordings of known truth, to start without a laboratory and to test against. Not a model of neurons.
+
+Nothing here responds to anything: each stimulus's response x is drawn from a gamma distribution that belongs to its
+frequency, and spikes are then placed so that x is found again. There is no memory, no network, no effect of the order
+or of the pattern of stimuli. To study those, use a virtual culture.
+
+How a response becomes spikes. With N channels and a window of T = 8 ms, x = S / (T N) for S spikes, so S = x T N,
+rounded up or down at random such that its mean is exact; x comes in steps of 1 / (T N), 0.49 Hz for 256 channels. The
+spikes of a response come in volleys of `VOLLEY` spikes a channel, so that it activates about x T N / VOLLEY channels: 8 %
+of them at x = 42 Hz, 24 % at 120 Hz. A burst activates 90 to 100 % of the channels, one to three times each. In the
+ratio of active channels, responses and bursts are thus far apart, and Otsu's threshold between them is not in doubt.
+Background spikes are placed everywhere except up to 10 ms after a stimulus, so that the window holds x and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import InvalidArgument, Mismatch
+from animat.progress import Progress, Silent
+from animat.recordings.protocol import Presentation
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Channels, Recording, Stimuli
+
+WINDOW_S = (0.002, 0.010)
+"""In which a response's spikes lie; they keep 0.2 ms away from its ends, so that rounding cannot move one out."""
+VOLLEY = 4
+VOLLEY_STEP_S = 0.0012
+BURST_RATIO = (0.9, 1.0)
+PAUSE_S = 1.0
+SAMPLING_RATE_HZ = 20_000.0
+PITCH_UM = 17.5
+ARRAY = (220, 120)
+STIMULATION_ELECTRODES = 32
+PATTERN_ELECTRODES = 5
+PATTERN_SPACING_UM = 100.0
+
+
+@dataclass(frozen=True)
+class MadeUpCulture:
+    """A culture that answers each stimulus with a number drawn from a known distribution.
+
+    A stimulus of frequency i is answered by x ~ Gamma(shape, m_i / shape) Hz per channel, with
+    m_i = means_hz[i] exp(-fatigue_per_h t), t the recording's start on the culture's clock in hours; with probability
+    `burst_share` a burst comes instead.
+
+    Attributes:
+        seed: fixes the electrodes and patterns, and with `start_min` every draw of a recording.
+        means_hz: mean response at each frequency when fresh, Hz per channel, at most 150.
+        shape: the gamma's shape; the coefficient of variation is 1 / sqrt(shape).
+        frequencies_hz: stimulus frequencies, presented as blocks in random order; at most 100.
+        patterns: stimulation patterns; each is presented once at each frequency, in random order.
+        channels: recording channels; x comes in steps of 1 / (0.008 channels) Hz.
+        fatigue_per_h: how fast the means fall.
+        burst_share: share of stimuli that a burst covers.
+        background_hz: rate of spikes that no stimulus causes, per channel, outside the 10 ms after a stimulus.
+
+    Raises:
+        InvalidArgument: naming the setting, what was expected and what came.
+    """
+
+    seed: int
+    means_hz: tuple[float, ...] = (30.0, 36.0, 42.0, 48.0, 54.0)
+    shape: float = 6.0
+    frequencies_hz: tuple[float, ...] = (5.0, 10.0, 20.0, 40.0, 80.0)
+    patterns: int = 100
+    channels: int = 256
+    fatigue_per_h: float = 0.05
+    burst_share: float = 0.05
+    background_hz: float = 0.5
+
+    def __post_init__(self) -> None:
+        _expect(self.seed >= 0, "seed", "0 or more", self.seed)
+        _expect(len(self.frequencies_hz) >= 1, "frequencies_hz", "at least one", self.frequencies_hz)
+        _expect(all(0 < f <= 100 for f in self.frequencies_hz), "frequencies_hz", "0 to 100 Hz", self.frequencies_hz)
+        _expect(
+            len(set(self.frequencies_hz)) == len(self.frequencies_hz),
+            "frequencies_hz",
+            "each once",
+            self.frequencies_hz,
+        )
+        _expect(len(self.means_hz) == len(self.frequencies_hz), "means_hz", "one a frequency", self.means_hz)
+        _expect(all(0 <= m <= 150 for m in self.means_hz), "means_hz", "0 to 150 Hz a channel", self.means_hz)
+        _expect(self.shape > 0, "shape", "more than 0", self.shape)
+        _expect(1 <= self.patterns <= 10_000, "patterns", "1 to 10,000", self.patterns)
+        _expect(16 <= self.channels <= 1024, "channels", "16 to 1,024", self.channels)
+        _expect(self.fatigue_per_h >= 0, "fatigue_per_h", "0 or more", self.fatigue_per_h)
+        _expect(0 <= self.burst_share < 1, "burst_share", "0 to less than 1", self.burst_share)
+        _expect(0 <= self.background_hz <= 1000, "background_hz", "0 to 1,000 Hz", self.background_hz)
+
+    def record(self, start_min: float = 0.0) -> Recording:
+        """One recording by the paper's protocol: blocked, one pulse a presentation (method of the paper, section 2).
+
+        Args:
+            start_min: its start on the culture's clock in minutes, 0 or more.
+        """
+        _expect(0 <= start_min < np.inf, "start_min", "0 minutes or more", start_min)
+        channels, patterns = self._electrodes()
+        rng = np.random.default_rng([self.seed, 1, round(start_min * 60_000)])
+        time_s, frequency, pattern = self._protocol(rng)
+        stop_s = float(time_s[-1]) + PAUSE_S
+        means_hz = np.array(self.means_hz) * np.exp(-self.fatigue_per_h * start_min / 60)
+        x_hz = rng.gamma(self.shape, means_hz[frequency] / self.shape)
+        is_burst = rng.random(len(time_s)) < self.burst_share
+        parts = (
+            self._responses(rng, time_s[~is_burst], x_hz[~is_burst]),
+            self._bursts(rng, time_s[is_burst]),
+            self._background(rng, time_s, stop_s),
+        )
+        spike_time_s = np.concatenate([part[0] for part in parts])
+        spike_channel = np.concatenate([part[1] for part in parts])
+        order = np.argsort(spike_time_s, kind="stable")
+        return Recording(
+            spike_times_s=spike_time_s[order],
+            spike_channels=spike_channel[order],
+            channels=channels,
+            stimuli=Stimuli(
+                time_s=time_s,
+                frequency_hz=np.array(self.frequencies_hz, dtype=np.float64)[frequency],
+                pattern=pattern,
+                electrodes=patterns[pattern],
+                presentation=np.arange(len(time_s)),
+            ),
+            sampling_rate_hz=SAMPLING_RATE_HZ,
+            start_s=0.0,
+            duration_s=stop_s,
+            start_min=float(start_min),
+            presentation=Presentation("blocked", 1),
+            provenance=self.provenance,
+        )
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """What a recording of this culture says about its origin: every setting, hence the truth."""
+        settings = {field.name: str(getattr(self, field.name)) for field in fields(self)}
+        return {"source": "made up by animat.recordings.made_up: known truth, not a model of neurons", **settings}
+
+    def _electrodes(self) -> tuple[Channels, Int64[np.ndarray, "patterns electrodes"]]:
+        """The recording channels, and the electrodes of each pattern; the same in all recordings."""
+        rng = np.random.default_rng([self.seed, 0])
+        columns, rows = ARRAY
+        shuffled = rng.permutation(columns * rows)
+        electrode, others = shuffled[: self.channels], shuffled[self.channels :]
+        stimulating: list[int] = []
+        for candidate in others.tolist():
+            if all(_distance_um(candidate, chosen) > PATTERN_SPACING_UM for chosen in stimulating):
+                stimulating.append(candidate)
+            if len(stimulating) == STIMULATION_ELECTRODES:
+                break
+        patterns: dict[tuple[int, ...], None] = {}
+        while len(patterns) < self.patterns:
+            chosen = rng.choice(stimulating, PATTERN_ELECTRODES, replace=False)
+            patterns[tuple(sorted(chosen.tolist()))] = None
+        channels = Channels(
+            label=np.arange(self.channels).astype(np.str_),
+            electrode=electrode,
+            x_um=(electrode % columns) * PITCH_UM,
+            y_um=(electrode // columns) * PITCH_UM,
+        )
+        return channels, np.array(list(patterns), dtype=np.int64)
+
+    def _protocol(
+        self, rng: np.random.Generator
+    ) -> tuple[Float64[np.ndarray, " stimuli"], Int64[np.ndarray, " stimuli"], Int64[np.ndarray, " stimuli"]]:
+        """Time, index of the frequency and pattern of each stimulus."""
+        times, frequencies, patterns = [], [], []
+        start_s = 0.0
+        for frequency in rng.permutation(len(self.frequencies_hz)):
+            start_s += PAUSE_S
+            block_s = start_s + np.arange(self.patterns) / self.frequencies_hz[frequency]
+            start_s = float(block_s[-1])
+            times.append(block_s)
+            frequencies.append(np.full(self.patterns, frequency))
+            patterns.append(rng.permutation(self.patterns))
+        return np.concatenate(times), np.concatenate(frequencies), np.concatenate(patterns)
+
+    def _responses(
+        self,
+        rng: np.random.Generator,
+        time_s: Float64[np.ndarray, " responses"],
+        x_hz: Float64[np.ndarray, " responses"],
+    ) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+        """Spikes (time, channel) in the windows such that each response is x."""
+        window_s = WINDOW_S[1] - WINDOW_S[0]
+        n_spikes = np.floor(x_hz * window_s * self.channels + rng.random(len(x_hz))).astype(np.int64)
+        response = np.repeat(np.arange(len(x_hz)), n_spikes)
+        place = np.arange(len(response)) - np.repeat(np.cumsum(n_spikes) - n_spikes, n_spikes)
+        volley, step = place // VOLLEY, place % VOLLEY
+        channel = _shuffles(rng, len(x_hz), self.channels)[response, volley % self.channels]
+        # The spikes of a volley share its start.
+        start_s = rng.random((len(x_hz), int(volley.max(initial=0)) + 1))[response, volley]
+        room_s = window_s - 0.0004 - (VOLLEY - 1) * VOLLEY_STEP_S
+        return time_s[response] + WINDOW_S[0] + 0.0002 + start_s * room_s + step * VOLLEY_STEP_S, channel
+
+    def _bursts(
+        self, rng: np.random.Generator, time_s: Float64[np.ndarray, " bursts"]
+    ) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+        n_active = np.ceil(rng.uniform(*BURST_RATIO, len(time_s)) * self.channels).astype(np.int64)
+        is_active = np.arange(self.channels)[None, :] < n_active[:, None]
+        n_spikes = rng.integers(1, 4, (len(time_s), self.channels))[is_active]
+        burst = np.repeat(np.nonzero(is_active)[0], n_spikes)
+        channel = np.repeat(_shuffles(rng, len(time_s), self.channels)[is_active], n_spikes)
+        return time_s[burst] + rng.uniform(WINDOW_S[0] + 0.0002, WINDOW_S[1] - 0.0002, len(burst)), channel
+
+    def _background(
+        self, rng: np.random.Generator, time_s: Float64[np.ndarray, " stimuli"], stop_s: float
+    ) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+        spike_s = rng.uniform(0, stop_s, rng.poisson(self.background_hz * self.channels * stop_s))
+        channel = rng.integers(0, self.channels, len(spike_s))
+        latest = np.searchsorted(time_s, spike_s, side="right") - 1
+        is_free = (latest < 0) | (spike_s - time_s[latest] > WINDOW_S[1] + 0.0002)
+        return spike_s[is_free], channel[is_free]
+
+
+def make_up_recording(seed: int, *, start_min: float = 0.0, **settings: Any) -> Recording:
+    """One recording of a made-up culture; `settings` are the attributes of `MadeUpCulture`.
+
+    Args:
+        seed: the same seed is the same culture; with the same `start_min`, the same recording.
+        start_min: when it starts on the culture's clock, in minutes.
+        settings: `means_hz`, `shape`, `frequencies_hz`, `patterns`, `channels`, ...
+
+    Raises:
+        InvalidArgument: naming the setting, what was expected and what came.
+    """
+    return MadeUpCulture(seed, **settings).record(start_min)
+
+
+def write_made_up_series(
+    seed: int,
+    folder: str | os.PathLike[str],
+    *,
+    sessions: int = 15,
+    interval_min: float = 10.0,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> list[Path]:
+    """Write the recordings of a made-up culture over time, one NWB file each, `recording_0000_min.nwb` and so on.
+
+    A file is complete or absent; files that are there already are kept, so an interrupted series goes on where it
+    stopped.
+
+    Args:
+        seed: of the culture.
+        folder: where the files go; made if it is missing.
+        sessions: number of recordings.
+        interval_min: minutes between the starts of two recordings.
+        progress: told after each recording.
+        settings: attributes of `MadeUpCulture`.
+
+    Returns:
+        The files, in the order of time.
+
+    Raises:
+        InvalidArgument: naming the setting, what was expected and what came.
+        Mismatch: if a file of the series is there but from another culture.
+    """
+    _expect(sessions >= 1, "sessions", "at least 1 recording", sessions)
+    _expect(interval_min > 0, "interval_min", "more than 0 minutes", interval_min)
+    culture = MadeUpCulture(seed, **settings)
+    progress = progress or Silent()
+    files = []
+    for session in range(sessions):
+        start_min = session * interval_min
+        file = Path(folder) / f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
+        if file.exists():
+            there = read_recording(file)
+            if dict(there.provenance) != culture.provenance or there.start_min != start_min:
+                raise Mismatch(
+                    f"{file}: expected a recording of the same made-up culture at {start_min:g} min, got another; "
+                    "remove it, or choose another folder"
+                )
+        else:
+            culture.record(start_min).save(file)
+        files.append(file)
+        progress.update(session + 1, sessions, file.name)
+    return files
+
+
+def _shuffles(rng: np.random.Generator, n: int, channels: int) -> Int64[np.ndarray, "n channels"]:
+    """All channels in random order, n times."""
+    return np.argsort(rng.random((n, channels)), axis=1)
+
+
+def _distance_um(electrode: int, other: int) -> float:
+    columns = ARRAY[0]
+    return PITCH_UM * math.hypot(electrode % columns - other % columns, electrode // columns - other // columns)
+
+
+def _expect(is_right: bool, name: str, expected: str, got: object) -> None:
+    if not is_right:
+        raise InvalidArgument(f"{name}: expected {expected}, got {got}")

@@ -1,0 +1,62 @@
+"""What was noticed about a recording: when its file was read, and in the recording itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import get_args
+
+import numpy as np
+
+from animat.recordings.findings import Finding, Severity
+from animat.recordings.recording import UNKNOWN, Recording
+
+
+def as_provenance(findings: Iterable[Finding]) -> dict[str, str]:
+    """Findings as entries of `Recording.provenance`, so that they travel with the recording and its file.
+
+    An entry reads `"warning: silent-channels-unknown"` -> its sentence; `noticed` turns it back into a finding.
+    """
+    return {f"{finding.severity}: {finding.name}": finding.sentence for finding in findings}
+
+
+def noticed(recording: Recording) -> tuple[Finding, ...]:
+    """All findings about a recording: those noted when its file was read, then those seen in its data.
+
+    Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent channels (`silent-channels`),
+    stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
+    """
+    from_file = []
+    for key, sentence in recording.provenance.items():
+        severity, colon, name = key.partition(": ")
+        if colon and severity in get_args(Severity):
+            from_file.append(Finding(name, severity, sentence))  # type: ignore[arg-type]
+    return (*from_file, *_in_data(recording))
+
+
+def _in_data(recording: Recording) -> Iterable[Finding]:
+    channels, stimuli = recording.channels, recording.stimuli
+    if not len(stimuli):
+        yield Finding(
+            "no-stimuli",
+            "refuse",
+            f"{len(recording.spike_times_s):,} spikes but no stimulus: there are no responses to learn from; "
+            "bring the stimulus times too",
+        )
+    if not len(recording.spike_times_s):
+        yield Finding("no-spikes", "refuse", f"no spike on any of {len(channels):,} channels: nothing can be learned")
+    else:
+        silent = len(channels) - len(np.unique(recording.spike_channels))
+        if silent:
+            sentence = f"{silent:,} of {len(channels):,} channels are silent; they count in rates per channel"
+            yield Finding("silent-channels", "note", sentence, float(silent))
+    unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1)))
+    if unknown:
+        sentence = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
+        yield Finding("stimulus-electrodes-unknown", "note", sentence, float(unknown))
+    if len(stimuli) and recording.presentation is None:
+        yield Finding(
+            "presentation-unknown",
+            "note",
+            "how the stimuli were presented (blocked or mixed, pulses a presentation) is not known; a closed loop "
+            "cannot check that it presents them in the same way",
+        )

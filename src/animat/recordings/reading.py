@@ -1,0 +1,123 @@
+"""Read recordings in any known format; the format is known by a file's content, not by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.recordings.formats.csv import read_csv
+from animat.recordings.formats.npz import read_npz
+from animat.recordings.formats.nwb import read_nwb
+from animat.recordings.recording import Recording
+
+HDF5 = b"\x89HDF\r\n\x1a\n"
+ZIP = b"PK"
+NPY = b"\x93NUMPY"
+IN_FOLDERS = ("*.nwb", "*.npz", "*_spikes.csv", "*_spikes.csv.gz")
+"""Names that are taken from a folder for recordings."""
+
+
+def read_recording(
+    path: str | os.PathLike[str],
+    *,
+    stimuli_path: str | os.PathLike[str] | None = None,
+    start_min: float | None = None,
+) -> Recording:
+    """Read one recording: NWB (HDF5), NPZ (zip) or CSV (text, gzipped or not), known by its content.
+
+    Args:
+        path: the file.
+        stimuli_path: the file of stimuli, for CSV only; by default the one beside the spikes.
+        start_min: when the recording started on the culture's clock, in minutes; by default what the file says.
+
+    Returns:
+        The recording, sorted and checked; what was noticed on the way is in its provenance (see
+        `animat.recordings.noticed`).
+
+    Raises:
+        InvalidFile: naming the file, what was expected and what came.
+        InvalidArgument: for a `stimuli_path` beside a file that holds its own stimuli, or a `start_min` not finite.
+    """
+    path = Path(path)
+    if start_min is not None and not np.isfinite(start_min):
+        raise InvalidArgument(f"start_min: expected finite minutes, got {start_min:g}")
+    magic = _first_bytes(path)
+    holds_stimuli = magic.startswith((HDF5, ZIP))
+    if holds_stimuli and stimuli_path is not None:
+        raise InvalidArgument(
+            f"stimuli_path: expected only beside CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
+        )
+    try:
+        if magic.startswith(HDF5):
+            recording = read_nwb(path)
+        elif magic.startswith(ZIP):
+            recording = read_npz(path)
+        elif magic.startswith(NPY):
+            raise InvalidFile(f"{path}: expected NPZ (several arrays by name), got NPY (one array)")
+        else:
+            recording = read_csv(path, stimuli_path=stimuli_path)
+    except (UnusableData, InvalidArgument) as error:
+        # These name the column at fault but not the file.
+        raise InvalidFile(f"{path}: {error}") from error
+    return recording if start_min is None else dataclasses.replace(recording, start_min=float(start_min))
+
+
+def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording]:
+    """Read recordings from files and folders, in the order of the culture's clock.
+
+    Args:
+        paths: files, or folders that hold `*.nwb`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`; or one of them.
+
+    Returns:
+        The recordings, sorted by `start_min`.
+
+    Raises:
+        InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings of one time.
+        InvalidArgument: if no path is given.
+    """
+    files = [file for path in _listed(paths) for file in _files(path)]
+    if not files:
+        raise InvalidArgument("paths: expected at least one file or folder of recordings, got none")
+    read = sorted(((read_recording(file), file) for file in files), key=lambda pair: pair[0].start_min)
+    for (earlier, file), (later, other) in pairwise(read):
+        if earlier.start_min == later.start_min:
+            raise InvalidFile(
+                f"{other}: expected recordings of different times, but this one and {file} both start at "
+                f"{later.start_min:g} min; leave one out, or save it anew with read_recording(path, start_min=...)"
+            )
+    return [recording for recording, _ in read]
+
+
+def _listed(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
+    return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(path) for path in paths]
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    # Hidden files are unfinished ones.
+    found = sorted({f for pattern in IN_FOLDERS for f in path.glob(pattern) if not f.name.startswith(".")})
+    if not found:
+        raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it")
+    return found
+
+
+def _first_bytes(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            magic = file.read(len(HDF5))
+    except FileNotFoundError as error:
+        raise InvalidFile(f"{path}: no such file") from error
+    except IsADirectoryError as error:
+        raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders") from error
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not magic:
+        raise InvalidFile(f"{path}: expected a recording (NWB, NPZ or CSV), got an empty file")
+    return magic
