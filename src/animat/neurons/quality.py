@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -86,7 +87,7 @@ def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndar
     if late:
         yield Finding(
             "window-past-end",
-            "warning",
+            "note" if late < 0.05 * n_read else "warning",
             f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out",
             float(late),
         )
@@ -109,7 +110,8 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
         )
     rate_hz, quiet_s = spontaneous_rate(recording, after_ms=end_ms)
     response = find_response(recording)
-    if quiet_s * 1e3 < 10 * (end_ms - start_ms):
+    parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
+    if quiet_s * 1e3 < 10 * (end_ms - start_ms) and parts.count.any():
         yield Finding(
             "window-not-tested",
             "note",
@@ -117,10 +119,11 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
             "stimulus), so it is not known whether the window holds a response",
         )
         return
-    parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
     # The busiest part is left out on both sides: an artefact that reaches into the window is not a response.
     spikes = int(parts.count.sum() - parts.count.max())
-    expected = rate_hz * (end_ms - start_ms) * 1e-3 * parts.n_stimuli * (1 - 1 / _WINDOW_PARTS)
+    expected = (
+        0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * parts.n_stimuli * (1 - 1 / _WINDOW_PARTS)
+    )
     per_stimulus = expected / max(parts.n_stimuli, 1)
     elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
     if spikes <= expected:

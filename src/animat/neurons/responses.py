@@ -35,6 +35,8 @@ class Responses:
         presentation: how stimuli were presented, None where it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         findings: what was noticed about them.
+        time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
+            responses that come from elsewhere.
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
@@ -52,6 +54,7 @@ class Responses:
     presentation: Presentation | None = None
     start_min: float = 0.0
     findings: tuple[Finding, ...] = ()
+    time_s: Float64[np.ndarray, " responses"] | None = None
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {
@@ -60,6 +63,8 @@ class Responses:
             "active_ratio": np.float64,
             "is_burst": np.bool_,
         }
+        if self.time_s is not None:
+            columns["time_s"] = np.float64
         for name, dtype in columns.items():
             array = np.array(getattr(self, name), dtype=dtype)
             if array.shape != (len(self),):
@@ -152,5 +157,6 @@ def extract_responses(
         separability=bursts.separability,
         presentation=recording.presentation,
         start_min=recording.start_min,
+        time_s=stimuli.time_s[used],
     )
     return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))

@@ -50,18 +50,25 @@ def count_active_channels(
     recording: Recording, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
 ) -> Int64[np.ndarray, " windows"]:
     """The number of channels with at least one spike in each window; edges and arguments as in `count_spikes`."""
-    first = np.searchsorted(recording.spike_times_s, from_s, side="left")
-    counts = np.searchsorted(recording.spike_times_s, to_s, side="left") - first
     n_channels = len(recording.channels)
-    active = np.zeros(len(counts), dtype=np.int64)
+    active = np.zeros(len(from_s), dtype=np.int64)
     # One mark a window and channel, in blocks of windows so that a long recording does not fill the memory.
     block = max(1, _BLOCK // max(n_channels, 1))
-    for start in range(0, len(counts), block):
-        n = counts[start : start + block]
-        window = np.repeat(np.arange(len(n)), n)
-        # The spikes of window i are first[i], first[i] + 1, ...: count up over all, restarting at each window.
-        spike = np.arange(n.sum()) + np.repeat(first[start : start + block] - (np.cumsum(n) - n), n)
-        marked = np.zeros((len(n), n_channels), dtype=bool)
+    for start in range(0, len(from_s), block):
+        rows = slice(start, start + block)
+        window, spike = spikes_in(recording, from_s[rows], to_s[rows])
+        marked = np.zeros((len(from_s[rows]), n_channels), dtype=bool)
         marked[window, recording.spike_channels[spike]] = True
-        active[start : start + block] = marked.sum(axis=1)
+        active[rows] = marked.sum(axis=1)
     return active
+
+
+def spikes_in(
+    recording: Recording, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+) -> tuple[Int64[np.ndarray, " pairs"], Int64[np.ndarray, " pairs"]]:
+    """All pairs of a window and a spike in it, as rows of both; edges and arguments as in `count_spikes`."""
+    first = np.searchsorted(recording.spike_times_s, from_s, side="left")
+    counts = np.searchsorted(recording.spike_times_s, to_s, side="left") - first
+    # The spikes of window i are first[i], first[i] + 1, ...: count up over all, restarting at each window.
+    spike = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+    return np.repeat(np.arange(len(counts)), counts), spike

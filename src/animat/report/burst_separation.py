@@ -1,0 +1,69 @@
+"""The four panels that show whether bursts stand apart from other responses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from animat.neurons.responses import Responses
+from animat.report.response_histograms import rate_edges
+from animat.report.style import BLACK, BLUE, BURST, NON_BURST, add_legend, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_RATE = "response x (Hz per channel)"
+_RATIO = "ratio of active channels (fraction)"
+
+
+def draw_burst_separation(responses: Responses) -> Figure:
+    """All x; x against the ratio of active channels; that ratio with the threshold; x against it, labelled."""
+    figure = new_figure(9.0, 6.8)
+    (all_x, plain), (ratios, labelled) = figure.subplots(2, 2)
+    all_x.hist(responses.rate_hz, bins=rate_edges(responses, responses.rate_hz, 40).tolist(), color=BLUE)
+    style_axes(all_x, f"{len(responses):,} responses", _RATE, "responses (count)")
+    _scatter(plain, responses, np.ones(len(responses), dtype=bool), BLUE, None)
+    style_axes(plain, "response against active channels", _RATIO, _RATE)
+    # A bar for every possible ratio, k/N, up to 40 bars: bins that are no multiple of 1/N show a comb.
+    ratios.hist(responses.active_ratio, bins=_ratio_edges(responses).tolist(), color=BLUE)
+    style_axes(ratios, f"separability {responses.separability:.2f}", _RATIO, "responses (count)")
+    n_bursts = int(np.count_nonzero(responses.is_burst))
+    _scatter(labelled, responses, ~responses.is_burst, NON_BURST, f"non-burst ({len(responses) - n_bursts:,})")
+    _scatter(labelled, responses, responses.is_burst, BURST, f"burst ({n_bursts:,})")
+    style_axes(labelled, "bursts set apart", _RATIO, _RATE)
+    for axes in (ratios, labelled):
+        if np.isfinite(responses.threshold) and responses.threshold < 1:
+            # Between the largest ratio that is no burst and the next possible one.
+            axes.axvline(
+                responses.threshold + 0.5 / responses.n_channels,
+                color=BLACK,
+                linestyle="--",
+                linewidth=1,
+                label=f"threshold {responses.threshold:.3f}",
+            )
+            add_legend(axes, loc="best", markerscale=2)
+    return figure
+
+
+def _scatter(
+    axes: Axes, responses: Responses, which: Bool[np.ndarray, " responses"], colour: str, label: str | None
+) -> None:
+    axes.scatter(
+        responses.active_ratio[which],
+        responses.rate_hz[which],
+        s=7,
+        alpha=0.4,
+        color=colour,
+        linewidths=0,
+        label=label,
+        rasterized=True,
+    )
+
+
+def _ratio_edges(responses: Responses) -> Float64[np.ndarray, " edges"]:
+    largest = round(responses.active_ratio.max() * responses.n_channels) if len(responses) else 1
+    step = max(1, -(-(largest + 1) // 40))
+    return (np.arange(0, largest + 1 + step, step) - 0.5) / responses.n_channels

@@ -1,0 +1,115 @@
+"""An inspection as text for a terminal and as a folder of figures."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+from animat.neurons.inspection import Inspection
+from animat.neurons.psth import PostStimulusHistogram, post_stimulus_histogram
+from animat.recordings.recording import Recording
+from animat.report.burst_separation import draw_burst_separation
+from animat.report.psth import draw_psth
+from animat.report.raster import draw_raster
+from animat.report.response_histograms import draw_response_histograms
+from animat.report.style import save_figure
+
+_MOST_CONDITIONS = 16
+_MARK = {"refuse": "!!", "warning": "! ", "note": "- "}
+
+
+def inspection_text(inspection: Inspection) -> str:
+    """Lines for a terminal: what the recording holds, its responses, the conditions, the findings, the verdict."""
+    responses = inspection.responses
+    start_ms, end_ms = responses.window_ms
+    duration_min = inspection.duration_s / 60
+    lines = [
+        f"{inspection.name}: {inspection.verdict}",
+        f"  {inspection.n_spikes:,} spikes on {inspection.n_channels:,} channels in {inspection.duration_s:,.1f} s "
+        f"({duration_min:.1f} min), from {inspection.start_min:g} min on the culture's clock",
+        f"  {inspection.n_stimuli:,} stimuli"
+        + (
+            f" in {inspection.n_presentations:,} presentations"
+            if inspection.n_presentations != inspection.n_stimuli
+            else ""
+        )
+        + (f", {inspection.presentation}" if inspection.presentation else ""),
+    ]
+    if math.isfinite(inspection.mean_spikes_per_stimulus):
+        lines.append(
+            f"  {inspection.mean_spikes_per_stimulus:.2f} spikes in {start_ms:g}-{end_ms:g} ms per stimulus"
+            + (
+                f"; {inspection.spontaneous_rate_hz:.3g} Hz per channel without stimuli"
+                if math.isfinite(inspection.spontaneous_rate_hz)
+                else ""
+            )
+        )
+    if len(responses):
+        lines.append(
+            f"  bursts: {inspection.n_bursts:,} of {len(responses):,} responses, above {responses.threshold:.3f} of the "
+            f"channels active (separability {responses.separability:.2f})"
+        )
+        lines += ["", *_table(inspection)]
+    if inspection.findings:
+        lines += ["", *(f"  {_MARK[finding.severity]} {finding.sentence}" for finding in inspection.findings)]
+    return "\n".join(lines)
+
+
+def draw_inspection(
+    recording: Recording, inspection: Inspection, folder: str | os.PathLike[str], file_format: str = "png"
+) -> list[Path]:
+    """Draw raster, post-stimulus histogram, burst separation and response histograms into a folder.
+
+    Args:
+        recording: the recording that was inspected.
+        inspection: what was found in it.
+        folder: where to; it is made if it is missing. Files are named after the inspection's name.
+        file_format: `"png"`, `"svg"` or `"pdf"`.
+
+    Returns:
+        The files. A recording without stimuli has a raster only.
+
+    Raises:
+        InvalidFile: if a file cannot be written.
+    """
+    responses = inspection.responses
+    stem = Path(inspection.name).name.removesuffix(".gz").rsplit(".", 1)[0]
+    figures = {"raster": draw_raster(recording, responses)}
+    if inspection.n_presentations:
+        figures["psth"] = draw_psth(
+            _histogram(recording, inspection), responses.window_ms, inspection.spontaneous_rate_hz
+        )
+    if len(responses):
+        figures["burst-separation"] = draw_burst_separation(responses)
+        figures["responses"] = draw_response_histograms(responses)
+    return [save_figure(figure, Path(folder) / f"{stem}-{what}.{file_format}") for what, figure in figures.items()]
+
+
+def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHistogram:
+    """Wide enough for the window, and for the response where that lies elsewhere."""
+    end_ms = inspection.responses.window_ms[1]
+    response = inspection.response
+    if response is not None and response.start_ms >= end_ms:
+        end_ms = response.end_ms
+    to_ms = max(50.0, min(2 * end_ms, end_ms + 100))
+    return post_stimulus_histogram(recording, -0.4 * to_ms, to_ms, 1.0 if to_ms <= 100 else 5.0)
+
+
+def _table(inspection: Inspection) -> list[str]:
+    conditions = inspection.conditions
+    chosen = " (chosen, as none were asked for)" if inspection.by_default else ""
+    shown = conditions[:_MOST_CONDITIONS]
+    width = max([len("condition"), *(len(c.label) for c in shown)])
+    lines = [
+        f"  conditions: {inspection.by}{chosen}",
+        f"  {'condition':<{width}}  responses  non-burst  median x (Hz)  P(x >= P50)",
+    ]
+    for c in shown:
+        numbers = (
+            f"{c.median_rate_hz:13.2f}  {c.share_above_median:11.2f}" if c.n_non_burst else f"{'-':>13}  {'-':>11}"
+        )
+        lines.append(f"  {c.label:<{width}}  {c.n_responses:>9,}  {c.n_non_burst:>9,}  {numbers}")
+    if len(conditions) > len(shown):
+        lines.append(f"  ... and {len(conditions) - len(shown)} more conditions")
+    return lines

@@ -1,0 +1,57 @@
+"""The post-stimulus time histogram, with the window that responses are read in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from animat.neurons.psth import PostStimulusHistogram
+from animat.report.style import BLUE, GREY, RED, WINDOW, add_legend, new_figure, style_axes
+
+_ARTEFACT_MS = 5.0
+"""Bins nearer to the stimulus than this do not set the height of the axis when they would dwarf all others."""
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw_psth(
+    histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float | None = None
+) -> Figure:
+    """Mean rate per channel against the time from the stimulus; what is lost in the artefact stands out as empty.
+
+    Args:
+        histogram: the counts.
+        window_ms: the window to mark.
+        spontaneous_hz: rate per channel without stimuli, drawn as a line.
+    """
+    figure = new_figure(7.5, 3.8)
+    axes = figure.subplots()
+    rate_hz = np.nan_to_num(histogram.rate_hz)
+    axes.axvspan(
+        *window_ms, color=WINDOW, alpha=0.25, linewidth=0, label=f"window {window_ms[0]:g}-{window_ms[1]:g} ms"
+    )
+    axes.stairs(rate_hz, histogram.edges_ms, fill=True, color=BLUE)
+    axes.axvline(0, color=RED, linewidth=1, label="stimulus")
+    if spontaneous_hz is not None and np.isfinite(spontaneous_hz):
+        axes.axhline(spontaneous_hz, color=GREY, linewidth=1, linestyle="--", label="spontaneous rate")
+    axes.set_xlim(histogram.edges_ms[0], histogram.edges_ms[-1])
+    width_ms = histogram.edges_ms[1] - histogram.edges_ms[0]
+    title = f"{histogram.n_stimuli:,} stimuli, {histogram.n_channels:,} channels, bins of {width_ms:g} ms"
+    centres_ms = 0.5 * (histogram.edges_ms[1:] + histogram.edges_ms[:-1])
+    clear = np.abs(centres_ms) > _ARTEFACT_MS
+    highest_hz = 1.1 * float(max(rate_hz[clear].max(initial=0.0), 2 * np.nan_to_num(spontaneous_hz or 0.0)))
+    if highest_hz and rate_hz.max() > 1.5 * highest_hz:
+        title += f"; the artefact, up to {rate_hz.max():.3g} Hz, is cut off"
+        axes.set_ylim(0, highest_hz)
+    else:
+        axes.set_ylim(0, None)
+    style_axes(
+        axes,
+        title,
+        "time from stimulus (ms)",
+        "firing rate (Hz per channel)",
+    )
+    add_legend(axes, loc="upper right")
+    return figure

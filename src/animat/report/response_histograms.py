@@ -1,0 +1,70 @@
+"""Histograms of the response of each condition: what the neuron simulator draws from."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.neurons.responses import Responses
+from animat.report.style import MEDIAN, add_legend, condition_colours, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MOST_PANELS = 16
+_BINS = 30
+
+
+def draw_response_histograms(responses: Responses) -> Figure:
+    """Non-burst responses of every condition on one axis of rates, with the median P50 of all together.
+
+    At most 16 conditions are drawn, those with the most responses; the title says so.
+    """
+    n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
+    drawn = sorted(sorted(range(len(n)), key=lambda i: -n[i])[:_MOST_PANELS])
+    columns = 1 if len(drawn) <= 5 else 2
+    rows = max(1, math.ceil(len(drawn) / columns))
+    figure = new_figure(5.0 * columns, 0.9 + 1.25 * rows if rows > 1 else 3.2)
+    panels = figure.subplots(rows, columns, sharex=True, squeeze=False).T.reshape(-1)
+    colours = condition_colours([condition.unit for condition in responses.conditions])
+    edges_hz = rate_edges(responses, responses.non_burst_rate_hz, _BINS)
+    shares = responses.shares_above_median()
+    for axes, i in zip(panels, drawn, strict=False):
+        x = responses.rates_of(i)
+        axes.hist(x, bins=edges_hz.tolist(), weights=np.full(len(x), 1 / max(len(x), 1)), color=colours[i])
+        share = f", P(x ≥ P50) = {shares[i]:.2f}" if len(x) else ""
+        style_axes(axes, f"{responses.conditions[i].label}: n = {len(x):,}{share}", "", "fraction")
+        if math.isfinite(responses.median_rate_hz):
+            label = f"P50 = {responses.median_rate_hz:.1f} Hz"
+            axes.axvline(responses.median_rate_hz, color=MEDIAN, linewidth=1.2, linestyle="--", label=label)
+            if i == drawn[0]:
+                add_legend(axes, loc="best")
+    for axes in panels[len(drawn) :]:
+        axes.set_visible(False)
+    for column in range(columns):
+        # The lowest panel of a column that is not full shows its ticks too.
+        panels[min((column + 1) * rows, max(len(drawn), 1)) - 1].tick_params(labelbottom=True)
+    figure.supxlabel("response x (Hz per channel)", fontsize=9)
+    left_out = len(n) - len(drawn)
+    if left_out:
+        title = f"the {len(drawn)} conditions with the most responses; {left_out} more are not drawn"
+        figure.suptitle(title, fontsize=9)
+    return figure
+
+
+def rate_edges(
+    responses: Responses, rates_hz: Float64[np.ndarray, " some"], n_bins: int
+) -> Float64[np.ndarray, " edges"]:
+    """Edges of at most n_bins bins that each hold equally many of the possible rates.
+
+    x is a whole number of spikes over (window x channels); bins of any other width would hold now one more of its
+    values and now one less, and show a comb that is not in the data.
+    """
+    start_ms, end_ms = responses.window_ms
+    step_hz = 1 / ((end_ms - start_ms) * 1e-3 * responses.n_channels)
+    most = round(float(rates_hz.max()) / step_hz) if len(rates_hz) else 1
+    spikes = max(1, math.ceil((most + 1) / n_bins))
+    return (np.arange(0, most + 1 + spikes, spikes) - 0.5) * step_hz

@@ -1,0 +1,91 @@
+"""How every figure of animat looks, and how it is written to a file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from animat.errors import InvalidArgument
+from animat.writing import written_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = ("png", "svg", "pdf")
+
+# Okabe and Ito's palette, which people with any common colour blindness can tell apart.
+BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+)
+GREY = "#8C8C8C"
+WINDOW = ORANGE
+NON_BURST = BLUE
+BURST = RED
+MEDIAN = RED
+
+# Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
+_SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure in the house style, of a size in inches; it needs no display and touches no global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+    """Title and labels (with units), without the upper and right frame."""
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_xlabel(x_label, fontsize=9)
+    axes.set_ylabel(y_label, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def add_legend(axes: Axes, **place: Any) -> None:
+    """A legend without a frame; `place` as in `Axes.legend`."""
+    axes.legend(fontsize=8, frameon=False, **place)
+
+
+def condition_colours(units: Sequence[str]) -> list[str]:
+    """A colour for each condition: rising along cividis for frequencies, which are ordered; Okabe-Ito for others."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    n = len(units)
+    if n > 1 and (n > 6 or all(unit == "Hz" for unit in units)):
+        # The last tenth of cividis is too pale on white.
+        return [to_hex(colormaps["cividis"](0.88 * i / (n - 1))) for i in range(n)]
+    return [BLUE, ORANGE, GREEN, PURPLE, SKY, RED][:n]
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write a figure as PNG, SVG or PDF, by the path's ending; the file is complete or absent.
+
+    Raises:
+        InvalidArgument: for another ending.
+        InvalidFile: if the file cannot be written.
+    """
+    import matplotlib
+
+    path = Path(path)
+    if path.suffix[1:].lower() not in FORMATS:
+        raise InvalidArgument(f"{path}: expected a figure's name to end in .png, .svg or .pdf, got {path.suffix!r}")
+    # A date in the file would make the same figure another file each time; PNG holds none.
+    metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower())
+    with written_whole(path) as beside, matplotlib.rc_context(_SAVING):
+        figure.savefig(beside, format=path.suffix[1:].lower(), dpi=160, metadata=metadata)
+    return path
