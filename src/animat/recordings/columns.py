@@ -174,7 +174,8 @@ class PlainColumns:
     def _presentations(self, n: int, in_time: Int64[np.ndarray, " stimuli"]) -> Int64[np.ndarray, " stimuli"]:
         if self.stimulus_presentation is not None:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
-            return _whole("stimulus_presentation", column)[in_time]
+            presentations: Int64[np.ndarray, " stimuli"] = _whole("stimulus_presentation", column)[in_time]
+            return presentations
         if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
             raise UnusableData(
                 f"stimulus_presentation: expected, to tell which {self.presentation_pulses} pulses belong to one "

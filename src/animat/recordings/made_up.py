@@ -5,11 +5,11 @@ frequency, and spikes are then placed so that x is found again. There is no memo
 or of the pattern of stimuli. To study those, use a virtual culture.
 
 How a response becomes spikes. With N channels and a window of T = 8 ms, x = S / (T N) for S spikes, so S = x T N,
-rounded up or down at random such that its mean is exact; x comes in steps of 1 / (T N), 0.49 Hz for 256 channels. The
-spikes of a response come in volleys of `VOLLEY` spikes a channel, so that it activates about x T N / VOLLEY channels: 8 %
-of them at x = 42 Hz, 24 % at 120 Hz. A burst activates 90 to 100 % of the channels, one to three times each. In the
-ratio of active channels, responses and bursts are thus far apart, and Otsu's threshold between them is not in doubt.
-Background spikes are placed everywhere except up to 10 ms after a stimulus, so that the window holds x and nothing else.
+rounded up or down at random such that its mean is exact; x comes in steps of 1 / (T N), 0.49 Hz for 256 channels.
+The spikes of a response come in volleys of `VOLLEY` on one channel, so that it activates about x T N / VOLLEY
+channels: 8 % of them at x = 42 Hz, 24 % at 120 Hz. A burst activates 90 to 100 % of the channels, one to three times
+each. In the ratio of active channels, responses and bursts are thus far apart, and Otsu's threshold falls between them.
+Background spikes are placed everywhere except up to 10 ms after a stimulus: the window holds x and nothing else.
 """
 
 from __future__ import annotations
