@@ -125,7 +125,7 @@ class ByInterval(Conditions):
             raise InvalidArgument(f"interval: expected a tolerance above 0 %, got {100 * self.tolerance:g} %")
 
     def __str__(self) -> str:
-        return f"interval{_listed(self.values_hz)}+-{_number(100 * self.tolerance)}%"
+        return f"interval{_listed(self.values_hz)}+-{100 * self.tolerance:.10g}%"
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Put each pulse to the nearest frequency within the tolerance; others have no condition."""
@@ -230,9 +230,10 @@ def conditions_named(text: str) -> Conditions:
         values, sign, tolerance = rest.replace("±", "+-").partition("+-")
         if not sign:
             return ByInterval(_floats(text, values))
-        if not tolerance.strip().endswith("%"):
-            raise _unread(text, "a tolerance in per cent after +-, as in interval:5,10+-25%")
-        return ByInterval(_floats(text, values), _floats(text, tolerance.strip()[:-1])[0] / 100)
+        percent = _floats(text, tolerance.strip().removesuffix("%"))
+        if len(percent) != 1 or not tolerance.strip().endswith("%"):
+            raise _unread(text, "one tolerance in per cent after +-, as in interval:5,10+-25%")
+        return ByInterval(_floats(text, values), percent[0] / 100)
     if name == "electrode":
         return ByElectrode(tuple(_integers(text, part, "+") for part in rest.split(",") if rest))
     if name == "pattern":

@@ -45,6 +45,8 @@ def draw_burst_separation(responses: Responses) -> Figure:
                 label=f"threshold {responses.threshold:.3f}",
             )
             add_legend(axes, loc="best", markerscale=2)
+            for handle in axes.get_legend().legend_handles:
+                handle.set_alpha(1)
     return figure
 
 
@@ -55,7 +57,7 @@ def _scatter(
         responses.active_ratio[which],
         responses.rate_hz[which],
         s=7,
-        alpha=0.4,
+        alpha=0.4 if len(responses) > 300 else 0.8,
         color=colour,
         linewidths=0,
         label=label,

@@ -47,8 +47,8 @@ def inspection_text(inspection: Inspection) -> str:
         )
     if len(responses):
         lines.append(
-            f"  bursts: {inspection.n_bursts:,} of {len(responses):,} responses, above {responses.threshold:.3f} of the "
-            f"channels active (separability {responses.separability:.2f})"
+            f"  bursts: {inspection.n_bursts:,} of {len(responses):,} responses, above {responses.threshold:.3f} of "
+            f"the channels active (separability {responses.separability:.2f})"
         )
         lines += ["", *_table(inspection)]
     if inspection.findings:
