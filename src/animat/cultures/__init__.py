@@ -1,0 +1,1 @@
+"""What can be stimulated and recorded: the contract, and one file per kind of culture."""

@@ -1,0 +1,7 @@
+"""The virtual culture's living matter: a spiking network that can be stimulated and grows tired, in compiled steps."""
+
+from animat.cultures.tissue.coupling import Pulse
+from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
+from animat.cultures.tissue.tissue import Snapshot, Spikes, Tissue
+
+__all__ = ["Pulse", "ShortTerm", "Snapshot", "Spikes", "Tissue", "TissueParameters"]

@@ -1,0 +1,163 @@
+"""What an electrode's pulse reaches: neurons near it, and neurons whose axons pass by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt64
+
+from animat.cultures.tissue.kernel import axonal_draws
+from animat.cultures.tissue.network import Network
+from animat.cultures.tissue.parameters import TissueParameters
+from animat.errors import InvalidArgument
+
+SMALLEST_KICK_MV = 0.5
+"""Kicks below this are left out: they change no spike that noise does not."""
+REMEMBERED_PATTERNS = 10_000
+AXONAL_KICK_MV = 1000.0
+"""A spike that arrives along the axon brings the soma over any threshold."""
+
+
+LARGEST_STRENGTH = 2.0
+"""Pulses up to twice the full one are modelled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pulse:
+    """One stimulation pulse, on one or several electrodes at once.
+
+    Attributes:
+        time_s: start, on the tissue's clock.
+        x_um, y_um: positions of the electrodes, shape (electrodes,).
+        strength: 1 for the full pulse; kicks and the number of axons reached grow with it in proportion.
+
+    Raises:
+        InvalidArgument: for positions of different shapes, or a strength outside 0 to 2.
+    """
+
+    time_s: float
+    x_um: Float64[np.ndarray, " electrodes"]
+    y_um: Float64[np.ndarray, " electrodes"]
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("x_um", "y_um"):
+            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=np.float64)))
+        if self.x_um.shape != self.y_um.shape or self.x_um.ndim != 1:
+            raise InvalidArgument(
+                f"x_um, y_um: expected one position an electrode, got shapes {self.x_um.shape} and {self.y_um.shape}"
+            )
+        if not 0 <= self.strength <= LARGEST_STRENGTH:
+            raise InvalidArgument(
+                f"strength: expected 0 to {LARGEST_STRENGTH:g}, 1 the full pulse, got {self.strength}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """What a full pulse reaches on its electrodes; a neuron is listed once for each electrode that reaches it.
+
+    Attributes:
+        near, kick_mv: neurons near an electrode, and the depolarisation of each, shape (near,).
+        axons, axon_rank, axon_latency_ms, axon_key: neurons whose axons may pass an electrode; a pulse of strength s
+            reaches those with rank below s; the latency of each; the key of its random draws; shape (axons,).
+    """
+
+    near: Int64[np.ndarray, " near"]
+    kick_mv: Float64[np.ndarray, " near"]
+    axons: Int64[np.ndarray, " axons"]
+    axon_rank: Float64[np.ndarray, " axons"]
+    axon_latency_ms: Float64[np.ndarray, " axons"]
+    axon_key: UInt64[np.ndarray, " axons"]
+
+
+class Kicks(NamedTuple):
+    """Kicks to neurons in the order of their steps, shape (kicks,) each."""
+
+    step: Int64[np.ndarray, " kicks"]
+    neuron: Int64[np.ndarray, " kicks"]
+    mv: Float32[np.ndarray, " kicks"]
+
+
+class Coupling:
+    """The coupling of electrodes to a network, fixed by the seed and the electrodes' positions.
+
+    A neuron at distance d is kicked by `kick_mv` f / (1 + (d / `kick_reach_um`)^2), with f its own log-normal factor;
+    its axon passes the electrode with a probability in proportion to exp(-d / `axon_reach_um`), scaled so that an
+    electrode meets `axons_per_electrode` axons on average.
+    """
+
+    def __init__(self, seed: int, parameters: TissueParameters, network: Network) -> None:
+        rng = np.random.default_rng([seed, 3])
+        self._seed, self._parameters, self._network = seed, parameters, network
+        self._kick_factor = rng.lognormal(0.0, parameters.kick_sigma, len(network))
+        self._own_latency_ms = parameters.axon_latency_spread_ms * rng.uniform(0, 1, len(network))
+        self._electrodes: dict[tuple[int, int], Reach] = {}
+        self._patterns: dict[tuple[tuple[int, int], ...], Reach] = {}
+
+    def reach(self, x_um: Float64[np.ndarray, " electrodes"], y_um: Float64[np.ndarray, " electrodes"]) -> Reach:
+        """What a full pulse on the electrodes at (x, y) reaches; positions are told apart to 0.1 micrometres."""
+        places = tuple((round(10 * x), round(10 * y)) for x, y in zip(x_um.tolist(), y_um.tolist(), strict=True))
+        if places not in self._patterns:
+            each = [self._reach_of_one(place) for place in places]
+            if len(self._patterns) >= REMEMBERED_PATTERNS:
+                self._patterns.clear()
+            self._patterns[places] = Reach(
+                **{f.name: np.concatenate([getattr(reach, f.name) for reach in each]) for f in fields(Reach)}
+            )
+        return self._patterns[places]
+
+    def kicks(self, pulse: Pulse, pulse_step: int) -> Kicks:
+        """The kicks that a pulse at `pulse_step` gives.
+
+        An axonal spike passes with `axon_reliability` and arrives after its fixed latency and a jitter; both draws are
+        functions of the pulse's step, so they do not depend on how time is cut.
+        """
+        parameters = self._parameters
+        if len(pulse.x_um) == 0:
+            return NO_KICKS
+        reach = self.reach(pulse.x_um, pulse.y_um)
+        draw, jitter = np.empty(len(reach.axons)), np.empty(len(reach.axons))
+        axonal_draws(reach.axon_key, pulse_step, draw, jitter)
+        passes = (draw < parameters.axon_reliability) & (reach.axon_rank < pulse.strength)
+        latency_ms = reach.axon_latency_ms[passes] + parameters.axon_jitter_ms * jitter[passes]
+        arrival = pulse_step + np.maximum(np.rint(latency_ms / parameters.step_ms), 0).astype(np.int64)
+        return in_order(
+            Kicks(
+                np.concatenate([np.full(len(reach.near), pulse_step, dtype=np.int64), arrival]),
+                np.concatenate([reach.near, reach.axons[passes]]),
+                np.concatenate(
+                    [reach.kick_mv * pulse.strength, np.full(len(arrival), AXONAL_KICK_MV)], dtype=np.float32
+                ),
+            )
+        )
+
+    def _reach_of_one(self, place: tuple[int, int]) -> Reach:
+        if place in self._electrodes:
+            return self._electrodes[place]
+        parameters, network = self._parameters, self._network
+        distance_um = np.hypot(network.x_um - place[0] / 10, network.y_um - place[1] / 10)
+        kick_mv = parameters.kick_mv * self._kick_factor / (1 + (distance_um / parameters.kick_reach_um) ** 2)
+        near = np.flatnonzero(kick_mv > SMALLEST_KICK_MV)
+        passing = np.exp(-distance_um / parameters.axon_reach_um)
+        chance = parameters.axons_per_electrode * passing / passing.sum()
+        rng = np.random.default_rng([self._seed, 4, place[0] % 2**32, place[1] % 2**32])
+        rank = rng.uniform(size=len(network)) / chance
+        key = rng.integers(0, 2**64, len(network), dtype=np.uint64)
+        axons = np.flatnonzero(rank < LARGEST_STRENGTH)
+        latency_ms = parameters.axon_latency_ms + self._own_latency_ms + distance_um / parameters.conduction_um_per_ms
+        reach = Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
+        self._electrodes[place] = reach
+        return reach
+
+
+def in_order(*kicks: Kicks) -> Kicks:
+    """All the kicks given, in the order of their steps, then neurons."""
+    step, neuron, mv = (np.concatenate(column) for column in zip(*kicks, strict=True))
+    order = np.lexsort((mv, neuron, step))
+    return Kicks(step[order], neuron[order], mv[order])
+
+
+NO_KICKS = Kicks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))

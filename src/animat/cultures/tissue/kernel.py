@@ -1,0 +1,309 @@
+"""The stepping loop of the virtual tissue, compiled.
+
+No fast mathematics: every operation is rounded as written, so the same state gives the same spikes bit for bit however
+many steps a call takes and however wide the processor's vectors are. The loops over neurons are short and each writes
+few arrays, because that is what the compiler turns into vector code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
+
+f4 = np.float32
+ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
+FAINT = f4(1e-20)
+"""Added at every decay, so that silence ends at about 1e-17 and never at subnormal numbers, which are slow."""
+SUM_OF_FOUR_MEAN = f4(2 * 65535)
+SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
+"""Mean and standard deviation of the sum of four uniform 16-bit integers."""
+
+
+class Constants(NamedTuple):
+    """Numbers that hold for all neurons; factors are per time step, conductances in units of the leak."""
+
+    block: tuple[np.float32, np.float32, np.float32, np.float32]  # B(V) = b0 + b1 V + b2 V^2 + b3 V^3
+    block_low_mv: np.float32  # the cubic holds between these
+    block_high_mv: np.float32
+    leak_mv: np.float32
+    threshold_mv: np.float32
+    reset_mv: np.float32
+    potassium_mv: np.float32
+    gaba_mv: np.float32
+    keep_ampa: np.float32
+    keep_nmda: np.float32
+    keep_gaba: np.float32
+    keep_potassium: np.float32
+    keep_adaptation: np.float32
+    keep_noise: np.float32
+    noise_scale_mv: np.float32
+    nmda_ratio: np.float32
+    nmda_fill: np.float32  # 1 / the conductance at which NMDA is saturated
+    hyperpolarisation: np.float32
+    adaptation_mv: np.float32
+    step_s: float
+    use: Float64[np.ndarray, "from_type to_type"]
+    recovery_s: Float64[np.ndarray, "from_type to_type"]
+    facilitation_s: Float64[np.ndarray, "from_type to_type"]
+    availability_loss: float
+    availability_s: float
+    release_loss: float
+    release_recovery_s: float
+    n_excitatory: int
+
+
+class Wiring(NamedTuple):
+    """What each neuron is, and its synapses; see `Network`."""
+
+    step_over_membrane: Float32[np.ndarray, " neurons"]
+    refractory_steps: Int32[np.ndarray, " neurons"]
+    drive_mv: Float32[np.ndarray, " neurons"]
+    noise_key: UInt64[np.ndarray, " neurons"]
+    needed: Float64[np.ndarray, " neurons"]
+    start: Int64[np.ndarray, " neurons_and_one"]
+    target: Int32[np.ndarray, " synapses"]
+    weight: Float32[np.ndarray, " synapses"]
+    delay_steps: Int32[np.ndarray, " synapses"]
+
+
+class State(NamedTuple):
+    """All that changes. Columns of `x` and `u` are towards excitatory and towards inhibitory neurons.
+
+    `drive` is the noisy drive in mV; `refractory` the steps left; `arriving_*` a ring of the conductances under way,
+    one row a step; `x`, `u`, `available` and `release` are as they were just after each neuron's last spike.
+    """
+
+    v_mv: Float32[np.ndarray, " neurons"]
+    drive_mv: Float32[np.ndarray, " neurons"]
+    ampa: Float32[np.ndarray, " neurons"]
+    nmda: Float32[np.ndarray, " neurons"]
+    gaba: Float32[np.ndarray, " neurons"]
+    potassium: Float32[np.ndarray, " neurons"]
+    adaptation_mv: Float32[np.ndarray, " neurons"]
+    refractory: Int32[np.ndarray, " neurons"]
+    arriving_e: Float32[np.ndarray, "ring neurons"]
+    arriving_i: Float32[np.ndarray, "ring neurons"]
+    last_spike: Int64[np.ndarray, " neurons"]
+    x: Float64[np.ndarray, "neurons 2"]
+    u: Float64[np.ndarray, "neurons 2"]
+    available: Float64[np.ndarray, " neurons"]
+    release: Float64[np.ndarray, " neurons"]
+
+
+compiled = numba.njit(cache=True, error_model="numpy", fastmath=False)
+
+
+@compiled
+def mixed(key: np.uint64, step: int) -> np.uint64:
+    """The 64 bits of SplitMix64 (Steele et al. 2014, doi 10.1145/2660193.2660195) for a key and a step."""
+    z = key + np.uint64(step) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@compiled
+def sum_of_four(bits: np.uint64) -> np.float32:
+    """The sum of the four 16-bit integers in 64 bits, less its mean: nearly normal (excess kurtosis -0.3)."""
+    low = np.uint64(0xFFFF)
+    total = (bits & low) + ((bits >> np.uint64(16)) & low) + ((bits >> np.uint64(32)) & low) + (bits >> np.uint64(48))
+    return f4(np.int32(total)) - SUM_OF_FOUR_MEAN
+
+
+@compiled
+def move_membrane(constants: Constants, state: State, step_over_membrane: Float32[np.ndarray, " neurons"]) -> None:
+    """One step of V, exact for conductances held over the step, up to (1 - exp(-z)) / z = 1 / (1 + z/2 + z^2/12)."""
+    v_mv, drive_mv, ampa, nmda, gaba = state.v_mv, state.drive_mv, state.ampa, state.nmda, state.gaba
+    potassium, refractory = state.potassium, state.refractory
+    b0, b1, b2, b3 = constants.block
+    low_mv, high_mv = constants.block_low_mv, constants.block_high_mv
+    leak_mv, potassium_mv, gaba_mv = constants.leak_mv, constants.potassium_mv, constants.gaba_mv
+    for i in range(v_mv.size):
+        v = v_mv[i]
+        within = min(max(v, low_mv), high_mv)
+        unblocked = ((b3 * within + b2) * within + b1) * within + b0
+        total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
+        current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
+        z = total * step_over_membrane[i]
+        moved = v + current * step_over_membrane[i] / (ONE + z * (HALF + z * TWELFTH))
+        v_mv[i] = moved if refractory[i] == 0 else v
+
+
+@compiled
+def move_noise(
+    constants: Constants,
+    drive_mv: Float32[np.ndarray, " neurons"],
+    mean_mv: Float32[np.ndarray, " neurons"],
+    key: UInt64[np.ndarray, " neurons"],
+    step: int,
+) -> None:
+    """One step of the Ornstein-Uhlenbeck drive, its noise a function of the neuron and the step alone."""
+    keep, scale = constants.keep_noise, constants.noise_scale_mv
+    for i in range(drive_mv.size):
+        noise_mv = scale * sum_of_four(mixed(key[i], step))
+        drive_mv[i] = mean_mv[i] + (drive_mv[i] - mean_mv[i]) * keep + noise_mv
+
+
+@compiled
+def decay(values: Float32[np.ndarray, " neurons"], keep: np.float32) -> None:
+    """One step of an exponential decay."""
+    for i in range(values.size):
+        values[i] = values[i] * keep + FAINT
+
+
+@compiled
+def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
+    """One step of the refractory period."""
+    for i in range(refractory.size):
+        refractory[i] = max(refractory[i] - np.int32(1), np.int32(0))
+
+
+@compiled
+def arrive(constants: Constants, state: State, slot: int) -> None:
+    """Add what arrives in this step to the conductances, and empty its row of the ring."""
+    ampa, nmda, gaba = state.ampa, state.nmda, state.gaba
+    excitation, inhibition = state.arriving_e[slot], state.arriving_i[slot]
+    ratio, fill = constants.nmda_ratio, constants.nmda_fill
+    for i in range(ampa.size):
+        nmda[i] += ratio * excitation[i] * (ONE - fill * nmda[i])
+    for i in range(ampa.size):
+        ampa[i] += excitation[i]
+        excitation[i] = f4(0.0)
+    for i in range(gaba.size):
+        gaba[i] += inhibition[i]
+        inhibition[i] = f4(0.0)
+
+
+@compiled
+def over_threshold(constants: Constants, state: State) -> np.int32:
+    """The number of neurons over their threshold; refractory ones lie at the reset."""
+    v_mv, adaptation_mv, threshold_mv = state.v_mv, state.adaptation_mv, constants.threshold_mv
+    count = np.int32(0)
+    for i in range(v_mv.size):
+        count += np.int32(v_mv[i] > threshold_mv + adaptation_mv[i])
+    return count
+
+
+@compiled
+def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: float) -> float:
+    """What an exponential recovery to `rest` has come to."""
+    return rest + (value - rest) * math.exp(-elapsed_s / time_constant_s)
+
+
+@compiled
+def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, gain: float) -> None:
+    """Let neuron i spike: release, depress, tire, send along every synapse, reset."""
+    kind = 0 if i < constants.n_excitatory else 1
+    elapsed_s = (step - state.last_spike[i]) * constants.step_s
+    state.last_spike[i] = step
+    strength = 1.0
+    if kind == 0:
+        release = recovered(state.release[i], 1.0, elapsed_s, constants.release_recovery_s)
+        strength = release * gain
+        state.release[i] = release * (1.0 - constants.release_loss)
+    available = recovered(state.available[i], 1.0, elapsed_s, constants.availability_s)
+    state.available[i] = available * (1.0 - constants.availability_loss)
+    to_e = strength * release_of(constants, state, i, kind, 0, elapsed_s)
+    to_i = strength * release_of(constants, state, i, kind, 1, elapsed_s)
+
+    ring = state.arriving_e if kind == 0 else state.arriving_i
+    last_row = ring.shape[0] - 1
+    for synapse in range(wiring.start[i], wiring.start[i + 1]):
+        target = wiring.target[synapse]
+        released = to_e if target < constants.n_excitatory else to_i
+        ring[(step + wiring.delay_steps[synapse]) & last_row, target] += f4(wiring.weight[synapse] * released)
+
+    state.v_mv[i] = constants.reset_mv
+    state.potassium[i] += constants.hyperpolarisation
+    state.adaptation_mv[i] += constants.adaptation_mv
+    state.refractory[i] = wiring.refractory_steps[i]
+
+
+@compiled
+def release_of(constants: Constants, state: State, i: int, kind: int, towards: int, elapsed_s: float) -> float:
+    """Recover u and x since the last spike, release u x, and leave them as they are after it."""
+    use = constants.use[kind, towards]
+    x = recovered(state.x[i, towards], 1.0, elapsed_s, constants.recovery_s[kind, towards])
+    u = use
+    if constants.facilitation_s[kind, towards] > 0.0:
+        u = recovered(state.u[i, towards], use, elapsed_s, constants.facilitation_s[kind, towards])
+    released = float(u * x)
+    state.x[i, towards] = x - released
+    state.u[i, towards] = u + use * (1.0 - u)
+    return released
+
+
+@compiled
+def advance(
+    constants: Constants,
+    wiring: Wiring,
+    state: State,
+    first_step: int,
+    n_steps: int,
+    gain: float,
+    kick_step: Int64[np.ndarray, " kicks"],
+    kick_neuron: Int64[np.ndarray, " kicks"],
+    kick_mv: Float32[np.ndarray, " kicks"],
+    spike_step: Int64[np.ndarray, " capacity"],
+    spike_neuron: Int64[np.ndarray, " capacity"],
+) -> tuple[int, int, int]:
+    """Advance by up to `n_steps`; stops early where a step's spikes might no longer fit the output.
+
+    Args:
+        constants, wiring, state: the tissue; the state is changed in place.
+        first_step, n_steps: the tissue's clock, in steps, and how far to go.
+        gain: factor on excitatory weights over this call.
+        kick_step, kick_neuron, kick_mv: kicks in the order of their steps, none before `first_step`.
+        spike_step, spike_neuron: output, at least as long as there are neurons.
+
+    Returns:
+        The steps taken, the kicks passed, and the spikes written.
+    """
+    n = state.v_mv.size
+    last_row = state.arriving_e.shape[0] - 1
+    kicks = 0
+    spikes = 0
+    for step in range(first_step, first_step + n_steps):
+        if spikes + n > spike_step.size:
+            return step - first_step, kicks, spikes
+        count_down(state.refractory)
+        while kicks < kick_step.size and kick_step[kicks] == step:
+            i = kick_neuron[kicks]
+            elapsed_s = (step - state.last_spike[i]) * constants.step_s
+            available = recovered(state.available[i], 1.0, elapsed_s, constants.availability_s)
+            if state.refractory[i] == 0 and available > wiring.needed[i]:
+                state.v_mv[i] += kick_mv[kicks]
+            kicks += 1
+        move_membrane(constants, state, wiring.step_over_membrane)
+        move_noise(constants, state.drive_mv, wiring.drive_mv, wiring.noise_key, step)
+        decay(state.ampa, constants.keep_ampa)
+        decay(state.nmda, constants.keep_nmda)
+        decay(state.gaba, constants.keep_gaba)
+        decay(state.potassium, constants.keep_potassium)
+        decay(state.adaptation_mv, constants.keep_adaptation)
+        if over_threshold(constants, state) > 0:
+            for i in range(n):
+                if state.v_mv[i] > constants.threshold_mv + state.adaptation_mv[i]:
+                    spike_step[spikes] = step
+                    spike_neuron[spikes] = i
+                    spikes += 1
+                    fire(constants, wiring, state, i, step, gain)
+        arrive(constants, state, step & last_row)
+    return n_steps, kicks, spikes
+
+
+@compiled
+def axonal_draws(
+    key: UInt64[np.ndarray, " axons"],
+    step: int,
+    draw: Float64[np.ndarray, " axons"],
+    jitter: Float64[np.ndarray, " axons"],
+) -> None:
+    """Draws of one pulse at `step`: a uniform and a nearly standard normal number for each axon's key."""
+    for j in range(key.size):
+        draw[j] = (mixed(key[j], 2 * step) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+        jitter[j] = sum_of_four(mixed(key[j], 2 * step + 1)) / SUM_OF_FOUR_SD

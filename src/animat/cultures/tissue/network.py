@@ -1,0 +1,89 @@
+"""Where the neurons of a virtual tissue sit, what they are, and how they are connected: all from one seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from animat.cultures.tissue.parameters import TissueParameters
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Neurons and synapses; excitatory neurons come first. Synapses of neuron i are rows start[i] to start[i + 1].
+
+    Attributes:
+        x_um, y_um: positions, shape (neurons,).
+        is_excitatory: type of each neuron, shape (neurons,).
+        drive_mv: constant drive of each neuron, shape (neurons,).
+        start: first synapse of each neuron, and the end of the last, shape (neurons + 1,).
+        target: the neuron a synapse ends on, shape (synapses,).
+        weight: its peak conductance in units of the leak, before release, shape (synapses,).
+        delay_steps: its delay, at least one step, shape (synapses,).
+    """
+
+    x_um: Float64[np.ndarray, " neurons"]
+    y_um: Float64[np.ndarray, " neurons"]
+    is_excitatory: Bool[np.ndarray, " neurons"]
+    drive_mv: Float32[np.ndarray, " neurons"]
+    start: Int64[np.ndarray, " neurons_and_one"]
+    target: Int32[np.ndarray, " synapses"]
+    weight: Float32[np.ndarray, " synapses"]
+    delay_steps: Int32[np.ndarray, " synapses"]
+
+    def __len__(self) -> int:
+        return len(self.x_um)
+
+
+def grow(seed: int, parameters: TissueParameters) -> Network:
+    """Grow a network: neurons uniform on the array, each with a fixed number of synapses from each type.
+
+    The probability of a synapse from j to i falls with their distance d as
+    s_j ((1 - a) exp(-d / reach) / Z_i + a / n), where a is the long-range share, s_j the log-normal propensity of j to
+    send, Z_i the sum of the exponentials over the n neurons of j's type; the weight is log-normal about its mean.
+
+    Args:
+        seed: decides every draw.
+        parameters: sizes, reach, weights.
+    """
+    rng = np.random.default_rng([seed, 1])
+    n, n_e = parameters.neurons, parameters.n_excitatory
+    x_um, y_um = rng.uniform(0, parameters.width_um, n), rng.uniform(0, parameters.height_um, n)
+    drive_mv = rng.normal(parameters.drive_mv, parameters.drive_spread_mv, n)
+    sends = rng.lognormal(0.0, parameters.out_degree_sigma, n)
+    distance_um = np.hypot(x_um[:, None] - x_um[None, :], y_um[:, None] - y_um[None, :])
+
+    sources, targets = [], []
+    for first, last, degree in ((0, n_e, parameters.in_degree_e), (n_e, n, parameters.in_degree_i)):
+        near = np.exp(-distance_um[:, first:last] / parameters.reach_um)
+        near /= near.sum(axis=1, keepdims=True)
+        far_share = parameters.long_range_share
+        chance = sends[first:last] * ((1 - far_share) * near + far_share / (last - first))
+        # The largest of log chance + Gumbel noise are a draw without replacement in proportion to the chances.
+        score = np.log(chance) + rng.gumbel(size=chance.shape)
+        own = np.arange(first, last)
+        score[own, own - first] = -np.inf
+        chosen = np.argpartition(-score, degree, axis=1)[:, :degree] + first
+        sources.append(chosen.ravel())
+        targets.append(np.repeat(np.arange(n), degree))
+    source, target = np.concatenate(sources), np.concatenate(targets)
+    order = np.lexsort((target, source))
+    source, target = source[order], target[order]
+
+    mean = np.array([[parameters.weight_ee, parameters.weight_ei], [parameters.weight_ie, parameters.weight_ii]])
+    sigma = parameters.weight_sigma
+    spread = rng.lognormal(-(sigma**2) / 2, sigma, len(source))
+    weight = mean[(source >= n_e).astype(int), (target >= n_e).astype(int)] * spread
+    delay_ms = parameters.delay_ms + distance_um[target, source] / parameters.conduction_um_per_ms
+    return Network(
+        x_um=x_um,
+        y_um=y_um,
+        is_excitatory=np.arange(n) < n_e,
+        drive_mv=drive_mv.astype(np.float32),
+        start=np.searchsorted(source, np.arange(n + 1)).astype(np.int64),
+        target=target.astype(np.int32),
+        weight=weight.astype(np.float32),
+        delay_steps=np.maximum(np.rint(delay_ms / parameters.step_ms), 1).astype(np.int32),
+    )

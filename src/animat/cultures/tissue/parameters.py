@@ -1,0 +1,186 @@
+"""Every number of the virtual tissue, with its unit and where it comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from math import isfinite
+
+from animat.errors import InvalidArgument
+
+
+@dataclass(frozen=True)
+class ShortTerm:
+    """Short-term plasticity of one kind of synapse (Tsodyks, Pawelzik & Markram 1998, doi 10.1162/089976698300017502).
+
+    A spike releases u x; then x falls by it and u rises by U (1 - u); between spikes x recovers to 1, u to U.
+
+    Attributes:
+        use: U, the resting release probability.
+        recovery_ms: time constant of x.
+        facilitation_ms: time constant of u; 0 for a synapse that does not facilitate.
+    """
+
+    use: float
+    recovery_ms: float
+    facilitation_ms: float = 0.0
+
+
+@dataclass(frozen=True)
+class TissueParameters:
+    """The parameters of a virtual tissue; conductances are in units of the leak.
+
+    Marks: [L] from the literature, [C] calibrated so that the figures of `docs/virtual-culture.md` come out.
+
+    Raises:
+        InvalidArgument: for a number that is not finite or outside what it may be.
+    """
+
+    # Size and place.
+    neurons: int = 1200
+    """[C] Number of neurons, spread uniformly over the array."""
+    excitatory_share: float = 0.8
+    """[L] Share of excitatory neurons."""
+    width_um: float = 3850.0
+    height_um: float = 2100.0
+    """The array's sides."""
+    step_ms: float = 0.2
+    """The time step."""
+
+    # Membrane.
+    membrane_e_ms: float = 20.0
+    membrane_i_ms: float = 10.0
+    """[L] Membrane time constants."""
+    leak_mv: float = -70.0
+    threshold_mv: float = -50.0
+    """[L] Leak reversal and resting threshold."""
+    reset_mv: float = -60.0
+    """[C] Potential after a spike."""
+    potassium_mv: float = -80.0
+    gaba_mv: float = -70.0
+    """[L] Reversal potentials of the after-hyperpolarisation and of inhibition; excitation reverses at 0."""
+    refractory_e_ms: float = 3.0
+    refractory_i_ms: float = 2.0
+    """[L] Absolute refractory periods."""
+    hyperpolarisation: float = 0.003
+    """[C] Added to the potassium conductance by each spike."""
+    hyperpolarisation_ms: float = 4000.0
+    """[L] Its time constant."""
+    adaptation_mv: float = 0.6
+    """[C] Added to the threshold by each spike."""
+    adaptation_ms: float = 100.0
+    """[C] Its time constant."""
+
+    # Synapses.
+    ampa_ms: float = 3.0
+    nmda_ms: float = 110.0
+    gaba_ms: float = 10.0
+    """[L] Decay of the synaptic conductances."""
+    nmda_ratio: float = 0.71
+    """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
+    nmda_saturation: float = 2.0
+    """[C] The NMDA conductance at which arrivals add no more."""
+    e_to_e: ShortTerm = ShortTerm(0.12, 750.0, 220.0)
+    e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
+    i_to_any: ShortTerm = ShortTerm(0.137, 750.0)
+    """[C] within [L]: short-term plasticity."""
+    weight_ee: float = 0.65
+    weight_ei: float = 0.8
+    weight_ie: float = 0.48
+    weight_ii: float = 0.6
+    """[C] Mean weights, from the first letter to the second."""
+    weight_sigma: float = 0.5
+    """[C] Sigma of the log-normal weights."""
+    in_degree_e: int = 52
+    in_degree_i: int = 30
+    """[C] Synapses on each neuron, from excitatory and from inhibitory ones."""
+    reach_um: float = 220.0
+    """[C] A connection's probability falls as exp(-distance / reach)."""
+    long_range_share: float = 0.1
+    """[C] Share of connections regardless of distance."""
+    out_degree_sigma: float = 0.4
+    """[C] Sigma of the log-normal spread of out-degrees."""
+    delay_ms: float = 0.8
+    """Delay of a synapse without distance."""
+    conduction_um_per_ms: float = 500.0
+    """[L] Speed of axons."""
+
+    # Drive.
+    drive_mv: float = 9.7
+    drive_spread_mv: float = 1.8
+    """[C] Mean of the constant drive over neurons, and its standard deviation."""
+    noise_mv: float = 7.8
+    """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
+    noise_ms: float = 5.0
+    """[C] Its time constant."""
+
+    # Stimulation.
+    kick_mv: float = 68.0
+    """[C] Depolarisation of a neuron on the electrode by a full pulse."""
+    kick_sigma: float = 0.35
+    """[C] Sigma of its log-normal spread over neurons (median 1)."""
+    kick_reach_um: float = 40.0
+    """[C] The kick falls as 1 / (1 + (distance / reach)^2)."""
+    axons_per_electrode: float = 14.5
+    """[C] Expected number of neurons that an electrode drives through their axons."""
+    axon_reach_um: float = 500.0
+    """[C] Their probability falls as exp(-distance / reach)."""
+    axon_reliability: float = 0.8
+    """[L] Probability that a pulse drives an axon in its reach."""
+    axon_latency_ms: float = 0.5
+    axon_latency_spread_ms: float = 1.0
+    """[C] Latency: this, conduction, and a share of the spread that is each neuron's own."""
+    axon_jitter_ms: float = 0.16
+    """[L] Standard deviation of the latency from pulse to pulse."""
+    availability_loss: float = 0.01
+    """[C] Share of a neuron's availability lost with each spike."""
+    availability_s: float = 8.0
+    """[C] Time constant of its recovery (Goldental et al. 2014: failures above a critical frequency)."""
+    availability_needed_low: float = 0.30
+    availability_needed_high: float = 0.55
+    """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
+
+    # Fatigue.
+    release_loss: float = 2e-4
+    """[C] Share of an excitatory neuron's release lost with each spike."""
+    release_recovery_min: float = 60.0
+    """[C] Time constant of its recovery."""
+    fatigue_share: float = 0.35
+    """[C] Share of all excitatory weights that is lost in the long run."""
+    fatigue_min: float = 80.0
+    """[C] Time constant of that loss."""
+    drift_share: float = 0.03
+    drift_min: float = 30.0
+    """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""
+
+    def __post_init__(self) -> None:
+        if self.neurons < 10:
+            raise InvalidArgument(f"neurons: expected at least 10, got {self.neurons}")
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, ShortTerm):
+                if not (0 < value.use <= 1 and value.recovery_ms > 0 and value.facilitation_ms >= 0):
+                    raise InvalidArgument(f"{each.name}: expected 0 < use <= 1 and times above 0, got {value}")
+                continue
+            if not isfinite(value):
+                raise InvalidArgument(f"{each.name}: expected a finite number, got {value}")
+            if each.name.endswith(("_ms", "_um", "_s", "_min")) and value <= 0 and each.name not in _MAY_BE_ZERO:
+                raise InvalidArgument(f"{each.name}: expected a number above 0, got {value}")
+            if each.name.endswith(("_share", "_loss", "_reliability")) and not 0 <= value <= 1:
+                raise InvalidArgument(f"{each.name}: expected a number from 0 to 1, got {value}")
+        for degree, available in (
+            (self.in_degree_e, self.n_excitatory),
+            (self.in_degree_i, self.neurons - self.n_excitatory),
+        ):
+            if not 0 <= degree < available:
+                raise InvalidArgument(
+                    f"in_degree_e, in_degree_i: expected fewer synapses than the {available} neurons of that type, "
+                    f"got {degree}: lower it or raise neurons"
+                )
+
+    @property
+    def n_excitatory(self) -> int:
+        """Number of excitatory neurons; they come first in every array."""
+        return round(self.neurons * self.excitatory_share)
+
+
+_MAY_BE_ZERO = {"delay_ms", "axon_latency_ms", "axon_latency_spread_ms", "axon_jitter_ms"}

@@ -1,0 +1,128 @@
+"""From parameters and a network to what the kernel takes: constants per step, wiring, and the state to start from."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.cultures.tissue import kernel
+from animat.cultures.tissue.network import Network
+from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
+
+BLOCK_LOW_MV, BLOCK_HIGH_MV = -80.0, -50.0
+"""Where the cubic stands for the NMDA block; outside, its value at the nearer end holds."""
+
+
+def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
+    """The parameters as the kernel takes them: per step, and in single precision."""
+    f4, step_ms = np.float32, parameters.step_ms
+
+    def keep(time_constant_ms: float) -> np.float32:
+        return f4(np.exp(-step_ms / time_constant_ms))
+
+    def table(of: str) -> Float64[np.ndarray, "from_type to_type"]:
+        kinds: tuple[tuple[ShortTerm, ShortTerm], ...] = (
+            (parameters.e_to_e, parameters.e_to_i),
+            (parameters.i_to_any, parameters.i_to_any),
+        )
+        return np.array([[getattr(kind, of) for kind in row] for row in kinds])
+
+    noise_keep = np.exp(-step_ms / parameters.noise_ms)
+    return kernel.Constants(
+        block=block_cubic(),
+        block_low_mv=f4(BLOCK_LOW_MV),
+        block_high_mv=f4(BLOCK_HIGH_MV),
+        leak_mv=f4(parameters.leak_mv),
+        threshold_mv=f4(parameters.threshold_mv),
+        reset_mv=f4(parameters.reset_mv),
+        potassium_mv=f4(parameters.potassium_mv),
+        gaba_mv=f4(parameters.gaba_mv),
+        keep_ampa=keep(parameters.ampa_ms),
+        keep_nmda=keep(parameters.nmda_ms),
+        keep_gaba=keep(parameters.gaba_ms),
+        keep_potassium=keep(parameters.hyperpolarisation_ms),
+        keep_adaptation=keep(parameters.adaptation_ms),
+        keep_noise=f4(noise_keep),
+        noise_scale_mv=f4(parameters.noise_mv * np.sqrt(1 - noise_keep**2) / kernel.SUM_OF_FOUR_SD),
+        nmda_ratio=f4(parameters.nmda_ratio),
+        nmda_fill=f4(1 / parameters.nmda_saturation),
+        hyperpolarisation=f4(parameters.hyperpolarisation),
+        adaptation_mv=f4(parameters.adaptation_mv),
+        step_s=step_ms / 1000,
+        use=table("use"),
+        recovery_s=table("recovery_ms") / 1000,
+        facilitation_s=table("facilitation_ms") / 1000,
+        availability_loss=parameters.availability_loss,
+        availability_s=parameters.availability_s,
+        release_loss=parameters.release_loss,
+        release_recovery_s=parameters.release_recovery_min * 60,
+        n_excitatory=parameters.n_excitatory,
+    )
+
+
+def nmda_block(v_mv: Float64[np.ndarray, " potentials"]) -> Float64[np.ndarray, " potentials"]:
+    """B(V) = 1 / (1 + exp(-0.062 V) / 3.57): the share of NMDA channels that magnesium leaves open.
+
+    Jahr & Stevens 1990, doi 10.1523/JNEUROSCI.10-09-03178.1990, at 1 mM magnesium.
+    """
+    return 1 / (1 + np.exp(-0.062 * v_mv) / 3.57)
+
+
+def block_cubic() -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """The cubic through B(V) at the four Chebyshev nodes of the range where neurons live, constant term first."""
+    middle, half = (BLOCK_LOW_MV + BLOCK_HIGH_MV) / 2, (BLOCK_HIGH_MV - BLOCK_LOW_MV) / 2
+    nodes_mv = middle + half * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
+    b0, b1, b2, b3 = np.polynomial.Polynomial.fit(nodes_mv, nmda_block(nodes_mv), 3).convert().coef
+    return np.float32(b0), np.float32(b1), np.float32(b2), np.float32(b3)
+
+
+def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> kernel.Wiring:
+    rng = np.random.default_rng([seed, 7])
+    is_e, step_ms = network.is_excitatory, parameters.step_ms
+    membrane_ms = np.where(is_e, parameters.membrane_e_ms, parameters.membrane_i_ms)
+    refractory_ms = np.where(is_e, parameters.refractory_e_ms, parameters.refractory_i_ms)
+    return kernel.Wiring(
+        step_over_membrane=(step_ms / membrane_ms).astype(np.float32),
+        refractory_steps=np.rint(refractory_ms / step_ms).astype(np.int32),
+        drive_mv=network.drive_mv,
+        noise_key=rng.integers(0, 2**64, len(network), dtype=np.uint64),
+        needed=rng.uniform(parameters.availability_needed_low, parameters.availability_needed_high, len(network)),
+        start=network.start,
+        target=network.target,
+        weight=network.weight,
+        delay_steps=network.delay_steps,
+    )
+
+
+def fresh_state(seed: int, parameters: TissueParameters, network: Network, wiring: kernel.Wiring) -> kernel.State:
+    """A rested tissue: recovered synapses, no conductances, drive and membrane drawn from a plausible spread."""
+    rng = np.random.default_rng([seed, 8])
+    n = len(network)
+    drive_mv = wiring.drive_mv + parameters.noise_mv * rng.standard_normal(n)
+    ring = 1 << int(max(network.delay_steps, default=1)).bit_length()
+    use = np.where(
+        network.is_excitatory[:, None],
+        np.array([[parameters.e_to_e.use, parameters.e_to_i.use]]),
+        np.array([[parameters.i_to_any.use, parameters.i_to_any.use]]),
+    )
+
+    def zeros(*shape: int) -> np.ndarray:
+        return np.zeros(shape, np.float32)
+
+    return kernel.State(
+        v_mv=rng.uniform(parameters.leak_mv, parameters.reset_mv, n).astype(np.float32),
+        drive_mv=drive_mv.astype(np.float32),
+        ampa=zeros(n),
+        nmda=zeros(n),
+        gaba=zeros(n),
+        potassium=zeros(n),
+        adaptation_mv=zeros(n),
+        refractory=np.zeros(n, np.int32),
+        arriving_e=zeros(ring, n),
+        arriving_i=zeros(ring, n),
+        last_spike=np.zeros(n, np.int64),
+        x=np.ones((n, 2)),
+        u=use,
+        available=np.ones(n),
+        release=np.ones(n),
+    )

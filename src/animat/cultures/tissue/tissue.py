@@ -1,0 +1,217 @@
+"""A piece of living matter that is simulated: neurons on a plane that spike, can be stimulated, and grow tired."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from animat.cultures.tissue import kernel
+from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
+from animat.cultures.tissue.fatigue import MARK_S, Fatigue
+from animat.cultures.tissue.network import grow
+from animat.cultures.tissue.parameters import TissueParameters
+from animat.cultures.tissue.preparation import fresh_state, prepare_constants, prepare_wiring
+from animat.errors import InvalidArgument, Mismatch
+
+NS = 1_000_000_000
+
+
+class Spikes(NamedTuple):
+    """Spikes in the order of time.
+
+    Attributes:
+        time_s: on the tissue's clock, shape (spikes,).
+        neuron: which neuron, shape (spikes,).
+    """
+
+    time_s: Float64[np.ndarray, " spikes"]
+    neuron: Int64[np.ndarray, " spikes"]
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The state of a tissue at one time, made by `Tissue.snapshot`, for tissues of the same seed and parameters."""
+
+    seed: int
+    parameters: TissueParameters
+    now_ns: int
+    step: int
+    kicks: Kicks
+    state: kernel.State
+
+
+class Tissue:
+    """A simulated culture of neurons without electrodes: `docs/virtual-culture.md` holds its equations.
+
+    Conductance-based leaky integrate-and-fire neurons with Tsodyks-Markram synapses. The same seed, parameters and
+    pulses give the same spikes bit for bit, in whatever pieces time is passed. Positions are in micrometres from the
+    array's corner. Nothing is known here of channels, files or protocols.
+
+    Args:
+        seed: decides the network, every draw of noise, and the drift over hours; zero or more.
+        parameters: the model's numbers.
+
+    Raises:
+        InvalidArgument: for a negative seed.
+    """
+
+    def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:
+        if seed < 0:
+            raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+        self.seed = seed
+        self.parameters = parameters or TissueParameters()
+        self._network = grow(seed, self.parameters)
+        self._coupling = Coupling(seed, self.parameters, self._network)
+        self._fatigue = Fatigue(seed, self.parameters)
+        self._constants = prepare_constants(self.parameters)
+        self._wiring = prepare_wiring(seed, self.parameters, self._network)
+        self._state = fresh_state(seed, self.parameters, self._network, self._wiring)
+        self._step_ns = round(self.parameters.step_ms * 1e6)
+        self._now_ns = 0
+        self._step = 0
+        self._kicks = NO_KICKS
+        capacity = max(4 * self.parameters.neurons, 20_000)
+        self._spike_step = np.empty(capacity, np.int64)
+        self._spike_neuron = np.empty(capacity, np.int64)
+
+    @property
+    def now_s(self) -> float:
+        """The tissue's clock: what has been advanced and rested since it was made."""
+        return self._now_ns / NS
+
+    @property
+    def x_um(self) -> Float64[np.ndarray, " neurons"]:
+        """Position of each neuron along the array's long side."""
+        return self._network.x_um.copy()
+
+    @property
+    def y_um(self) -> Float64[np.ndarray, " neurons"]:
+        """Position of each neuron along the array's short side."""
+        return self._network.y_um.copy()
+
+    @property
+    def is_excitatory(self) -> Bool[np.ndarray, " neurons"]:
+        """Whether each neuron is excitatory."""
+        return self._network.is_excitatory.copy()
+
+    def advance(self, duration_s: float, pulses: Sequence[Pulse] = ()) -> Spikes:
+        """Let time pass, stimulate meanwhile, and return the spikes.
+
+        Time is kept to a nanosecond and stepped as far as whole steps fit, so a second in eighty pieces of 12.5 ms is
+        the same as in one. A pulse takes effect at the first step that does not begin before it.
+
+        Args:
+            duration_s: how long, zero or more.
+            pulses: pulses whose times lie in [now_s, now_s + duration_s), in any order.
+
+        Raises:
+            InvalidArgument: for a negative duration, or a pulse outside this stretch of time; nothing has then passed.
+        """
+        end_ns = self._now_ns + _nanoseconds("duration_s", duration_s)
+        new = [self._kicks_of(pulse, end_ns) for pulse in pulses]
+        if new:
+            self._kicks = in_order(self._kicks, *new)
+        self._now_ns = end_ns
+        last_step = end_ns // self._step_ns
+        steps, neurons = [], []
+        while self._step < last_step:
+            mark = self._step * self._step_ns // (MARK_S * NS)
+            mark_end = -(-(mark + 1) * MARK_S * NS // self._step_ns)
+            taken, passed, spikes = kernel.advance(
+                self._constants,
+                self._wiring,
+                self._state,
+                self._step,
+                min(last_step, mark_end) - self._step,
+                self._fatigue.gain(mark),
+                *self._kicks,
+                self._spike_step,
+                self._spike_neuron,
+            )
+            self._step += taken
+            if passed:
+                self._kicks = Kicks(*(column[passed:] for column in self._kicks))
+            steps.append(self._spike_step[:spikes].copy())
+            neurons.append(self._spike_neuron[:spikes].copy())
+        if not steps:
+            return Spikes(np.empty(0), np.empty(0, np.int64))
+        return Spikes(np.concatenate(steps) * (self._step_ns / NS), np.concatenate(neurons))
+
+    def rest(self, duration_s: float) -> None:
+        """Let time pass in closed form: without stepping, without a stimulus, and as if no neuron spiked.
+
+        Everything that decays or recovers exponentially (after-hyperpolarisation, adaptation, conductances, short-term
+        plasticity, availability, release) goes to where it is after that time, and the slow drift goes on as it would
+        have. The noisy drive is drawn anew from its distribution given where it was; the membrane settles at its drive,
+        or at the reset where the drive is above; what was under way arrives nowhere. Afterwards advance a second or so
+        before trusting the fast variables.
+
+        Args:
+            duration_s: how long, zero or more.
+
+        Raises:
+            InvalidArgument: for a negative duration.
+        """
+        self._now_ns += _nanoseconds("duration_s", duration_s)
+        steps = self._now_ns // self._step_ns - self._step
+        if steps == 0:
+            return
+        constants, state = self._constants, self._state
+        for values, keep in (
+            (state.ampa, constants.keep_ampa),
+            (state.nmda, constants.keep_nmda),
+            (state.gaba, constants.keep_gaba),
+            (state.potassium, constants.keep_potassium),
+            (state.adaptation_mv, constants.keep_adaptation),
+        ):
+            values *= np.float32(float(keep) ** steps)
+        rng = np.random.default_rng([self.seed, 6, self._step])
+        kept = float(constants.keep_noise) ** steps
+        spread_mv = self.parameters.noise_mv * np.sqrt(1 - kept**2)
+        mean_mv = self._wiring.drive_mv
+        state.drive_mv[:] = mean_mv + (state.drive_mv - mean_mv) * kept + spread_mv * rng.standard_normal(len(mean_mv))
+        state.v_mv[:] = np.minimum(constants.leak_mv + state.drive_mv, constants.reset_mv)
+        state.refractory[:] = np.maximum(state.refractory - steps, 0)
+        state.arriving_e[:] = 0
+        state.arriving_i[:] = 0
+        # x, u, availability and release are kept as of each neuron's last spike: moving the clock recovers them.
+        self._step += steps
+        self._kicks = NO_KICKS
+
+    def snapshot(self) -> Snapshot:
+        """A copy of the state, to come back to."""
+        state = kernel.State(*(values.copy() for values in self._state))
+        return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks, state)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back, or on, to a snapshot: what follows is bit for bit what followed it.
+
+        Raises:
+            Mismatch: for a snapshot of another seed or other parameters.
+        """
+        if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
+            raise Mismatch(
+                f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or of "
+                "other parameters: make a tissue with those"
+            )
+        self._state = kernel.State(*(values.copy() for values in snapshot.state))
+        self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
+
+    def _kicks_of(self, pulse: Pulse, end_ns: int) -> Kicks:
+        pulse_ns = round(pulse.time_s * NS)
+        if not self._now_ns <= pulse_ns < end_ns:
+            raise InvalidArgument(
+                f"pulses: expected times from {self.now_s:g} s to before {end_ns / NS:g} s on the tissue's clock, "
+                f"got {pulse.time_s:g} s"
+            )
+        return self._coupling.kicks(pulse, -(-pulse_ns // self._step_ns))
+
+
+def _nanoseconds(name: str, seconds: float) -> int:
+    if not 0 <= seconds < float("inf"):
+        raise InvalidArgument(f"{name}: expected a time of 0 s or more, got {seconds}")
+    return round(seconds * NS)
