@@ -1,0 +1,28 @@
+"""Gymnasium environments: `Animat/Cartpole-v0` and `Animat/Navigation-v0`, each alone or as a vector.
+
+`import animat` registers them; `gymnasium.make("animat:Animat/Cartpole-v0")` does both. What they accept is the
+signature of `animat.gym.setup.set_up`.
+"""
+
+from __future__ import annotations
+
+IDS = {"Animat/Cartpole-v0": "cartpole", "Animat/Navigation-v0": "navigation"}
+"""The environments, and the robot of each."""
+
+
+def register_environments() -> None:
+    """Tell Gymnasium about the environments; doing it again changes nothing.
+
+    Nothing else of animat, and no JAX, is loaded before an environment is made.
+    """
+    from gymnasium.envs.registration import register, registry
+
+    for id_, robot in IDS.items():
+        if id_ not in registry:
+            # No max_episode_steps: the robot's own episode limit truncates, and is an option like all others.
+            register(
+                id_,
+                entry_point="animat.gym.single:AnimatEnv",
+                vector_entry_point="animat.gym.vector:AnimatVectorEnv",
+                kwargs={"robot": robot},
+            )

@@ -1,0 +1,116 @@
+"""From the options of an environment to an Animat and the simulator of its neurons."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from animat.animat import Animat, Delivery
+from animat.errors import InvalidArgument, UnusableData
+from animat.mapping import Mapping, mapping_named
+from animat.neurons.conditions import conditions_named
+from animat.neurons.made_up import LABELS, made_up_simulator
+from animat.neurons.responses import extract_responses
+from animat.neurons.simulator import Kind, NeuronSimulator
+from animat.neurons.timeline import fit_timeline
+from animat.neurons.windows import DEFAULT_WINDOW_MS
+from animat.recordings.reading import read_recordings
+from animat.robots.registry import robot_named
+
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What an environment runs on.
+
+    Attributes:
+        animat: neurons, mapping and robot; static.
+        simulator: how the neurons answer; data.
+        condition_labels: what the actions 0, 1, ... do, `("5 Hz", ...)`.
+    """
+
+    animat: Animat[Any]
+    simulator: NeuronSimulator
+    condition_labels: tuple[str, ...]
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """The robot's quantities in its own units, within the bounds that no episode passes."""
+        quantities = self.animat.robot.quantities
+        low, high = (np.array([getattr(q, end) for q in quantities], np.float32) for end in ("low", "high"))
+        return spaces.Box(low, high, dtype=np.float32)
+
+    @property
+    def action_space(self) -> spaces.Discrete:
+        """The conditions."""
+        return spaces.Discrete(self.animat.n_conditions)
+
+
+def set_up(
+    robot: str,
+    *,
+    mapping: str | Mapping = "1-threshold",
+    recordings: Paths | None = None,
+    simulator: NeuronSimulator | None = None,
+    at_min: float = 0.0,
+    conditions: str | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    kind: Kind = "histogram",
+    delivery: Delivery = "chosen",
+    **parameters: float,
+) -> Setup:
+    """Read the options of `Animat/...` environments.
+
+    Args:
+        robot: its name; set by the environment's id.
+        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`.
+        recordings: files or folders of recordings of one culture to make the neurons' simulator of.
+        simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions
+            of `animat.neurons.made_up` answer.
+        at_min: which recording's simulator, in minutes on the culture's clock: the newest at that time.
+        conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
+        window_ms: when a response is read after its stimulus.
+        kind: `histogram` (the paper) or `empirical`.
+        delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
+        parameters: of the robot, `pole_mass_kg=0.55`.
+
+    Raises:
+        InvalidArgument: for options that are not known or do not go together.
+        InvalidFile: for recordings that cannot be read.
+        UnusableData: for recordings that no controller can learn from.
+    """
+    body = robot_named(robot, **parameters)
+    for caveat in body.caveats():
+        warnings.warn(caveat, stacklevel=2)
+    if recordings is not None and simulator is not None:
+        raise InvalidArgument("recordings, simulator: expected one of them, got both")
+    if recordings is not None:
+        simulator, labels = _simulator_of(recordings, at_min, conditions, window_ms, kind)
+    elif simulator is not None:
+        labels = tuple(f"condition {i}" for i in range(simulator.n_conditions))
+    else:
+        simulator, labels = made_up_simulator(), LABELS
+    if delivery not in ("chosen", "shuffled"):
+        raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
+    chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
+    return Setup(Animat(body, chosen, simulator.n_conditions, delivery), simulator, labels)
+
+
+def _simulator_of(
+    recordings: Paths, at_min: float, conditions: str | None, window_ms: tuple[float, float], kind: Kind
+) -> tuple[NeuronSimulator, tuple[str, ...]]:
+    by = None if conditions is None else conditions_named(conditions)
+    timeline = fit_timeline([extract_responses(r, by, window_ms) for r in read_recordings(recordings)], kind=kind)
+    for finding in timeline.findings:
+        if finding.severity == "refuse":
+            raise UnusableData(f"recordings: {finding.sentence}")
+        if finding.severity == "warning":
+            warnings.warn(finding.sentence, stacklevel=3)
+    return timeline.at(at_min), tuple(condition.label for condition in timeline.conditions)

@@ -1,0 +1,105 @@
+"""One Animat as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from animat.errors import InvalidArgument
+from animat.gym.compiled import CompiledAnimat, Step
+from animat.gym.setup import set_up
+from animat.report.frames import draw_robot
+
+
+class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
+    """A robot that moves as neurons answer; the action picks the stimulus.
+
+    Observation: `Box`, what the robot sees, in the task's units (the learner scales). Action: `Discrete`, the index
+    of the condition given to the neurons. Reward: the task's own. `terminated` when the task ends by itself,
+    `truncated` at the robot's `episode_limit`, never both.
+
+    `info` of a step: `delivered`, the condition that reached the neurons; `rate_hz`, how they answered (Hz per
+    channel); `command`, the motor command in [-1, 1] made of it.
+
+    Everything random comes from the generator that `reset(seed=...)` seeds.
+
+    Args:
+        robot: its name; set by the environment's id.
+        render_mode: `rgb_array`, or None.
+        options: mapping, neurons and the robot's parameters (see `animat.gym.setup.set_up`).
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's name and form
+
+    def __init__(self, robot: str, *, render_mode: str | None = None, **options: Any) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.setup = set_up(robot, **options)
+        self.observation_space = self.setup.observation_space
+        self.action_space = self.setup.action_space
+        self._compiled = CompiledAnimat(self.setup)
+        self._states: Float32[np.ndarray, "1 numbers"] | None = None
+        self._shown: list[Float32[np.ndarray, " observations"]] = []
+        self._command = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32[np.ndarray, " observations"], dict[str, Any]]:
+        """Start an episode; `options` are not used."""
+        super().reset(seed=seed)
+        self._states, observations = self._compiled.start(1, self.np_random)
+        self._shown, self._command = [], 0.0
+        self._show(observations[0])
+        return observations[0], {}
+
+    def step(self, action: np.int64) -> tuple[Float32[np.ndarray, " observations"], float, bool, bool, dict[str, Any]]:
+        """Stimulate with the condition `action`, and let the robot move by the response."""
+        if self._states is None:
+            raise gymnasium.error.ResetNeeded("step: expected an episode that reset() started, got none")
+        if not self.action_space.contains(action):
+            last = self.setup.animat.n_conditions - 1
+            raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {action!r}")
+        after: Step = self._compiled.step(self._states, np.array([action]), self.np_random)
+        self._states = after.states
+        self._command = float(after.command[0])
+        self._show(after.observations[0])
+        info = {
+            "delivered": int(after.delivered[0]),
+            "rate_hz": float(after.rate_hz[0]),
+            "command": self._command,
+        }
+        return (
+            after.observations[0],
+            float(after.rewards[0]),
+            bool(after.terminated[0]),
+            bool(after.truncated[0]),
+            info,
+        )
+
+    def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """A picture of the robot as it is now, with `render_mode="rgb_array"`."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render: made without a render_mode; make it with render_mode="rgb_array"')
+            return None
+        if not self._shown:
+            raise gymnasium.error.ResetNeeded("render: expected an episode that reset() started, got none")
+        *earlier, now = self._shown
+        return draw_robot(self.setup.animat.robot, now, command=self._command, earlier=earlier)
+
+    def _show(self, observation: Float32[np.ndarray, " observations"]) -> None:
+        """Keep what pictures need; the observation itself is the user's, so it is copied."""
+        if self.render_mode is not None:
+            self._shown.append(observation.copy())
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuse a render mode other than None and `rgb_array`.
+
+    Raises:
+        InvalidArgument: naming the mode.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")

@@ -1,0 +1,129 @@
+"""Many Animats, stepped at once, as a Gymnasium vector environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from jaxtyping import Bool, Float32, Int64, UInt8
+
+from animat.errors import InvalidArgument
+from animat.gym.compiled import CompiledAnimat, Rows
+from animat.gym.setup import set_up
+from animat.gym.single import check_render_mode
+from animat.report.frames import draw_robot
+
+IN_INFO = ("delivered", "rate_hz", "command")
+
+
+class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float32[np.ndarray, " environments"]]):
+    """`num_envs` independent Animats in one compiled call; each is an `AnimatEnv` (see there).
+
+    An environment whose episode ended starts anew in the step after (Gymnasium's `NEXT_STEP`): its action is not used
+    in that step, its observation is the first of the new episode, its reward 0. `info` holds arrays `delivered`,
+    `rate_hz` and `command`, each with a mask `_delivered` and so on that is False where a step only started an episode.
+
+    Args:
+        robot: its name; set by the environment's id.
+        num_envs: how many.
+        render_mode: `rgb_array`, or None.
+        options: as of `AnimatEnv`, the same for all.
+    """
+
+    metadata = {  # noqa: RUF012 - Gymnasium's name and form
+        "render_modes": ["rgb_array"],
+        "render_fps": 50,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(self, robot: str, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+        if num_envs < 1:
+            raise InvalidArgument(f"num_envs: expected at least 1, got {num_envs}")
+        check_render_mode(render_mode)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.setup = set_up(robot, **options)
+        self.single_observation_space = self.setup.observation_space
+        self.single_action_space = self.setup.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._compiled = CompiledAnimat(self.setup)
+        self._states: Rows | None = None
+        self._ended: Bool[np.ndarray, " environments"] = np.zeros(num_envs, bool)
+        self._shown: list[list[Float32[np.ndarray, " observations"]]] = [[] for _ in range(num_envs)]
+        self._commands = np.zeros(num_envs, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Rows, dict[str, Any]]:
+        """Start all episodes; one seed decides all of them, and `options` are not used."""
+        super().reset(seed=seed)
+        states, observations = self._compiled.start(self.num_envs, self.np_random)
+        self._states = states
+        self._ended = np.zeros(self.num_envs, bool)
+        self._show(observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, bool))
+        return observations, {}
+
+    def step(
+        self, actions: Int64[np.ndarray, " environments"]
+    ) -> tuple[
+        Rows,
+        Float32[np.ndarray, " environments"],
+        Bool[np.ndarray, " environments"],
+        Bool[np.ndarray, " environments"],
+        dict[str, Any],
+    ]:
+        """One iteration of each environment, or the start of a new episode where the last one ended."""
+        if self._states is None:
+            raise gymnasium.error.ResetNeeded("step: expected episodes that reset() started, got none")
+        actions = np.asarray(actions)
+        n_conditions = self.setup.animat.n_conditions
+        is_whole = np.issubdtype(actions.dtype, np.integer)
+        if not is_whole or actions.shape != (self.num_envs,) or np.any((actions < 0) | (actions >= n_conditions)):
+            raise InvalidArgument(
+                f"actions: expected {self.num_envs} conditions, whole numbers from 0 to {n_conditions - 1}, "
+                f"got {actions!r}"
+            )
+        after = self._compiled.step(self._states, actions, self.np_random)
+        begun, going = self._ended, ~self._ended
+        states, observations = after.states, after.observations
+        if begun.any():
+            start_states, start_observations = self._compiled.start(self.num_envs, self.np_random)
+            states = np.where(begun[:, None], start_states, states)
+            observations = np.where(begun[:, None], start_observations, observations)
+        self._states = states
+        rewards = np.where(begun, np.float32(0), after.rewards)
+        terminated, truncated = after.terminated & going, after.truncated & going
+        self._ended = terminated | truncated
+        info: dict[str, Any] = {}
+        for name in IN_INFO:
+            info[name], info[f"_{name}"] = np.where(going, getattr(after, name), 0), going.copy()
+        self._show(observations, np.where(going, after.command, np.float32(0)), begun)
+        return observations, rewards, terminated, truncated, info
+
+    def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
+        """A picture of each robot as it is now, with `render_mode="rgb_array"`."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render: made without a render_mode; make it with render_mode="rgb_array"')
+            return None
+        if self._states is None:
+            raise gymnasium.error.ResetNeeded("render: expected episodes that reset() started, got none")
+        robot = self.setup.animat.robot
+        return tuple(
+            draw_robot(robot, shown[-1], command=float(u), earlier=shown[:-1])
+            for shown, u in zip(self._shown, self._commands, strict=True)
+        )
+
+    def _show(
+        self,
+        observations: Rows,
+        commands: Float32[np.ndarray, " environments"],
+        begun: Bool[np.ndarray, " environments"],
+    ) -> None:
+        """Keep what pictures need; the observations themselves are the user's, so they are copied."""
+        if self.render_mode is None:
+            return
+        self._commands = commands
+        for i, observation in enumerate(observations.copy()):
+            self._shown[i] = [observation] if begun[i] else [*self._shown[i], observation]

@@ -1,0 +1,68 @@
+"""A simulator of made-up responses with known truth, for a first try and for tests without any recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from animat.errors import InvalidArgument
+from animat.neurons.simulator import PERCENTILES, HistogramSimulator
+
+MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
+"""Mean responses to the five conditions, in the order of 5, 10, 20, 40 and 80 Hz."""
+
+LABELS = ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
+
+
+def made_up_simulator(
+    means_hz: Sequence[float] = MEANS_HZ,
+    *,
+    shape: float = 6.0,
+    bins: int = 20,
+    range_hz: float = 120.0,
+    n_responses: int = 500,
+) -> HistogramSimulator:
+    """The histogram simulator of gamma-distributed responses, in closed form: nothing is drawn, nothing is fitted.
+
+        x | condition c  ~  Gamma(shape, means_hz[c] / shape)
+
+    With the defaults, a response passes the pooled median (38.7 Hz) with probability 0.22, 0.38, 0.53, 0.64 and 0.74.
+
+    Args:
+        means_hz: mean response to each condition, Hz per channel.
+        shape: of all the gamma distributions; the larger, the narrower.
+        bins, range_hz: of the histogram, from 0; what lies above the range counts into the last bin.
+        n_responses: of a recording, all conditions together (the paper: 500). The percentiles P0 and P100, which for
+            a distribution would be 0 and infinity, are where the ends of so many responses lie: the quantiles
+            1/(n + 1) and n/(n + 1).
+
+    Raises:
+        InvalidArgument: for no means, or a number that is not positive.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import gammainc
+
+    means = np.asarray(means_hz, np.float64)
+    if means.ndim != 1 or not len(means) or not np.all(np.isfinite(means) & (means > 0)):
+        raise InvalidArgument(f"means_hz: expected one positive mean in Hz a condition, got {means_hz!r}")
+    for name, value in {"shape": shape, "bins": bins, "range_hz": range_hz, "n_responses": n_responses}.items():
+        if not (np.isfinite(value) and value > 0):
+            raise InvalidArgument(f"{name}: expected a positive number, got {value!r}")
+
+    edges_hz = np.linspace(0.0, range_hz, bins + 1)
+    cumulative = gammainc(shape, edges_hz * shape / means[:, None])
+    cumulative[:, -1] = 1.0
+
+    def pooled_share_below(x_hz: float) -> float:
+        return float(np.mean(gammainc(shape, x_hz * shape / means)))
+
+    shares = np.clip(np.array(PERCENTILES) / 100, 1 / (n_responses + 1), n_responses / (n_responses + 1))
+    highest_hz = 100 * float(means.max())
+    percentiles_hz = [brentq(lambda x, share=share: pooled_share_below(x) - share, 0.0, highest_hz) for share in shares]
+    return HistogramSimulator(
+        jnp.asarray(cumulative, jnp.float32),
+        jnp.asarray(edges_hz, jnp.float32),
+        jnp.asarray(percentiles_hz, jnp.float32),
+    )
