@@ -40,7 +40,7 @@ class Channels:
         _freeze(self, "the channel table", label=np.str_, electrode=np.int64, x_um=np.float64, y_um=np.float64)
         labels, counts = np.unique(self.label, return_counts=True)
         if np.any(counts > 1):
-            raise UnusableData(f"channels.label: expected each label once, got {labels[counts > 1][0]!r} twice or more")
+            raise UnusableData(f"channels.label: expected each label once, got '{labels[counts > 1][0]}' twice or more")
 
     def __len__(self) -> int:
         return len(self.label)

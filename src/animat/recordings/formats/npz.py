@@ -73,7 +73,7 @@ def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
     routing: dict[str, Column] = {}
     left_out = []
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             for key in archive.files:
                 name = OTHER_NAMES.get(key, key)
                 if name in columns:

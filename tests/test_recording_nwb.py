@@ -1,0 +1,256 @@
+"""NWB: a saved recording reads back equal. Oracles: pynwb's validator and reader, nwbinspector, real full disks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.formats.nwb import read_nwb, write_nwb
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.protocol import Presentation
+from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+
+TEXT = st.text(st.characters(blacklist_characters="\0", blacklist_categories=("Cs",)), max_size=8)
+FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@st.composite
+def recordings(draw: st.DrawFn, max_channels: int = 6) -> Recording:
+    n_channels = draw(st.integers(0, max_channels))
+    n_spikes = draw(st.integers(0, 30)) if n_channels else 0
+    n_stimuli, width = draw(st.integers(0, 8)), draw(st.integers(0, 4))
+    start_s = draw(st.floats(-1e4, 1e4))
+    # Few distinct times, so that spikes and stimuli coincide.
+    times = st.integers(0, 20).map(lambda step: start_s + 0.5 * step)
+    spike_s = draw(npst.arrays(np.float64, n_spikes, elements=times))
+    stimulus_s = draw(npst.arrays(np.float64, n_stimuli, elements=times))
+    whole = st.integers(-1, 2**40)
+    presentations = st.builds(Presentation, st.sampled_from(["blocked", "mixed"]), st.integers(1, 9))
+    position = st.floats(allow_nan=True, allow_infinity=False)
+    return Recording(
+        spike_times_s=np.sort(spike_s),
+        spike_channels=draw(npst.arrays(np.int64, n_spikes, elements=st.integers(0, max(n_channels - 1, 0)))),
+        channels=Channels(
+            # numpy's text arrays do not keep null characters at the end, nor does anyone need them.
+            label=np.array(draw(st.lists(TEXT, min_size=n_channels, max_size=n_channels, unique=True)), dtype=np.str_),
+            electrode=draw(npst.arrays(np.int64, n_channels, elements=whole)),
+            x_um=draw(npst.arrays(np.float64, n_channels, elements=position)),
+            y_um=draw(npst.arrays(np.float64, n_channels, elements=position)),
+        ),
+        stimuli=Stimuli(
+            time_s=np.sort(stimulus_s),
+            frequency_hz=draw(
+                npst.arrays(np.float64, n_stimuli, elements=st.sampled_from([np.nan, 0.2, 5.0, 80.0, 1 / 3]))
+            ),
+            pattern=draw(npst.arrays(np.int64, n_stimuli, elements=whole)),
+            electrodes=draw(npst.arrays(np.int64, (n_stimuli, width), elements=st.sampled_from([UNKNOWN, 7, 26_399]))),
+            presentation=np.sort(draw(npst.arrays(np.int64, n_stimuli, elements=whole))),
+        ),
+        sampling_rate_hz=draw(st.sampled_from([np.nan, 20_000.0, 25_000.0])),
+        start_s=start_s,
+        duration_s=draw(st.floats(10.1, 1e5)),
+        start_min=draw(st.floats(-1e6, 1e6)),
+        presentation=draw(st.none() | presentations),
+        provenance=draw(st.dictionaries(TEXT, TEXT, max_size=3)),
+    )
+
+
+@pytest.fixture(scope="module")
+def made_up() -> Recording:
+    return make_up_recording(3, start_min=20.0, patterns=12, channels=32)
+
+
+@FEW
+@given(recording=recordings())
+def test_a_saved_recording_reads_back_equal(recording: Recording, tmp_path: Path) -> None:
+    recording.save(tmp_path / "a.nwb")
+    assert Recording.load(tmp_path / "a.nwb").equals(recording)
+
+
+@settings(FEW, max_examples=8)
+@given(recording=recordings())
+def test_pynwb_finds_every_saved_recording_valid(recording: Recording, tmp_path: Path) -> None:
+    import pynwb
+
+    recording.save(tmp_path / "a.nwb")
+    assert pynwb.validate(path=str(tmp_path / "a.nwb")) == []
+
+
+def test_a_recording_of_205_000_spikes_on_1024_channels_reads_back_equal(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    recording = Recording(
+        spike_times_s=np.sort(np.round(rng.uniform(-1, 100, 205_000) * 20_000) / 20_000),
+        spike_channels=rng.integers(0, 1024, 205_000),
+        channels=Channels(np.arange(1024).astype(str), np.arange(1024), rng.random(1024), rng.random(1024)),
+        stimuli=make_up_recording(0).stimuli,
+        sampling_rate_hz=20_000.0,
+        start_s=-1.0,
+        duration_s=101.0,
+    )
+    recording.save(tmp_path / "a.nwb")
+    assert read_nwb(tmp_path / "a.nwb").equals(recording)
+
+
+def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(made_up: Recording, tmp_path: Path) -> None:
+    import pynwb
+
+    made_up.save(tmp_path / "a.nwb")
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r") as nwb_io:
+        nwb = nwb_io.read()
+        assert len(nwb.units) == len(made_up.channels)
+        for channel in range(len(made_up.channels)):
+            expected_s = made_up.spike_times_s[made_up.spike_channels == channel]
+            np.testing.assert_array_equal(nwb.units["spike_times"][channel], expected_s)
+            region = nwb.units["electrodes"][channel]
+            assert region["label"].tolist() == [made_up.channels.label[channel]]
+        electrodes = nwb.electrodes.to_dataframe()
+        np.testing.assert_array_equal(electrodes["electrode_id"], made_up.channels.electrode)
+        np.testing.assert_array_equal(electrodes["rel_x"], made_up.channels.x_um)
+        stimuli = nwb.stimulus["stimuli"].to_dataframe()
+        np.testing.assert_array_equal(stimuli["start_time"], made_up.stimuli.time_s)
+        np.testing.assert_array_equal(stimuli["frequency_hz"], made_up.stimuli.frequency_hz)
+        np.testing.assert_array_equal(np.stack(stimuli["electrode_ids"].tolist()), made_up.stimuli.electrodes)
+        np.testing.assert_array_equal(nwb.units["obs_intervals"][0], [[made_up.start_s, made_up.stop_s]])
+        assert nwb.units.resolution == 1 / 20_000
+
+
+def test_who_recorded_what_goes_into_the_fields_of_nwb(made_up: Recording, tmp_path: Path) -> None:
+    import pynwb
+
+    with_subject(made_up).save(tmp_path / "a.nwb")
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r") as nwb_io:
+        nwb = nwb_io.read()
+        assert nwb.experimenter == ("Doe, Jane", "Roe, Richard")
+        assert nwb.subject.species == "Rattus norvegicus"
+        assert nwb.session_start_time.isoformat() == "2024-05-31T14:00:00+09:00"
+        assert nwb.keywords[:].tolist() == ["culture", "stimulation"]
+
+
+@pytest.mark.oracle
+def test_nwbinspector_finds_nothing_critical_and_no_violation(made_up: Recording, tmp_path: Path) -> None:
+    from nwbinspector import Importance, inspect_nwbfile
+
+    with_subject(made_up).save(tmp_path / "a.nwb")
+    messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "a.nwb")))
+    # What is left is a suggestion: the table of scalars has one row.
+    assert [m.check_function_name for m in messages if m.importance != Importance.BEST_PRACTICE_SUGGESTION] == []
+
+
+def with_subject(recording: Recording) -> Recording:
+    import dataclasses
+
+    who = {
+        "experimenter": "Doe, Jane; Roe, Richard",
+        "institution": "An Institute",
+        "lab": "A Laboratory",
+        "recorded_at": "2024-05-31T14:00:00+09:00",
+        "keywords": "culture, stimulation",
+        "experiment_description": "Responses to five frequencies.",
+        "subject_id": "culture-1",
+        "species": "Rattus norvegicus",
+        "sex": "U",
+        "age": "P42D",
+        "subject_description": "dissociated cortical culture",
+    }
+    return dataclasses.replace(recording, provenance={**recording.provenance, **who})
+
+
+@pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_one_clear_line(made_up: Recording, tmp_path: Path, share: float) -> None:
+    path = tmp_path / "a.nwb"
+    made_up.save(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(InvalidFile, match=r"a\.nwb: expected a whole NWB recording, but it is cut off") as caught:
+        Recording.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_damage_anywhere_in_the_file_is_an_error_of_ours_or_harmless(made_up: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "a.nwb"
+    made_up.save(path)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for start in rng.integers(8, len(content) - 64, 60).tolist():
+        path.write_bytes(content[:start] + rng.bytes(64) + content[start + 64 :])
+        try:
+            read_nwb(path)
+        except InvalidFile as error:
+            assert "\n" not in str(error)
+
+
+def test_another_programs_files_are_refused(tmp_path: Path) -> None:
+    import datetime
+
+    import pynwb
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["voltage"] = np.zeros(3)
+    with pytest.raises(InvalidFile, match=r"a\.h5: expected NWB, got another HDF5 file \(it holds: voltage\)"):
+        Recording.load(tmp_path / "a.h5")
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    with pynwb.NWBHDF5IO(str(tmp_path / "b.nwb"), "w") as nwb_io:
+        nwb_io.write(pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start))
+    with pytest.raises(InvalidFile, match=r"b\.nwb: expected an NWB recording written by animat .* got another"):
+        Recording.load(tmp_path / "b.nwb")
+
+
+def test_a_file_of_a_later_format_version_is_refused(made_up: Recording, tmp_path: Path) -> None:
+    made_up.save(tmp_path / "a.nwb")
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        file["processing/ecephys/animat_recording/format_version"][0] = 2
+    with pytest.raises(InvalidFile, match="expected format version 1 or older, got 2: update animat"):
+        read_nwb(tmp_path / "a.nwb")
+
+
+@pytest.mark.parametrize(
+    ("provenance", "message"),
+    [({"source": "a\0b"}, "without null characters"), ({"recorded_at": "yesterday"}, "ISO 8601 date")],
+)
+def test_text_that_the_file_cannot_hold_is_refused(
+    made_up: Recording, tmp_path: Path, provenance: dict[str, str], message: str
+) -> None:
+    import dataclasses
+
+    with pytest.raises(InvalidArgument, match=message):
+        write_nwb(dataclasses.replace(made_up, provenance=provenance), tmp_path / "a.nwb")
+    assert list(tmp_path.iterdir()) == []
+
+
+SAVE_ON_A_FULL_DISK = """
+import resource, signal, sys
+from animat.errors import InvalidFile
+from animat.recordings.made_up import make_up_recording
+recording = make_up_recording(4)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    recording.save(sys.argv[1])
+except InvalidFile as error:
+    print(error)
+    sys.exit(3)
+"""
+
+
+def test_a_full_disk_leaves_the_old_file_whole(made_up: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "a.nwb"
+    made_up.save(path)
+    before = path.read_bytes()
+    assert len(before) > 100_000
+    done = subprocess.run(
+        [sys.executable, "-c", SAVE_ON_A_FULL_DISK, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 3, done.stderr
+    assert "a.nwb: cannot be written: File too large; what stood there before is unchanged" in done.stdout
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["a.nwb"]
+    assert read_nwb(path).equals(made_up)

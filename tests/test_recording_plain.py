@@ -1,0 +1,425 @@
+"""Plain NPZ and CSV. Oracles: hand-written files, properties (any order reads the same), real recordings."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from animat.errors import AnimatError, InvalidArgument, InvalidFile
+from animat.recordings.noticed import noticed
+from animat.recordings.protocol import Presentation
+from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.recording import Recording
+
+FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+SPIKES = {"spike_time_s": np.array([0.5, -0.25, 0.5]), "spike_channel": np.array([7, 3, 3])}
+STIMULI = {"stimulus_time_s": np.array([2.0, 1.0])}
+
+
+def npz(folder: Path, **arrays: Any) -> Path:
+    np.savez_compressed(folder / "a.npz", **arrays)
+    return folder / "a.npz"
+
+
+def names(recording: Recording) -> set[str]:
+    return {finding.name for finding in noticed(recording)}
+
+
+# --- NPZ -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_required_keys_are_enough(tmp_path: Path) -> None:
+    recording = read_recording(npz(tmp_path, **SPIKES, **STIMULI))
+    assert recording.spike_times_s.tolist() == [-0.25, 0.5, 0.5]
+    assert recording.channels.label[recording.spike_channels].tolist() == ["3", "3", "7"]
+    assert recording.stimuli.time_s.tolist() == [1.0, 2.0]
+    assert (recording.start_s, recording.stop_s, recording.start_min) == (-0.25, 2.0, 0.0)
+    assert np.isnan(recording.sampling_rate_hz)
+    assert recording.presentation is None
+    assert recording.stimuli.presentation.tolist() == [0, 1]
+    assert names(recording) >= {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
+    assert "1 of 3 spikes came after a later one" in recording.provenance["note: unsorted-spikes"]
+
+
+def test_every_key_arrives_in_its_place(tmp_path: Path) -> None:
+    recording = read_recording(
+        npz(
+            tmp_path,
+            **SPIKES,
+            **STIMULI,
+            channel_label=np.array([3, 5, 7]),
+            channel_electrode=np.array([30, 50, 70]),
+            channel_xy_um=np.array([[0.0, 1], [2, 3], [4, np.nan]]),
+            stimulus_frequency_hz=np.array([80.0, np.nan]),
+            stimulus_pattern=np.array([1, 0]),
+            stimulus_electrodes=np.array([[9, 8], [7, -1]]),
+            stimulus_presentation=np.array([4, 4]),
+            sampling_rate_hz=20_000,
+            start_min=140.0,
+            start_s=-1.0,
+            duration_s=5.0,
+            presentation_order="mixed",
+            presentation_pulses=2,
+            note_of_mine=np.zeros(2),
+        )
+    )
+    assert recording.spike_channels.tolist() == [0, 0, 2]
+    assert recording.channels.label.tolist() == ["3", "5", "7"]
+    assert recording.channels.electrode.tolist() == [30, 50, 70]
+    assert recording.channels.x_um.tolist() == [0.0, 2.0, 4.0]
+    assert recording.channels.y_um[:2].tolist() == [1.0, 3.0]
+    np.testing.assert_array_equal(recording.stimuli.frequency_hz, [np.nan, 80.0])
+    assert recording.stimuli.pattern.tolist() == [0, 1]
+    assert recording.stimuli.electrodes.tolist() == [[7, -1], [9, 8]]
+    assert recording.stimuli.is_last_of_presentation.tolist() == [False, True]
+    assert (recording.start_s, recording.duration_s, recording.start_min) == (-1.0, 5.0, 140.0)
+    assert (recording.sampling_rate_hz, recording.presentation) == (20_000.0, Presentation("mixed", 2))
+    assert recording.provenance["note: keys-left-out"].endswith("note_of_mine")
+    assert "silent-channels" in names(recording)
+
+
+def test_numbers_are_rows_where_channels_have_names_or_only_positions(tmp_path: Path) -> None:
+    spikes = {"spike_time_s": np.array([0.0, 1.0]), "spike_channel": np.array([2, 0], dtype=np.uint16)}
+    by_name = read_recording(npz(tmp_path, **spikes, **STIMULI, channel_label=np.array(["a", "b", "c"])))
+    assert by_name.spike_channels.tolist() == [2, 0]
+    by_position = read_recording(npz(tmp_path, **spikes, **STIMULI, channel_xy_um=np.zeros((3, 2))))
+    assert by_position.spike_channels.tolist() == [2, 0]
+    assert by_position.channels.label.tolist() == ["0", "1", "2"]
+
+
+def test_units_become_channels_with_the_electrode_at_their_position(tmp_path: Path) -> None:
+    recording = read_recording(
+        npz(
+            tmp_path,
+            spike_time_s=np.array([0.0]),
+            spike_unit=np.array([1]),
+            unit_xy_um=np.array([[1.0, 2.0], [9.0, 9.0]]),
+            stim_time_s=np.array([0.5, 0.6]),
+            stim_tag=np.array(["train", "sensory"]),
+            stim_electrodes=np.array([[5], [6]]),
+            mapping_electrode=np.array([11, 12]),
+            mapping_xy_um=np.array([[3.0, 3.0], [1.0, 2.0]]),
+        )
+    )
+    assert recording.provenance["channels"] == "sorted units"
+    assert recording.channels.electrode.tolist() == [12, -1]
+    assert recording.stimuli.pattern.tolist() == [1, 0]
+    assert recording.provenance["patterns"] == "0: sensory, 1: train"
+
+
+@FEW
+@given(data=st.data(), steps=st.lists(st.integers(-20, 20), max_size=25))
+def test_the_order_of_spikes_and_stimuli_in_the_file_does_not_matter(
+    data: st.DataObject, steps: list[int], tmp_path: Path
+) -> None:
+    times = np.array(steps, dtype=np.float64) / 4
+    channels = np.array([data.draw(st.integers(0, 3)) for _ in steps], dtype=np.int64)
+    columns = {"channel_xy_um": np.zeros((4, 2))}
+    shuffled = np.array(data.draw(st.permutations(range(len(steps)))), dtype=np.int64)
+    distinct = np.unique(times)
+    first, second = (
+        read_recording(
+            npz(
+                tmp_path,
+                spike_time_s=times[order],
+                spike_channel=channels[order],
+                stimulus_time_s=stimuli,
+                stimulus_frequency_hz=20 + stimuli,
+                **columns,
+            )
+        )
+        for order, stimuli in ((np.arange(len(steps)), distinct), (shuffled, distinct[::-1]))
+    )
+    assert np.array_equal(first.spike_times_s, np.sort(times))
+    assert np.array_equal(first.spike_times_s, second.spike_times_s)
+    assert np.array_equal(first.spike_channels, second.spike_channels)
+    assert np.array_equal(second.stimuli.frequency_hz, 20 + distinct)
+    assert (first.start_s, first.duration_s) == (second.start_s, second.duration_s)
+
+
+@FEW
+@given(start_s=st.floats(-1e9, -1e-9), stop_s=st.floats(-1e9, 1e9))
+def test_the_default_span_holds_every_event(start_s: float, stop_s: float, tmp_path: Path) -> None:
+    times = np.array([start_s, stop_s])
+    recording = read_recording(npz(tmp_path, spike_time_s=times, spike_channel=np.zeros(2), stimulus_time_s=times))
+    assert recording.start_s == min(times)
+    assert recording.stop_s >= max(times)
+
+
+BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
+    "missing keys": (
+        {"times": np.zeros(1), "spike_channel": np.zeros(1)},
+        "missing spike_time_s, stimulus_time_s; found spike_channel, times",
+    ),
+    "NaN times": (SPIKES | {"spike_time_s": np.array([0.0, np.nan, 1.0])}, "spike_time_s: .* got 1 of 3 NaN"),
+    "infinite stimulus": ({"stimulus_time_s": np.array([np.inf])}, "stimulus_time_s: .* got 1 of 1 NaN or infinite"),
+    "text for times": ({"spike_time_s": np.array(["a", "b", "c"])}, "spike_time_s: expected numbers, got <U1"),
+    "times in a table": (
+        {"spike_time_s": np.zeros((3, 1))},
+        r"spike_time_s: expected one column .* got shape \(3, 1\)",
+    ),
+    "two lengths": (
+        {"spike_channel": np.zeros(2)},
+        r"spike_channel: expected one channel a spike, shape \(3,\), got \(2,\)",
+    ),
+    "unknown label": (
+        {"channel_label": np.array([3, 4])},
+        "got 1 spikes on 1 unknown channels \\(such as '7'\\)",
+    ),
+    "unknown row": ({"channel_electrode": np.arange(7)}, "rows of the channel table .* got 7 \\(1 spikes"),
+    "text without labels": (
+        {"spike_channel": np.array(["a", "b", "c"]), "channel_electrode": np.arange(7)},
+        "spike_channel: expected rows",
+    ),
+    "a spike without channel": ({"spike_channel": np.array([0, np.nan, 1])}, "a channel for each spike, got 1 without"),
+    "half a channel": ({"spike_channel": np.array([0, 0.5, 1])}, "spike_channel: expected whole numbers, got 0.5"),
+    "a label twice": ({"channel_label": np.array([3, 7, 7])}, "each label once, got '7' twice"),
+    "channel columns of two lengths": (
+        {"channel_label": np.array([3, 7]), "channel_electrode": np.arange(3)},
+        "2 in channel_label, 3 in channel_electrode",
+    ),
+    "positions in one column": ({"channel_xy_um": np.zeros(8)}, r"channel_xy_um: expected shape \(8, 2\)"),
+    "negative frequency": ({"stimulus_frequency_hz": np.array([5.0, -5.0])}, "positive frequencies .* got -5"),
+    "frequencies of another length": (
+        {"stimulus_frequency_hz": np.zeros(3)},
+        r"stimulus_frequency_hz: .*\(2,\), got \(3,\)",
+    ),
+    "electrodes of another length": (
+        {"stimulus_electrodes": np.zeros((3, 2))},
+        r"stimulus_electrodes: .* got \(3, 2\)",
+    ),
+    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: expected, to tell which 5"),
+    "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
+    "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),
+    "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
+    "two rates": ({"sampling_rate_hz": np.ones(2)}, r"sampling_rate_hz: expected one value, got shape \(2,\)"),
+    "no rate": ({"sampling_rate_hz": 0}, "sampling_rate_hz: expected a positive rate in Hz, got 0"),
+    "start that is not finite": ({"start_min": np.nan}, "start_min: expected finite minutes, got nan"),
+    "duration too short": ({"duration_s": 1.0}, "expected times within the recording"),
+    "negative duration": ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
+    "one thing under two names": (
+        {"stim_time_s": np.zeros(2)},
+        "expected stimulus_time_s once, got it under two names",
+    ),
+    "pickled objects": (
+        {"channel_label": np.array([{"a": 1}, None], dtype=object)},
+        "expected plain arrays .* got pickled objects, which are never read",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_NPZ)
+def test_a_bad_npz_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+    changes, message = BAD_NPZ[case]
+    arrays = changes if "missing" in case else SPIKES | STIMULI | changes
+    with pytest.raises(InvalidFile, match=message) as caught:
+        read_recording(npz(tmp_path, **arrays))
+    assert str(caught.value).startswith(str(tmp_path / "a.npz"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.9, 0.99])
+def test_a_truncated_npz_is_one_clear_line(share: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(InvalidFile, match=r"a\.npz: expected a whole NPZ archive, but it is cut off or damaged"):
+        read_recording(path)
+
+
+def test_a_damaged_npz_is_an_error_of_ours_or_harmless(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
+    content = path.read_bytes()
+    for start in rng.integers(4, len(content) - 16, 150).tolist():
+        path.write_bytes(content[:start] + rng.bytes(16) + content[start + 16 :])
+        try:
+            read_recording(path)
+        except InvalidFile as error:
+            assert "\n" not in str(error)
+
+
+# --- CSV -------------------------------------------------------------------------------------------------------------
+
+
+def csv(folder: Path, spikes: str, stimuli: str | None = None) -> Path:
+    (folder / "a_spikes.csv").write_text(spikes)
+    if stimuli is not None:
+        (folder / "a_stimuli.csv").write_text(stimuli)
+    return folder / "a_spikes.csv"
+
+
+def test_csv_with_a_header_or_a_bare_column_of_stimuli(tmp_path: Path) -> None:
+    path = csv(tmp_path, "n,time,channel,uV\n1,0.5,b,-3\n2,-0.5,a,-2\n", "1.5\n0.25\n")
+    recording = read_recording(path, start_min=10.0)
+    assert recording.spike_times_s.tolist() == [-0.5, 0.5]
+    assert recording.channels.label[recording.spike_channels].tolist() == ["a", "b"]
+    assert recording.stimuli.time_s.tolist() == [0.25, 1.5]
+    assert recording.start_min == 10.0
+    assert "n, uV" in recording.provenance["note: columns-left-out"]
+    stimuli = (
+        "time_s;frequency_hz;pattern;electrodes;presentation\n0.1;5;left;12 13;0\n0.2;;right;14;0\n0.3;80;left;;1\n"
+    )
+    (tmp_path / "other.csv").write_text(stimuli)
+    recording = read_recording(path, stimuli_path=tmp_path / "other.csv")
+    np.testing.assert_array_equal(recording.stimuli.frequency_hz, [5.0, np.nan, 80.0])
+    assert recording.stimuli.pattern.tolist() == [0, 1, 0]
+    assert recording.stimuli.electrodes.tolist() == [[12, 13], [14, -1], [-1, -1]]
+    assert recording.stimuli.presentation.tolist() == [0, 0, 1]
+
+
+def test_csv_may_be_gzipped_and_have_a_byte_order_mark_and_windows_lines(tmp_path: Path) -> None:
+    path = tmp_path / "a_spikes.csv.gz"
+    path.write_bytes(gzip.compress("\ufefftime_s\tunit\r\n0.5\t3\r\n".encode()))
+    (tmp_path / "a_stimuli.csv.gz").write_bytes(gzip.compress(b"time\n0.75\n"))
+    recording = read_recording(path)
+    assert recording.channels.label.tolist() == ["3"]
+    assert recording.stimuli.time_s.tolist() == [0.75]
+
+
+def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
+    recording = read_recording(csv(tmp_path, "time,channel\n0.5,1\n"))
+    assert len(recording.stimuli) == 0
+    refusal = next(finding for finding in noticed(recording) if finding.name == "no-stimuli")
+    assert refusal.severity == "refuse"
+    assert "1 spikes but no stimulus" in refusal.sentence
+
+
+BAD_CSV = {
+    "no known column": ("t,c\n1,2\n", None, "expected a column named spike_time_s or time_s or time, found t, c"),
+    "no channel": ("time,c\n1,2\n", None, "expected a column named spike_channel or channel or unit, found time, c"),
+    "a word for a time": (
+        "time,channel\n1,2\nsoon,2\n",
+        None,
+        "spike_time_s: expected a number in data line 2, got 'soon'",
+    ),
+    "an empty time": ("time,channel\n,2\n", None, "spike_time_s: expected finite times .* got 1 of 1"),
+    "an empty channel": ("time,channel\n1,\n1,2\n", None, "expected a channel for each spike, got 1 without"),
+    "a short line": ("time,channel\n1,2\n1\n", None, "expected 2 columns in each line, got 1 in data line 2"),
+    "blank": ("\n\n", None, "expected a header line"),
+    "stimuli without times": (
+        "time,channel\n1,2\n",
+        "frequency_hz,x\n5,5\n",
+        "a_stimuli.csv: expected a column named stim",
+    ),
+    "electrodes as words": (
+        "time,channel\n1,2\n",
+        "time,electrodes\n1,left\n",
+        "stimulus_electrodes: expected whole numbers separated by spaces",
+    ),
+    "negative frequency": ("time,channel\n1,2\n", "time,frequency_hz\n1,-5\n", "positive frequencies .* got -5"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CSV)
+def test_a_bad_csv_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+    spikes, stimuli, message = BAD_CSV[case]
+    with pytest.raises(InvalidFile, match=message) as caught:
+        read_recording(csv(tmp_path, spikes, stimuli))
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
+def test_a_truncated_gzip_is_one_clear_line(share: float, tmp_path: Path) -> None:
+    text = "time,channel\n" + "\n".join(f"{t / 7},{t % 5}" for t in range(400))
+    content = gzip.compress(text.encode())
+    (tmp_path / "a_spikes.csv.gz").write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(InvalidFile, match=r"expected a whole file, but it cannot be read or is cut off"):
+        read_recording(tmp_path / "a_spikes.csv.gz")
+
+
+# --- any file, folders -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    (tmp_path / "empty.nwb").touch()
+    (tmp_path / "b.nwb").write_bytes(b"\xff\xfe\x00binary")
+    (tmp_path / "a_stimuli.csv").write_text("1\n")
+    for path, message in {
+        "none.nwb": "no such file",
+        "a.npy": "expected NPZ .* got NPY",
+        "empty.nwb": "got an empty file",
+        "b.nwb": "expected CSV .text in UTF-8., got something else",
+        "a_stimuli.csv": "expected a file of spikes, got the stimuli beside it",
+        ".": "got a folder; read_recordings reads folders",
+    }.items():
+        with pytest.raises(InvalidFile, match=message) as caught:
+            read_recording(tmp_path / path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InvalidArgument, match="start_min: expected finite minutes, got nan"):
+        read_recording(tmp_path / "a.npy", start_min=float("nan"))
+    with pytest.raises(InvalidArgument, match="stimuli_path: expected only beside CSV"):
+        read_recording(npz(tmp_path, **SPIKES, **STIMULI), stimuli_path=tmp_path / "a_stimuli.csv")
+
+
+def test_folders_are_read_in_the_order_of_the_cultures_clock(tmp_path: Path) -> None:
+    folder = tmp_path / "series"
+    folder.mkdir()
+    first = read_recording(npz(tmp_path, **SPIKES, **STIMULI, start_min=20.0))
+    first.save(folder / "a.nwb")
+    npz(folder, **SPIKES, **STIMULI, start_min=5.0)
+    csv(folder, "time,channel\n0.5,1\n", "0.25\n")
+    (folder / ".b.nwb.partial.nwb").write_bytes(b"half a file")
+    (folder / "notes.txt").write_text("not a recording")
+    read = read_recordings(folder)
+    assert [recording.start_min for recording in read] == [0.0, 5.0, 20.0]
+    assert read[2].equals(first)
+    first_alone = read_recordings([folder / "a.nwb"])
+    assert first_alone[0].equals(first)
+
+
+def test_two_recordings_of_one_time_and_empty_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidFile, match=r"expected a folder of recordings .* found none in it"):
+        read_recordings(tmp_path)
+    with pytest.raises(InvalidArgument, match="paths: expected at least one file"):
+        read_recordings([])
+    path = npz(tmp_path, **SPIKES, **STIMULI)
+    with pytest.raises(InvalidFile, match=r"both start at 0 min; leave one out"):
+        read_recordings([path, path])
+
+
+# --- real recordings -------------------------------------------------------------------------------------------------
+
+
+def test_the_organoid_recording(real_data: Path, tmp_path: Path) -> None:
+    recording = read_recording(real_data / "organoid_cartpole_maxone.npz")
+    counts = len(recording.spike_times_s), len(recording.channels), len(recording.stimuli)
+    assert counts == (240_559, 108, 2_775)
+    assert recording.provenance["channels"] == "sorted units"
+    assert recording.sampling_rate_hz == 20_000.0
+    assert recording.channels.has_positions
+    assert np.all(recording.channels.electrode >= 0)
+    with np.load(real_data / "organoid_cartpole_maxone.npz") as truth:
+        assert np.array_equal(
+            np.bincount(recording.spike_channels, minlength=108), np.bincount(truth["spike_unit"], minlength=108)
+        )
+        assert np.array_equal(recording.stimuli.electrodes, truth["stim_electrodes"])
+    window = [np.searchsorted(recording.spike_times_s, recording.stimuli.time_s + s) for s in (0.002, 0.010)]
+    assert np.mean(window[1] - window[0]) == pytest.approx(20.26, abs=0.005)
+    recording.save(tmp_path / "a.nwb")
+    assert Recording.load(tmp_path / "a.nwb").equals(recording)
+
+
+def test_the_brainoware_recording(real_data: Path) -> None:
+    recording = read_recording(real_data / "brainoware_spikes.csv.gz")
+    counts = len(recording.spike_times_s), len(recording.channels), len(recording.stimuli)
+    assert counts == (49_278, 584, 175)
+    assert "c_153ch" in recording.channels.label
+    assert recording.start_s == -0.07725
+    assert "silent-channels-unknown" in names(recording)
+    np.testing.assert_allclose(np.diff(recording.stimuli.time_s), 5.0, atol=0.5)
+
+
+def test_a_file_of_responses_without_times_is_refused_by_its_keys(real_data: Path) -> None:
+    with pytest.raises(AnimatError, match=r"expected the keys spike_time_s.*found culture0_spikes_per_electrode"):
+        read_recording(real_data / "rat_cortical_64ch_responses.npz")
