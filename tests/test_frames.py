@@ -1,0 +1,76 @@
+"""Pictures of robots: what is where in them, by the colours that the drawing names."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument
+from animat.report.frames import ACCENT, BODY, GOAL_FILL, INK, PAPER, TRAIL, Canvas, draw_robot
+from animat.robots import Cartpole, Navigation
+
+
+def places(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """(x, y) of the pixels of exactly this colour."""
+    return np.argwhere(np.all(picture == colour, axis=-1))[:, ::-1]
+
+
+def test_the_pole_leans_to_the_side_of_its_angle_and_the_cart_stands_at_its_place() -> None:
+    for x_m, angle in [(0.3, 0.2), (-0.3, -0.2)]:
+        picture = draw_robot(Cartpole(), np.array([x_m, 0, angle, 0]), command=math.copysign(1, x_m))
+        height, width, _ = picture.shape
+        pole, cart, arrow = places(picture, BODY), places(picture, INK), places(picture, ACCENT)
+        top, foot = pole[pole[:, 1].argmin()], pole[pole[:, 1].argmax()]
+        assert (top[0] - foot[0]) * angle > 0
+        slope = (top[0] - foot[0]) / (foot[1] - top[1])
+        assert slope == pytest.approx(math.tan(angle), abs=0.05)
+        assert (foot[0] - width / 2) * x_m > 0
+        assert (arrow[:, 0].mean() - foot[0]) * x_m > 0
+        assert len(cart) and len(pole) and height == 360
+
+
+def test_a_resting_cart_has_no_arrow() -> None:
+    assert not len(places(draw_robot(Cartpole(), np.zeros(4)), ACCENT))
+
+
+def test_the_robot_the_goal_and_the_path_are_where_they_should_be() -> None:
+    robot = Navigation()
+    earlier = [np.array([0.1 * i, 0.4, 0.0]) for i in range(5)]
+    picture = draw_robot(robot, np.array([0.5, 0.4, math.pi / 2]), earlier=earlier)
+    px_per_m = 360 / 1.12
+    origin = 0.06 * px_per_m
+
+    def place_m(colour: tuple[int, int, int]) -> np.ndarray:
+        return (places(picture, colour).mean(axis=0) + 0.5 - origin) / px_per_m
+
+    np.testing.assert_allclose(place_m(BODY), [0.5, 0.4], atol=0.005)
+    np.testing.assert_allclose(place_m(GOAL_FILL), [0.7, 0.7], atol=0.005)
+    np.testing.assert_allclose(place_m(TRAIL)[1], 0.4, atol=0.005)
+    # Heading pi/2 looks down: the nose is below the body.
+    assert place_m(ACCENT)[1] > 0.41
+
+
+def test_a_disc_covers_its_area_with_soft_edges() -> None:
+    canvas = Canvas(100, 100, (50.0, 50.0), 10.0)
+    canvas.disc((0.0, 0.0), 2.0, (0, 0, 0))
+    cover = 1 - canvas.picture()[..., 0] / PAPER[0]
+    assert cover.sum() == pytest.approx(math.pi * 20**2, rel=0.005)
+
+
+def test_what_lies_outside_the_picture_is_left_out_without_harm() -> None:
+    canvas = Canvas(20, 20, (0.0, 0.0), 1.0)
+    canvas.stroke([(-50.0, -50.0), (-30.0, -20.0)], 2.0, INK)
+    canvas.stroke([(-50.0, 10.0), (70.0, 10.0)], 2.0, INK)
+    assert places(canvas.picture(), INK)[:, 1].tolist() == [9] * 20 + [10] * 20
+
+
+def test_a_robot_without_a_drawing_is_refused() -> None:
+    @dataclass(frozen=True)
+    class Unicycle:
+        name = "unicycle"
+
+    with pytest.raises(InvalidArgument, match=r"expected one that can be drawn \(cartpole, navigation\), got unicycle"):
+        draw_robot(Unicycle(), np.zeros(3))  # type: ignore[arg-type]

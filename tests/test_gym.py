@@ -1,0 +1,328 @@
+"""The Gymnasium environments: Gymnasium's own checker, and a direct rollout of the Animat inside."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import animat
+from animat.animat import Animat
+from animat.errors import InvalidArgument
+from animat.gym import IDS, register_environments
+from animat.mapping import Linear, mapping_named
+from animat.neurons.made_up import LABELS, made_up_simulator
+from animat.neurons.simulator import silenced
+from animat.recordings.made_up import write_made_up_series
+from animat.robots import Cartpole, robot_named
+
+assert animat.__doc__  # importing animat registers the environments
+
+
+def rollout(env, actions, seed=0):
+    """(observations, rewards, terminated, truncated, infos) of the actions, resetting where an episode ends."""
+    observation, _ = env.reset(seed=seed)
+    steps = []
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        steps.append((observation, reward, terminated, truncated, info))
+        if terminated or truncated:
+            env.reset()
+    return [np.array(part) if i < 4 else part for i, part in enumerate(zip(*steps, strict=True))]
+
+
+@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("options", [{}, {"mapping": "9-thresholds"}, {"delivery": "shuffled"}])
+def test_gymnasiums_checker_passes_without_a_warning(id_: str, options: dict) -> None:
+    check_env(gymnasium.make(id_, render_mode="rgb_array", **options).unwrapped)
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import animat, gymnasium; make = gymnasium.make('Animat/Cartpole-v0')",
+        "import gymnasium, animat; make = gymnasium.make('Animat/Cartpole-v0')",
+        "import gymnasium; make = gymnasium.make('animat:Animat/Cartpole-v0')",
+    ],
+)
+def test_they_are_known_in_whichever_order_imports_come(imports: str) -> None:
+    code = imports + "; make.reset(seed=0); make.step(0)"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_registering_loads_nothing_heavy_and_twice_does_no_harm() -> None:
+    register_environments()
+    heavy = "{'jax', 'scipy', 'matplotlib', 'h5py', 'pynwb'}"
+    subprocess.run(
+        [sys.executable, "-c", f"import animat, sys; left = {heavy} & set(sys.modules); assert not left, left"],
+        check=True,
+    )
+
+
+@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds", "linear"])
+def test_an_episode_is_a_rollout_of_the_animat(id_: str, mapping: str) -> None:
+    """The same random numbers, handed to the Animat directly, give the same episode."""
+    env = gymnasium.make(id_, mapping=mapping)
+    actions = np.random.default_rng(1).integers(0, 5, 60)
+    env.reset(seed=11)
+    rng = np.random.Generator(type(env.unwrapped.np_random.bit_generator)())
+    rng.bit_generator.state = env.unwrapped.np_random.bit_generator.state
+
+    body, simulator = robot_named(IDS[id_]), made_up_simulator()
+    direct = Animat(body, mapping_named(mapping), 5)
+    state, advance = direct.reset(jax.random.key(0)), jax.jit(direct.advance)
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        uniforms = jnp.asarray(rng.random(direct.noise_size, np.float32))
+        outcome = advance(uniforms, state, jnp.int32(action), simulator)
+        state = outcome.state
+        np.testing.assert_allclose(observation, direct.observe(state), rtol=1e-5, atol=1e-6)
+        assert reward == pytest.approx(float(outcome.reward), rel=1e-5)
+        assert (terminated, truncated) == (bool(outcome.terminated), bool(outcome.truncated))
+        assert info == {
+            "delivered": action,
+            "rate_hz": pytest.approx(float(outcome.rate_hz), rel=1e-5),
+            "command": pytest.approx(float(outcome.command), abs=1e-5),
+        }
+        if terminated or truncated:
+            break
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_a_seed_decides_everything(id_: str) -> None:
+    actions = np.random.default_rng(0).integers(0, 5, 300)
+    one, same, other = (rollout(gymnasium.make(id_), actions, seed) for seed in (3, 3, 4))
+    for a, b in zip(one[:4], same[:4], strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert one[4] == same[4]
+    assert [info["rate_hz"] for info in one[4]] != [info["rate_hz"] for info in other[4]]
+
+
+def test_truncation_is_not_termination() -> None:
+    env = gymnasium.make("Animat/Navigation-v0")
+    _, rewards, terminated, truncated, _ = rollout(env, [0] * 250)
+    ends = np.flatnonzero(truncated)
+    assert len(ends) and not terminated[ends].any()
+    # Episodes end either way; none is longer than the limit.
+    assert np.diff(np.flatnonzero(terminated | truncated), prepend=-1).max() == 100
+    np.testing.assert_array_equal(terminated, rewards == 50)
+
+    env = gymnasium.make("Animat/Cartpole-v0", episode_limit=5, angle_limit_rad=1.5)
+    _, rewards, terminated, truncated, _ = rollout(env, [4] * 20)
+    assert np.flatnonzero(truncated).tolist() == [4, 9, 14, 19] and not terminated.any()
+    assert np.all(rewards == 1)
+
+    env = gymnasium.make("Animat/Cartpole-v0")
+    _, rewards, terminated, truncated, _ = rollout(env, [4] * 200)
+    assert terminated.any() and not truncated.any()
+    np.testing.assert_array_equal(terminated, rewards == -100)
+
+
+def test_an_episode_that_ends_by_itself_at_the_limit_is_terminated_only() -> None:
+    """A silent culture always pushes left, and without noise the pole falls in the same iteration every time."""
+    options = {"simulator": silenced(made_up_simulator()), "force_noise": 0.0}
+    falls = int(np.argmax(rollout(gymnasium.make("Animat/Cartpole-v0", **options), [0] * 60)[2])) + 1
+    _, rewards, terminated, truncated, _ = rollout(
+        gymnasium.make("Animat/Cartpole-v0", episode_limit=falls, **options), [0] * falls
+    )
+    assert terminated[-1] and not truncated[-1] and rewards[-1] == -100
+    _, rewards, terminated, truncated, _ = rollout(
+        gymnasium.make("Animat/Cartpole-v0", episode_limit=falls - 1, **options), [0] * (falls - 1)
+    )
+    assert truncated[-1] and not terminated[-1] and rewards[-1] == 1
+
+
+def test_robot_parameters_and_mappings_are_options() -> None:
+    env = gymnasium.make("Animat/Cartpole-v0", pole_mass_kg=0.55, force_noise=0.0, mapping=Linear()).unwrapped
+    assert env.setup.animat == Animat(Cartpole(pole_mass_kg=0.55, force_noise=0.0), Linear(), 5)
+    assert env.setup.condition_labels == LABELS
+    with pytest.warns(UserWarning, match="the goal cannot be reached: 20 iterations"):
+        gymnasium.make("Animat/Navigation-v0", episode_limit=20)
+
+
+def test_a_simulator_decides_how_the_neurons_answer() -> None:
+    env = gymnasium.make("Animat/Cartpole-v0", simulator=silenced(made_up_simulator()), mapping="linear")
+    infos = rollout(env, [0, 1, 2, 3, 4])[4]
+    assert all(info["rate_hz"] == 0 and info["command"] == -1 for info in infos)
+
+
+def test_shuffled_delivery_says_what_was_delivered() -> None:
+    infos = rollout(gymnasium.make("Animat/Navigation-v0", delivery="shuffled"), [2] * 2000)[4]
+    counts = np.bincount([info["delivered"] for info in infos], minlength=5)
+    # Binomial(2000, 1/5): a standard deviation of 18.
+    assert np.all(np.abs(counts - 400) < 90)
+
+
+def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
+    write_made_up_series(0, tmp_path, sessions=2, interval_min=60.0, fatigue_per_h=1.0)
+    first, second = (gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path, at_min=m).unwrapped for m in (0, 60))
+    assert first.setup.condition_labels == LABELS
+    assert first.action_space.n == 5
+    medians = [float(env.setup.simulator.percentiles[5]) for env in (first, second)]
+    assert medians[0] == pytest.approx(38.7, abs=4)
+    assert medians[1] == pytest.approx(38.7 * np.exp(-1), abs=2)
+    some = gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path, conditions="frequency:5,80")
+    assert some.action_space.n == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mapping": "3-thresholds"}, "mapping: expected one of 1-threshold"),
+        ({"pole_mass": 1.0}, "cartpole: expected parameters among .*, got 'pole_mass'"),
+        ({"recordings": "r", "simulator": made_up_simulator()}, "recordings, simulator: expected one of them"),
+        ({"delivery": "late"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(options: dict, message: str) -> None:
+    with pytest.raises(InvalidArgument, match=message):
+        gymnasium.make("Animat/Cartpole-v0", **options)
+    with pytest.raises(InvalidArgument, match=message):
+        gymnasium.make_vec("Animat/Cartpole-v0", num_envs=2, **options)
+
+
+@pytest.mark.parametrize("action", [-1, 5, 1.5, "2", np.array([1])])
+def test_actions_that_are_no_condition_are_refused(action: object) -> None:
+    env = gymnasium.make("Animat/Cartpole-v0").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(InvalidArgument, match="action: expected a condition, a whole number from 0 to 4, got"):
+        env.step(action)
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=2)
+    envs.reset(seed=0)
+    with pytest.raises(InvalidArgument, match="actions: expected 2 conditions"):
+        envs.step(np.array([action, 0]) if np.ndim(action) == 0 else action)
+
+
+def test_stepping_or_rendering_before_a_reset_is_refused() -> None:
+    env = gymnasium.make("Animat/Cartpole-v0", render_mode="rgb_array").unwrapped
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=2, render_mode="rgb_array")
+    for call in (lambda: env.step(0), env.render, lambda: envs.step(np.zeros(2, int)), envs.render):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"expected .* that reset\(\) started"):
+            call()
+    with pytest.raises(InvalidArgument, match="render_mode: expected 'rgb_array' or None, got 'human'"):
+        type(env)("cartpole", render_mode="human")
+    with pytest.raises(InvalidArgument, match="num_envs: expected at least 1, got 0"):
+        type(envs)("cartpole", 0)
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_a_vector_has_gymnasiums_form(id_: str) -> None:
+    envs = gymnasium.make_vec(id_, num_envs=7)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    observations, info = envs.reset(seed=0)
+    assert observations in envs.observation_space and info == {}
+    for _ in range(150):
+        observations, rewards, terminated, truncated, info = envs.step(envs.action_space.sample())
+        assert observations in envs.observation_space
+        assert (rewards.shape, rewards.dtype) == ((7,), np.float32)
+        assert terminated.dtype == truncated.dtype == np.bool_
+        assert not np.any(terminated & truncated)
+        assert set(info) == {"delivered", "rate_hz", "command", "_delivered", "_rate_hz", "_command"}
+
+
+def test_an_ended_episode_starts_anew_in_the_step_after() -> None:
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=16)
+    envs.reset(seed=1)
+    ended = np.zeros(16, bool)
+    n_begun = 0
+    for _ in range(200):
+        observations, rewards, terminated, truncated, info = envs.step(np.full(16, 4))
+        np.testing.assert_array_equal(observations[ended], 0)
+        np.testing.assert_array_equal(rewards[ended], 0)
+        np.testing.assert_array_equal(info["_command"], ~ended)
+        assert not (terminated | truncated)[ended].any()
+        np.testing.assert_array_equal(rewards[~ended], np.where(terminated[~ended], -100, 1))
+        n_begun += int(ended.sum())
+        ended = terminated | truncated
+    assert n_begun > 50
+
+
+def test_a_vector_of_one_is_the_single_environment() -> None:
+    """Until the first episode ends, both take the same numbers from generators of the same seed."""
+    actions = np.random.default_rng(0).integers(0, 5, 100)
+    env, envs = gymnasium.make("Animat/Navigation-v0"), gymnasium.make_vec("Animat/Navigation-v0", num_envs=1)
+    start, _ = env.reset(seed=5)
+    np.testing.assert_array_equal(envs.reset(seed=5)[0][0], start)
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        many = envs.step(np.array([action]))
+        np.testing.assert_array_equal(many[0][0], observation)
+        assert (many[1][0], many[2][0], many[3][0]) == (np.float32(reward), terminated, truncated)
+        assert {name: many[4][name][0] for name in info} == info
+        if terminated or truncated:
+            return
+    pytest.fail("expected the episode to end within its limit of 100")
+
+
+def test_a_seed_decides_a_whole_vector() -> None:
+    def play(seed: int) -> np.ndarray:
+        envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=4)
+        envs.reset(seed=seed)
+        return np.array([envs.step(np.full(4, i % 5))[0] for i in range(80)])
+
+    np.testing.assert_array_equal(play(2), play(2))
+    assert np.any(play(2) != play(3))
+    assert np.all(np.std(play(2)[10], axis=0) > 0)  # the environments differ from one another
+
+
+def test_vector_and_single_have_the_same_returns() -> None:
+    """Mean return of random play over whole episodes, by both; the standard error of the difference decides."""
+
+    def returns_of_single() -> np.ndarray:
+        env, rng, returns = gymnasium.make("Animat/Cartpole-v0").unwrapped, np.random.default_rng(0), []
+        env.reset(seed=0)
+        while len(returns) < 400:
+            total, ended = 0.0, False
+            while not ended:
+                _, reward, terminated, truncated, _ = env.step(rng.integers(5))
+                total, ended = total + reward, terminated or truncated
+            returns.append(total)
+            env.reset()
+        return np.array(returns)
+
+    def returns_of_vector() -> np.ndarray:
+        envs, rng = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=400), np.random.default_rng(1)
+        envs.reset(seed=0)
+        totals, going = np.zeros(400), np.ones(400, bool)
+        while going.any():
+            _, rewards, terminated, truncated, _ = envs.step(rng.integers(0, 5, 400))
+            totals += rewards * going
+            going &= ~(terminated | truncated)
+        return totals
+
+    single, vector = returns_of_single(), returns_of_vector()
+    error = np.sqrt(single.var() / 400 + vector.var() / 400)
+    assert abs(single.mean() - vector.mean()) < 4 * error
+    assert -90 < vector.mean() < -70
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
+    env = gymnasium.make(id_, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    for _ in range(5):
+        env.step(4)
+    later = env.render()
+    assert first.dtype == np.uint8 and first.ndim == 3 and first.shape == later.shape
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
+    assert np.any(first != later)
+    envs = gymnasium.make_vec(id_, num_envs=3, render_mode="rgb_array")
+    envs.reset(seed=0)
+    envs.step(np.zeros(3, int))
+    assert [picture.shape for picture in envs.render()] == [first.shape] * 3
+
+
+def test_without_a_render_mode_a_picture_is_refused_with_a_warning() -> None:
+    env = gymnasium.make("Animat/Cartpole-v0").unwrapped
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
