@@ -18,7 +18,7 @@ def test_percentiles_are_those_of_pooled_samples() -> None:
     percentiles = np.asarray(made_up_simulator().percentiles)
     np.testing.assert_allclose(percentiles[1:-1], np.percentile(x, range(10, 100, 10)), rtol=0.005)
     ends = np.percentile(x, [100 / 501, 100 * 500 / 501])
-    np.testing.assert_allclose(percentiles[[0, -1]], ends, rtol=0.01)
+    np.testing.assert_allclose(percentiles[[0, -1]], ends, rtol=0.03)
 
 
 @pytest.mark.parametrize("condition", range(5))
