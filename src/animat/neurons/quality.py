@@ -119,8 +119,8 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
             "stimulus), so it is not known whether the window holds a response",
         )
         return
-    # The busiest part is left out on both sides: an artefact that reaches into the window is not a response.
-    spikes = int(parts.count.sum() - parts.count.max())
+    # An artefact that reaches into the window is no response: the busier of the window's first two parts is left out.
+    spikes = int(parts.count.sum() - parts.count[:2].max())
     expected = (
         0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * parts.n_stimuli * (1 - 1 / _WINDOW_PARTS)
     )
@@ -131,8 +131,8 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
             "dead-window",
             "refuse",
             f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes a "
-            f"stimulus (without its busiest eighth, where an artefact may be) against {per_stimulus:.2f} in as much "
-            f"time before the stimulus"
+            f"stimulus (without an eighth at its start, where an artefact may be) against {per_stimulus:.2f} in as "
+            f"much time before the stimulus"
             + (
                 f"; the response is at {response.start_ms:g} to {response.end_ms:g} ms: "
                 f"use --window-ms {response.start_ms:g} {response.end_ms:g}"

@@ -75,6 +75,9 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     condition = responses.condition[chosen]
     colours = condition_colours([c.unit for c in responses.conditions])
     axes.axvspan(start_ms, end_ms, color=WINDOW, alpha=0.25, linewidth=0, label=f"window {start_ms:g}-{end_ms:g} ms")
+    for edge_ms in (start_ms, end_ms):
+        # On top of the dots, which can hide the band.
+        axes.axvline(edge_ms, color=WINDOW, linewidth=1.2, zorder=3)
     axes.axvline(0, color=RED, linewidth=1, label="stimulus")
     for i, c in enumerate(responses.conditions):
         of = condition[row] == i

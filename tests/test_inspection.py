@@ -1,0 +1,298 @@
+"""Findings, inspection and figures: recordings made to have one fault each, and real cultures with theirs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument
+from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern
+from animat.neurons.inspection import inspect_recording
+from animat.neurons.psth import post_stimulus_histogram
+from animat.neurons.responses import extract_responses
+from animat.recordings.made_up import MadeUpCulture
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+from animat.report.burst_separation import draw_burst_separation
+from animat.report.inspection import draw_inspection, inspection_text
+from animat.report.psth import draw_psth
+from animat.report.raster import draw_raster
+from animat.report.response_histograms import draw_response_histograms, rate_edges
+from animat.report.style import condition_colours, save_figure
+from test_responses import names, recording
+
+
+def answering(
+    spikes_of: dict[float, float],
+    n: int = 60,
+    n_channels: int = 40,
+    seed: int = 0,
+    window_s: tuple[float, float] = (0.003, 0.009),
+) -> Recording:
+    """A culture that answers each frequency with Poisson spikes of the given mean, with 1 Hz per channel besides."""
+    rng = np.random.default_rng(seed)
+    frequencies = np.repeat(list(spikes_of), n)
+    rng.shuffle(frequencies)
+    stimulus_s = 1 + 0.25 * np.arange(len(frequencies))
+    duration_s = float(stimulus_s[-1] + 1)
+    spikes = [(t, int(rng.integers(n_channels))) for t in rng.uniform(0, duration_s, int(n_channels * duration_s))]
+    for time_s, frequency in zip(stimulus_s, frequencies, strict=True):
+        count = rng.poisson(spikes_of[frequency])
+        spikes += [(time_s + rng.uniform(*window_s), int(rng.integers(n_channels))) for _ in range(count)]
+    return recording(spikes, stimulus_s, n_channels, duration_s, frequency_hz=frequencies)
+
+
+def sentence(source: Recording, name: str, **options: object) -> str:
+    found = {f.name: f.sentence for f in extract_responses(source, **options).findings}  # type: ignore[arg-type]
+    return found[name]
+
+
+def test_nothing_is_wrong_with_a_good_recording() -> None:
+    source = MadeUpCulture(seed=1).record(0.0)
+    inspection = inspect_recording(source)
+    assert inspection.verdict == "usable"
+    assert {f.severity for f in inspection.findings} == {"note"}
+    assert names(inspection.responses)["difference"] == "note"
+    assert [c.label for c in inspection.conditions] == ["5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz"]
+    assert sum(c.n_responses for c in inspection.conditions) == 500
+    assert sum(c.n_responses - c.n_non_burst for c in inspection.conditions) == inspection.n_bursts
+
+
+def test_no_stimuli() -> None:
+    inspection = inspect_recording(recording([(1.0, 0)], []))
+    assert [f.name for f in inspection.findings].count("no-stimuli") == 1
+    assert inspection.verdict == "not usable"
+    assert json.loads(json.dumps(inspection.to_dict(), allow_nan=False))["mean_spikes_per_stimulus"] is None
+
+
+def test_no_spikes_is_a_dead_window() -> None:
+    assert names(extract_responses(recording([], [1, 2, 3])))["dead-window"] == "refuse"
+
+
+def test_stimuli_that_leave_no_quiet_are_said_to_be_untested() -> None:
+    stimulus_s = np.arange(0, 2, 0.0125)
+    answered = recording([(t + 0.005, 0) for t in stimulus_s], stimulus_s)
+    assert names(extract_responses(answered))["window-not-tested"] == "note"
+    # An empty window needs no comparison.
+    assert names(extract_responses(recording([], stimulus_s)))["dead-window"] == "refuse"
+
+
+def test_a_response_in_a_single_moment_is_one() -> None:
+    stimulus_s = np.arange(1, 9, 0.25)
+    source = recording([(t + 0.006, 0) for t in stimulus_s], stimulus_s)
+    assert not {"dead-window", "window-not-tested"} & set(names(extract_responses(source)))
+
+
+def test_a_window_without_the_response_says_where_it_is() -> None:
+    # Silence where the window is, as after an artefact.
+    source = answering({5: 30.0, 10: 40.0}, window_s=(0.030, 0.070))
+    heard = (source.spike_times_s % 0.25 > 0.012) | (source.spike_times_s < 1)
+    spikes = np.column_stack([source.spike_times_s, source.spike_channels])[heard]
+    blanked = recording(spikes, source.stimuli.time_s, 40, source.duration_s, frequency_hz=source.stimuli.frequency_hz)
+    assert "the response is at 30 to 70 ms: use --window-ms 30 70" in sentence(blanked, "dead-window")
+    assert not {"dead-window", "response-elsewhere"} & set(names(extract_responses(blanked, window_ms=(30, 70))))
+
+
+def test_a_window_on_a_later_wave_is_told_of_the_first() -> None:
+    source = answering({5: 30.0, 10: 40.0}, window_s=(0.010, 0.030))
+    wave = np.column_stack([np.repeat(source.stimuli.time_s, 10) + 0.085, np.zeros(10 * len(source.stimuli))])
+    spikes = np.vstack([np.column_stack([source.spike_times_s, source.spike_channels]), wave])
+    waves = recording(spikes, source.stimuli.time_s, 40, source.duration_s, frequency_hz=source.stimuli.frequency_hz)
+    assert "the response is at 10 to 30 ms" in sentence(waves, "response-elsewhere", window_ms=(80, 90))
+
+
+def test_an_artefact_in_the_window_is_no_response() -> None:
+    source = answering({5: 0.0, 10: 0.0})
+    artefact = [(t + 0.0025, 0) for t in source.stimuli.time_s for _ in range(20)]
+    spikes = [*zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True), *artefact]
+    blanked = [(t, c) for t, c in spikes if not 0.003 <= (t % 0.25) < 0.010]
+    with_artefact = recording(
+        blanked, source.stimuli.time_s, 40, source.duration_s, frequency_hz=source.stimuli.frequency_hz
+    )
+    assert names(extract_responses(with_artefact))["dead-window"] == "refuse"
+
+
+def test_stimuli_closer_than_the_window_are_counted() -> None:
+    source = recording([], [1, 1.005, 2, 2.010, 3])
+    found = {f.name: f for f in extract_responses(source).findings}["stimuli-too-close"]
+    assert found.value == 1  # 10 ms apart is not closer than a window that ends at 10 ms
+    assert "1 of 5 stimuli" in found.sentence
+    assert "stimuli-too-close" not in names(extract_responses(source, window_ms=(2, 5)))
+
+
+def test_windows_past_the_end_are_left_out_and_counted() -> None:
+    responses = extract_responses(recording([], [1, 2, 9.995]))
+    assert len(responses) == 2
+    assert names(responses)["window-past-end"] == "warning"
+
+
+def test_stimuli_without_a_condition_are_counted() -> None:
+    source = recording([], [1, 2, 3], pattern=[0, 0, 1])
+    found = {f.name: f for f in extract_responses(source, ByPattern((0,))).findings}
+    assert (found["no-condition"].severity, found["no-condition"].value) == ("note", 1)
+    assert names(extract_responses(source, ByPattern((7,))))["no-condition"] == "refuse"
+
+
+def test_empty_and_thin_conditions() -> None:
+    source = answering({5: 10.0, 10: 14.0})
+    responses = extract_responses(source, ByFrequency((5, 10, 20)), burst_threshold=1)
+    assert names(responses)["empty-condition"] == "refuse"
+    assert "condition 20 Hz: no stimulus" in sentence(source, "empty-condition", by=ByFrequency((5, 20)))
+    assert np.isnan(responses.shares_above_median()[2])
+    thin = extract_responses(answering({5: 10.0, 10: 14.0}, n=29), burst_threshold=1)
+    assert names(thin)["few-samples"] == "warning"
+    assert "few-samples" not in names(extract_responses(answering({5: 10.0, 10: 14.0}, n=30), burst_threshold=1))
+
+
+def test_conditions_that_do_not_differ_are_said_to_give_no_control() -> None:
+    same = answering({5: 20.0, 10: 20.0}, n=400, n_channels=60)
+    assert names(extract_responses(same, burst_threshold=1))["no-difference"] == "warning"
+    assert "no policy can steer" in sentence(same, "no-difference", burst_threshold=1)
+    other = answering({5: 10.0, 10: 30.0}, n=400, n_channels=60)
+    assert "P(x >= P50) is 0.0" in sentence(other, "difference", burst_threshold=1)
+    assert "one-condition" in names(extract_responses(same, All()))
+
+
+def test_burst_separation_that_separates_nothing_is_said_so() -> None:
+    found = {f.name: f for f in extract_responses(answering({5: 20.0, 10: 20.0}, n=300)).findings}
+    assert "bursts" not in found
+    assert found["bursts-not-separable"].severity == "warning"
+    assert "%) are set apart as bursts" in found["bursts-not-separable"].sentence
+
+
+def test_many_clear_bursts_may_be_the_responses() -> None:
+    # Half of all stimuli fail altogether, the others make most channels fire.
+    found = names(extract_responses(answering({5: 0.0, 10: 60.0}, n=100)))
+    assert found["many-bursts"] == "warning"
+
+
+def test_organoid(real_data: Path) -> None:
+    source = read_recording(real_data / "organoid_cartpole_maxone.npz")
+    inspection = inspect_recording(source, ByInterval((5, 10)))
+    text = inspection_text(inspection)
+    assert "2,775 stimuli" in text
+    assert "20.26 spikes in 2-10 ms per stimulus" in text
+    assert inspection.verdict == "usable with care"
+    found = {f.name: f for f in inspection.findings}
+    # One hump of ratios: Otsu would drop more than half of the responses.
+    assert found["bursts-not-separable"].value == pytest.approx(0.62, abs=0.01)
+    assert "P(x >= P50) is" in found["difference"].sentence
+    assert inspection.response is not None
+    assert (inspection.response.start_ms, inspection.response.end_ms) == pytest.approx((3, 18), abs=1)
+
+
+def test_brainoware_is_refused_and_shown_the_way(real_data: Path) -> None:
+    source = read_recording(real_data / "brainoware_spikes.csv.gz")
+    inspection = inspect_recording(source)
+    assert inspection.verdict == "not usable"
+    assert inspection.findings[0].name == "dead-window"
+    assert "the window from 2 to 10 ms is dead" in inspection.findings[0].sentence
+    response = inspection.response
+    assert response is not None
+    assert 10 <= response.start_ms <= 20 and 400 <= response.end_ms <= 500
+    assert f"--window-ms {response.start_ms:g} {response.end_ms:g}" in inspection.findings[0].sentence
+    there = inspect_recording(source, window_ms=(response.start_ms, response.end_ms))
+    assert there.verdict != "not usable"
+
+
+def test_to_dict_is_json_and_says_what_the_text_says() -> None:
+    inspection = inspect_recording(MadeUpCulture(seed=2).record(0.0), name="culture.nwb")
+    data = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
+    text = inspection_text(inspection)
+    assert text.startswith(f"culture.nwb: {data['verdict']}")
+    assert f"{data['mean_spikes_per_stimulus']:.2f} spikes in 2-10 ms per stimulus" in text
+    assert all(finding["sentence"] in text and "\n" not in finding["sentence"] for finding in data["findings"])
+    assert all(condition["label"] in text for condition in data["conditions"])
+
+
+UNITS = ("(s)", "(ms)", "(Hz per channel)", "(row)", "(count)", "(fraction)", "fraction")
+
+
+def axes_of(figure):  # type: ignore[no-untyped-def]
+    return [axes for axes in figure.axes if axes.get_visible()]
+
+
+def test_figures_name_units_and_conditions() -> None:
+    source = MadeUpCulture(seed=1).record(0.0)
+    responses = extract_responses(source)
+    labels = [condition.label for condition in responses.conditions]
+    raster = draw_raster(source, responses)
+    legend = [text.get_text() for text in axes_of(raster)[1].get_legend().get_texts()]
+    assert legend == ["window 2-10 ms", "stimulus", *labels]
+    histograms = draw_response_histograms(responses)
+    titles = [axes.get_title(loc="left") for axes in axes_of(histograms)]
+    assert [title.split(":")[0] for title in titles] == labels
+    assert all(f"P(x ≥ P50) = {p:.2f}" in t for p, t in zip(responses.shares_above_median(), titles, strict=True))
+    psth = draw_psth(post_stimulus_histogram(source), responses.window_ms, 0.5)
+    assert "window 2-10 ms" in [text.get_text() for text in psth.axes[0].get_legend().get_texts()]
+    panels = draw_burst_separation(responses)
+    assert len(panels.axes) == 4
+    for figure in (raster, psth, panels):
+        for axes in axes_of(figure):
+            assert axes.get_xlabel().endswith(UNITS), axes.get_xlabel()
+            assert axes.get_ylabel().endswith(UNITS), axes.get_ylabel()
+    assert histograms.get_supxlabel().endswith(UNITS)
+
+
+def test_an_artefact_does_not_dwarf_the_response_in_the_figure() -> None:
+    source = answering({5: 10.0, 10: 10.0})
+    artefact = [(t + 0.0005, 0) for t in source.stimuli.time_s for _ in range(200)]
+    spikes = [*zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True), *artefact]
+    histogram = post_stimulus_histogram(recording(spikes, source.stimuli.time_s, 40, source.duration_s))
+    axes = draw_psth(histogram, (2, 10)).axes[0]
+    assert axes.get_ylim()[1] < histogram.rate_hz.max() / 2
+    assert "is cut off" in axes.get_title(loc="left")
+
+
+def test_bins_hold_equally_many_possible_rates() -> None:
+    responses = extract_responses(answering({5: 10.0, 10: 30.0}))
+    edges_hz = rate_edges(responses, responses.rate_hz, 12)
+    step_hz = 1 / (0.008 * 40)
+    inside = [np.count_nonzero((k * step_hz >= edges_hz[:-1]) & (k * step_hz < edges_hz[1:])) for k in range(60)]
+    per_bin = np.histogram(np.arange(round(edges_hz[-1] / step_hz + 0.5)) * step_hz, edges_hz)[0]
+    assert len(per_bin) <= 12
+    assert len(set(per_bin.tolist())) == 1
+    assert set(inside) <= {0, 1}
+    assert np.histogram(responses.rate_hz, edges_hz)[0].sum() == len(responses)
+
+
+def test_many_conditions_have_a_colour_each_and_at_most_16_panels() -> None:
+    n = 40
+    source = recording([(t + 0.005, 0) for t in range(1, n + 1)], np.arange(1, n + 1), 4, n + 2, pattern=list(range(n)))
+    responses = extract_responses(source, ByPattern())
+    assert len(set(condition_colours([c.unit for c in responses.conditions]))) == n
+    figure = draw_response_histograms(responses)
+    assert len(axes_of(figure)) == 16
+    assert "24 more are not drawn" in figure.get_suptitle()
+    draw_raster(source, responses)
+
+
+@pytest.mark.parametrize("file_format", ["png", "svg", "pdf"])
+def test_figures_are_written_whole_and_the_same_each_time(tmp_path: Path, file_format: str) -> None:
+    source = answering({5: 10.0, 10: 30.0})
+    inspection = inspect_recording(source, name="a/b/culture.csv.gz")
+    files = draw_inspection(source, inspection, tmp_path / "figures", file_format)
+    assert [file.name for file in files] == [
+        f"culture-{what}.{file_format}" for what in ("raster", "psth", "burst-separation", "responses")
+    ]
+    first = [file.read_bytes() for file in files]
+    draw_inspection(source, inspection, tmp_path / "figures", file_format)
+    assert [file.read_bytes() for file in files] == first
+    assert len(list((tmp_path / "figures").iterdir())) == 4
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    figure = draw_response_histograms(extract_responses(answering({5: 10.0})))
+    with pytest.raises(InvalidArgument, match="expected a figure's name to end in"):
+        save_figure(figure, tmp_path / "figure.xyz")
+
+
+def test_a_recording_without_stimuli_can_be_drawn(tmp_path: Path) -> None:
+    source = recording([(1.0, 0)], [])
+    assert [f.name for f in draw_inspection(source, inspect_recording(source, name="x.nwb"), tmp_path)] == [
+        "x-raster.png"
+    ]
+    assert "not usable" in inspection_text(inspect_recording(source))
