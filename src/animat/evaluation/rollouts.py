@@ -1,0 +1,186 @@
+"""Episodes of policies and of controls against a simulator, many at once."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64, PRNGKeyArray
+
+from animat.animat import Environment
+from animat.errors import InvalidArgument
+from animat.neurons.simulator import NeuronSimulator
+from animat.training.policy import Policy
+from animat.training.sac import Layer, Network, draw_action, forward
+
+
+class Actor(abc.ABC):
+    """Whoever picks the actions of episodes: a pytree, so that several are run side by side."""
+
+    @abc.abstractmethod
+    def act(
+        self,
+        environment: Environment[Any],
+        observation: Float[Array, "episodes observations"],
+        uniforms: Float[Array, " episodes"],
+    ) -> Array:
+        """An action for each observation (scaled), from uniforms in [0, 1); shape (episodes,)."""
+
+
+@final
+@partial(jax.tree_util.register_dataclass, data_fields=["network"], meta_fields=["greedy"])
+@dataclass(frozen=True)
+class Networks(Actor):
+    """Trained policies: their networks, stacked; drawn from, or the most probable action taken."""
+
+    network: Network
+    greedy: bool = False
+
+    def act(
+        self,
+        environment: Environment[Any],
+        observation: Float[Array, "episodes observations"],
+        uniforms: Float[Array, " episodes"],
+    ) -> Array:
+        if not self.greedy:
+            return draw_action(environment, self.network, observation, uniforms)
+        outputs = forward(self.network, observation)
+        return jnp.tanh(outputs[:, 0]) if environment.n_actions is None else jnp.argmax(outputs, axis=-1)
+
+
+@final
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Uniform(Actor):
+    """Every action equally likely, whatever is observed: the random control."""
+
+    def act(
+        self,
+        environment: Environment[Any],
+        observation: Float[Array, "episodes observations"],
+        uniforms: Float[Array, " episodes"],
+    ) -> Array:
+        if environment.n_actions is None:
+            return 2.0 * uniforms - 1.0
+        return jnp.minimum((uniforms * environment.n_actions).astype(jnp.int32), environment.n_actions - 1)
+
+
+@final
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Constant(Actor):
+    """One action always: the constant control."""
+
+    action: Int[Array, ""]
+
+    def act(
+        self,
+        environment: Environment[Any],
+        observation: Float[Array, "episodes observations"],
+        uniforms: Float[Array, " episodes"],
+    ) -> Array:
+        return jnp.broadcast_to(self.action, uniforms.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """What came of a number of episodes of each of several actors.
+
+    Attributes:
+        returns: sum of rewards of each episode, in the task's own units, shape (actors, episodes).
+        lengths: iterations of each, shape (actors, episodes).
+        terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
+    """
+
+    returns: Float64[np.ndarray, "actors episodes"]
+    lengths: Int64[np.ndarray, "actors episodes"]
+    terminated: Bool[np.ndarray, "actors episodes"]
+
+
+def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:
+    """Stack the networks of policies that share one shape.
+
+    Raises:
+        InvalidArgument: if there are none, or their shapes or scales differ.
+    """
+    if not policies:
+        raise InvalidArgument("policies: expected at least one, got none")
+    first = policies[0]
+    for policy in policies[1:]:
+        if [w.shape for w in policy.weights] != [w.shape for w in first.weights]:
+            raise InvalidArgument("policies: expected networks of one shape, got several; evaluate them one by one")
+    layers = (
+        Layer(jnp.stack([p.weights[i] for p in policies]), jnp.stack([p.biases[i][None] for p in policies]))
+        for i in range(len(first.weights))
+    )
+    return Networks(tuple(layers), greedy)
+
+
+def roll_out(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actors: Actor,
+    n_actors: int,
+    *,
+    episodes: int,
+    seed: int,
+) -> Episodes:
+    """Run episodes of several actors against one simulator.
+
+    Every actor gets random numbers of its own, decided by `seed` and its place.
+
+    Args:
+        environment: robot and mapping.
+        simulator: the neurons' answers; None without neurons.
+        actors: one kind of actor, its arrays with a leading axis of actors.
+        n_actors: how many there are.
+        episodes: of each.
+        seed: decides every random draw.
+
+    Raises:
+        InvalidArgument: for fewer episodes than one.
+    """
+    if episodes < 1:
+        raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    keys = jax.random.split(jax.random.key(seed), n_actors)
+    returns, lengths, terminated = _roll_out(environment, episodes, simulator, actors, keys)
+    return Episodes(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), np.asarray(terminated))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _roll_out(
+    environment: Environment[Any], episodes: int, simulator: NeuronSimulator | None, actors: Actor, keys: PRNGKeyArray
+) -> tuple[Array, Array, Array]:
+    def one_actor(actor: Actor, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
+        def iteration(carry: tuple[Any, ...], key: PRNGKeyArray) -> tuple[tuple[Any, ...], None]:
+            state, going, returns, lengths, terminated = carry
+            uniforms = jax.random.uniform(key, (episodes, environment.noise_size + 1))
+            observation = jax.vmap(environment.observe)(state) / environment.scales
+            action = actor.act(environment, observation, uniforms[:, 0])
+            outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], state, action, simulator)
+            # An ended episode is carried along, and counts no further.
+            returns = returns + jnp.where(going, outcome.reward, 0.0)
+            terminated = terminated | (going & outcome.terminated)
+            lengths = lengths + going
+            going = going & ~(outcome.terminated | outcome.truncated)
+            return (outcome.state, going, returns, lengths, terminated), None
+
+        start, key = jax.random.split(key)
+        carry = (
+            jax.vmap(environment.reset)(jax.random.split(start, episodes)),
+            jnp.ones(episodes, bool),
+            jnp.zeros(episodes),
+            jnp.zeros(episodes, jnp.int32),
+            jnp.zeros(episodes, bool),
+        )
+        keys = jax.random.split(key, environment.robot.episode_limit)
+        _, _, returns, lengths, terminated = jax.lax.scan(iteration, carry, keys)[0]
+        return returns, lengths, terminated
+
+    return jax.vmap(one_actor)(actors, keys)

@@ -1,0 +1,199 @@
+"""Policies beside the controls that ask whether it is the culture that does the work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+
+from animat.animat import Animat, Environment, WithoutNeurons
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.rollouts import Constant, Episodes, Uniform, networks_of, roll_out
+from animat.neurons.simulator import NeuronSimulator, silenced
+from animat.neurons.timeline import SimulatorTimeline
+from animat.recordings.findings import Finding
+from animat.robots.base import Robot
+from animat.training.policy import Policy
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One line of the table: who acted, and the returns.
+
+    Attributes:
+        name: `policies`, or the control.
+        meaning: what the control takes away, in a few words.
+        episodes: one row an actor.
+    """
+
+    name: str
+    meaning: str
+    episodes: Episodes
+
+    @property
+    def mean_returns(self) -> Float64[np.ndarray, " actors"]:
+        """Each actor's mean return over its episodes: what the paper calls a policy's performance."""
+        return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The line as plain data."""
+        means = self.mean_returns
+        return {
+            "name": self.name,
+            "meaning": self.meaning,
+            "actors": len(means),
+            "episodes": self.episodes.returns.shape[1],
+            "mean_return": float(means.mean()),
+            # Over actors, as each is one sample; a control has one actor, whose episodes are the samples.
+            "standard_error": _standard_error(means if len(means) > 1 else self.episodes.returns[0]),
+            "mean_length": float(self.episodes.lengths.mean()),
+            "terminated_share": float(self.episodes.terminated.mean()),
+            "mean_returns": means.tolist(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Trained policies and controls on one simulator.
+
+    Attributes:
+        robot: the robot.
+        mapping: its name; None without neurons.
+        recorded_at_min: the recording the simulator was made of; None without neurons.
+        names: the policies, in the order of the first row's actors.
+        rows: the policies first, then the controls.
+        findings: where the policies' training and this simulator differ.
+    """
+
+    robot: str
+    mapping: str | None
+    recorded_at_min: float | None
+    names: tuple[str, ...]
+    rows: tuple[Row, ...]
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "robot": self.robot,
+            "mapping": self.mapping,
+            "recorded_at_min": self.recorded_at_min,
+            "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
+            "rows": [row.to_dict() for row in self.rows],
+            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
+        }
+
+
+def evaluate(
+    policies: Mapping[str, Policy],
+    timeline: SimulatorTimeline | None,
+    *,
+    at_min: float | None = None,
+    episodes: int = 100,
+    seed: int = 1,
+    greedy: bool = False,
+    robot: Robot[Any] | None = None,
+) -> Evaluation:
+    """Run policies and the controls beside them on the simulator of one minute.
+
+    The controls: *random*, an action drawn at random; *constant*, one condition always, for each of them; *silent*,
+    the policies on a culture that always answers 0; *shuffled*, the policies with the delivered condition drawn anew
+    at each iteration, whatever they chose.
+
+    Args:
+        policies: by name, all of one robot, mapping and set of conditions.
+        timeline: the culture's simulators; None for policies without neurons.
+        at_min: minute on the culture's clock whose newest simulator is used; None: the last recording.
+        episodes: of each policy and control.
+        seed: decides every random draw.
+        greedy: whether the most probable action is taken, not drawn from the policy.
+        robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
+
+    Raises:
+        InvalidArgument: for no policies or fewer episodes than one.
+        Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
+    """
+    if not policies:
+        raise InvalidArgument("policies: expected at least one, got none")
+    first_name, first = next(iter(policies.items()))
+    for name, policy in policies.items():
+        for attribute in ("robot", "mapping", "conditions", "commands"):
+            if getattr(policy, attribute) != getattr(first, attribute):
+                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; evaluate it alone")
+    if robot is not None and robot.name != first.robot.name:
+        raise Mismatch(f"robot: expected {first.robot.name}, which the policies were trained on, got {robot.name}")
+    body = robot or first.robot
+
+    findings: tuple[Finding, ...] = ()
+    simulator: NeuronSimulator | None = None
+    environment: Environment[Any]
+    minute = None
+    if first.mapping is None:
+        environment = WithoutNeurons(body, first.commands)
+    else:
+        if timeline is None:
+            raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
+        findings = _check(first, timeline)
+        row = timeline.row_at(timeline.start_min[-1] if at_min is None else at_min)
+        minute = float(timeline.start_min[row])
+        simulator = timeline.at(minute)
+        environment = Animat(body, first.mapping, len(timeline.conditions))
+
+    networks = networks_of(list(policies.values()), greedy=greedy)
+    n = len(policies)
+
+    def run(name: str, meaning: str, in_: Environment[Any], on: NeuronSimulator | None, actors: Any, many: int) -> Row:
+        return Row(name, meaning, roll_out(in_, on, actors, many, episodes=episodes, seed=seed))
+
+    rows = [run("policies", "as trained", environment, simulator, networks, n)]
+    rows.append(run("random", "any action, equally likely", environment, simulator, Uniform(), 1))
+    for i, label in enumerate(_action_labels(first)):
+        rows.append(run(f"constant {label}", "this one always", environment, simulator, Constant(jnp.array([i])), 1))
+    if isinstance(environment, Animat) and simulator is not None:
+        rows.append(run("silent", "the culture always answers 0", environment, silenced(simulator), networks, n))
+        shuffled = replace(environment, delivery="shuffled")
+        rows.append(run("shuffled", "the delivered condition is drawn anew", shuffled, simulator, networks, n))
+    return Evaluation(
+        body.name, None if first.mapping is None else first.mapping.name, minute, tuple(policies), tuple(rows), findings
+    )
+
+
+def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
+    if policy.conditions != timeline.conditions:
+        raise Mismatch(
+            f"conditions: expected {', '.join(c.label for c in policy.conditions)}, which the policies pick from, got "
+            f"recordings with {', '.join(c.label for c in timeline.conditions)}"
+        )
+    found = []
+    if policy.window_ms != timeline.window_ms:
+        found.append(
+            Finding(
+                "other-window",
+                "warning",
+                f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}",
+            )
+        )
+    if policy.presentation != timeline.presentation:
+        found.append(
+            Finding(
+                "other-presentation",
+                "warning",
+                f"the policies were trained on stimuli presented as {policy.presentation or 'unknown'}, in these "
+                f"recordings they are {timeline.presentation or 'unknown'}, and a culture answers otherwise",
+            )
+        )
+    return tuple(found)
+
+
+def _action_labels(policy: Policy) -> list[str]:
+    if policy.mapping is not None:
+        return [condition.label for condition in policy.conditions]
+    return [] if policy.commands is None else [f"{command:+g}" for command in policy.commands]
+
+
+def _standard_error(samples: Float64[np.ndarray, " samples"]) -> float | None:
+    return float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None

@@ -1,0 +1,83 @@
+"""What a simulator keeps of the responses it was made from, and what it loses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
+from animat.recordings.findings import Finding
+
+LARGEST_LOSS = 0.05
+"""A difference in P(x >= P50) between data and simulator above which `findings` warns."""
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """How often each condition passes the pooled median, in the data and in the simulator.
+
+    Attributes:
+        labels: the conditions.
+        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,).
+        in_simulator: the same from the simulator, shape (conditions,).
+        n_above_range: non-burst responses above a histogram's range, which were counted into its last bin.
+    """
+
+    labels: tuple[str, ...]
+    in_data: Float[np.ndarray, " conditions"]
+    in_simulator: Float[np.ndarray, " conditions"]
+    n_above_range: int
+
+    def findings(self) -> tuple[Finding, ...]:
+        """A warning where binning moves P(x >= P50) by more than `LARGEST_LOSS`, or responses lie above the range."""
+        found = []
+        loss = np.abs(self.in_data - self.in_simulator)
+        worst = int(np.argmax(loss))
+        if loss[worst] > LARGEST_LOSS:
+            found.append(
+                Finding(
+                    "binning",
+                    "warning",
+                    f"the histogram changes P(x >= P50) of {self.labels[worst]} from {self.in_data[worst]:.2f} to "
+                    f"{self.in_simulator[worst]:.2f}: take more bins, a smaller range, or the empirical simulator",
+                    float(loss[worst]),
+                )
+            )
+        if self.n_above_range:
+            found.append(
+                Finding(
+                    "above-range",
+                    "warning",
+                    f"{self.n_above_range} responses lie above the histogram's range and count into its last bin",
+                    float(self.n_above_range),
+                )
+            )
+        return tuple(found)
+
+
+def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
+    """Compare a simulator with the responses it was fitted to, at the pooled median P50.
+
+    The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50.
+    """
+    median = float(simulator.percentiles[5])
+    kept = ~responses.is_burst
+    in_data = np.array(
+        [
+            np.mean(responses.rate_hz[kept & (responses.condition == c)].astype(np.float32) >= np.float32(median))
+            for c in range(len(responses.conditions))
+        ]
+    )
+    uniforms = (jnp.arange(20_000) + 0.5) / 20_000
+    conditions = jnp.arange(simulator.n_conditions)
+    x = jax.jit(jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None)))(conditions, uniforms)
+    above = 0
+    if isinstance(simulator, HistogramSimulator):
+        above = int(np.count_nonzero(responses.rate_hz[kept] > float(simulator.edges_hz[-1])))
+    labels = tuple(condition.label for condition in responses.conditions)
+    return Fidelity(labels, in_data, np.asarray(jnp.mean(x >= median, axis=1), np.float64), above)

@@ -1,0 +1,194 @@
+"""The neuron simulator: per condition a distribution of responses, drawn from instead of asking the culture."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Literal, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
+
+from animat.errors import InvalidArgument, UnusableData
+from animat.neurons.responses import Responses
+
+Kind = Literal["histogram", "empirical"]
+
+PERCENTILES = tuple(range(0, 101, 10))
+"""Which percentiles of the pooled non-burst responses a simulator carries: P0 (smallest), P10, ..., P100 (largest)."""
+
+
+class NeuronSimulator(abc.ABC):
+    """What a culture answers to each condition, as a pytree of arrays; so a refresh changes data, never code.
+
+    Attributes:
+        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,).
+    """
+
+    percentiles: Float[Array, " percentiles"]
+
+    @property
+    @abc.abstractmethod
+    def n_conditions(self) -> int:
+        """How many conditions it answers to."""
+
+    @abc.abstractmethod
+    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
+        """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies."""
+
+    @final
+    def sample(self, key: PRNGKeyArray, condition: Int[Array, ""]) -> Float[Array, ""]:
+        """Draw one response x to a condition, in Hz per channel."""
+        return self.quantile(condition, jax.random.uniform(key))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class HistogramSimulator(NeuronSimulator):
+    """A normalised histogram per condition: draw a bin, then uniformly inside it (the paper, section 2.3).
+
+    With c the cumulative shares at the edges e, and b the bin in which c_b <= q < c_(b+1):
+    x(q) = e_b + (q - c_b) / (c_(b+1) - c_b) (e_(b+1) - e_b).
+
+    Attributes:
+        cumulative: share of a condition's responses below each edge, shape (conditions, bins + 1).
+        edges_hz: the bins' edges, shape (bins + 1,).
+        percentiles: as in `NeuronSimulator`.
+    """
+
+    cumulative: Float[Array, "conditions edges"]
+    edges_hz: Float[Array, " edges"]
+    percentiles: Float[Array, " percentiles"]
+
+    @property
+    def n_conditions(self) -> int:
+        return self.cumulative.shape[-2]
+
+    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
+        cumulative = self.cumulative[condition]
+        # Twenty comparisons beat a binary search, and an empty bin is never chosen: its two edges share a value.
+        bin_ = jnp.sum(uniform >= cumulative[1:-1])
+        low, high = cumulative[bin_], cumulative[bin_ + 1]
+        within = (uniform - low) / (high - low)
+        return self.edges_hz[bin_] + within * (self.edges_hz[bin_ + 1] - self.edges_hz[bin_])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EmpiricalSimulator(NeuronSimulator):
+    """The measured responses themselves: one of a condition's values is drawn, so nothing is lost to binning.
+
+    x(q) = v_(floor(q n)), v the n sorted values of the condition.
+
+    Attributes:
+        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses).
+        counts: how many of them there are, shape (conditions,).
+        percentiles: as in `NeuronSimulator`.
+    """
+
+    values_hz: Float[Array, "conditions values"]
+    counts: Int[Array, " conditions"]
+    percentiles: Float[Array, " percentiles"]
+
+    @property
+    def n_conditions(self) -> int:
+        return self.values_hz.shape[-2]
+
+    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
+        count = self.counts[condition]
+        # float32 rounds a uniform just under 1 times a count up to the count.
+        row = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
+        return self.values_hz[condition, row]
+
+
+def histogram_range_hz(responses: Responses) -> float:
+    """The upper end of a histogram's range: the largest non-burst response, rounded up to 10 Hz (at least 10 Hz).
+
+    The paper's 0-120 Hz was chosen for its culture; on another one a bin can hold several percentiles, and the
+    differences between conditions are lost. So the range is data.
+    """
+    return max(10.0, 10.0 * float(np.ceil(np.max(_non_burst(responses)) / 10.0)))
+
+
+def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
+    """Fit a histogram per condition to the non-burst responses.
+
+    Args:
+        responses: of one recording, every condition with at least one non-burst response.
+        bins: number of bins from 0 to `range_hz` (the paper: 20).
+        range_hz: upper end of the range (the paper: 120); None: `histogram_range_hz(responses)`. Responses above it
+            count into the last bin, and `fidelity` says how many they are.
+
+    Raises:
+        InvalidArgument: for fewer bins than one or a range that is not positive.
+        UnusableData: if a condition has no non-burst response.
+    """
+    if bins < 1:
+        raise InvalidArgument(f"bins: expected at least 1, got {bins}")
+    upper = histogram_range_hz(responses) if range_hz is None else range_hz
+    if not (np.isfinite(upper) and upper > 0):
+        raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {upper:g}")
+    edges = np.linspace(0.0, upper, bins + 1)
+    counts = np.array([np.histogram(np.minimum(x, upper), edges)[0] for x in _by_condition(responses)])
+    # Whole counts are added up before dividing, so that the last share is exactly 1 and no empty bin is ever drawn.
+    below = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
+    cumulative = below / below[:, -1:]
+    return HistogramSimulator(
+        jnp.asarray(cumulative, jnp.float32), jnp.asarray(edges, jnp.float32), pooled_percentiles(responses)
+    )
+
+
+def fit_empirical(responses: Responses, *, room: int | None = None) -> EmpiricalSimulator:
+    """Keep the non-burst responses of every condition to draw from.
+
+    Args:
+        responses: of one recording, every condition with at least one non-burst response.
+        room: how many values a condition has room for, so that simulators of several recordings stack; None: as many
+            as the largest condition needs.
+
+    Raises:
+        UnusableData: if a condition has no non-burst response.
+        InvalidArgument: if a condition has more responses than there is room for.
+    """
+    values = _by_condition(responses)
+    counts = np.array([len(x) for x in values])
+    room = int(counts.max()) if room is None else room
+    if counts.max() > room:
+        raise InvalidArgument(f"room: expected at least {counts.max()}, the largest condition's responses, got {room}")
+    table = np.stack([np.pad(np.sort(x), (0, room - len(x)), mode="edge") for x in values])
+    return EmpiricalSimulator(
+        jnp.asarray(table, jnp.float32), jnp.asarray(counts, jnp.int32), pooled_percentiles(responses)
+    )
+
+
+def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
+    """A culture that always answers 0, beside the percentiles of the one that did not: the silent control."""
+    conditions = simulator.n_conditions
+    return EmpiricalSimulator(
+        jnp.zeros((conditions, 1), jnp.float32), jnp.ones(conditions, jnp.int32), simulator.percentiles
+    )
+
+
+def pooled_percentiles(responses: Responses) -> Float[Array, " percentiles"]:
+    """P0, P10, ..., P100 of the non-burst responses of all conditions together, interpolated linearly, in Hz."""
+    return jnp.asarray(np.percentile(_non_burst(responses), PERCENTILES), jnp.float32)
+
+
+def _non_burst(responses: Responses) -> Float64[np.ndarray, " responses"]:
+    kept: Float64[np.ndarray, " responses"] = responses.rate_hz[~responses.is_burst]
+    if not len(kept):
+        raise UnusableData("responses: expected at least one non-burst response, got none")
+    return kept
+
+
+def _by_condition(responses: Responses) -> list[Float64[np.ndarray, " responses"]]:
+    kept = ~responses.is_burst
+    values = [responses.rate_hz[kept & (responses.condition == c)] for c in range(len(responses.conditions))]
+    for condition, x in zip(responses.conditions, values, strict=True):
+        if not len(x):
+            raise UnusableData(
+                f"condition {condition.label}: expected non-burst responses to fit, got none; leave the condition out"
+            )
+    return values

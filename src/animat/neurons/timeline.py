@@ -1,0 +1,125 @@
+"""A culture's simulators over its recordings: what parameter shadowing refreshes from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+
+from animat.errors import InvalidArgument, Mismatch
+from animat.neurons.conditions import Condition
+from animat.neurons.fidelity import Fidelity, fidelity
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import Kind, NeuronSimulator, fit_empirical, fit_histogram, histogram_range_hz
+from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorTimeline:
+    """Simulators of one culture, one a recording, stacked, with the minutes they were recorded at.
+
+    Attributes:
+        simulators: one pytree whose arrays have a leading axis of recordings.
+        start_min: minutes on the culture's clock, rising, shape (recordings,).
+        conditions: what the agent picks from, the same in every recording.
+        window_ms: the response window.
+        presentation: how stimuli were presented, None where it is not known.
+        fidelities: what each simulator keeps of its responses.
+        findings: what was noticed in the recordings and in the fits, with the minute in front.
+    """
+
+    simulators: NeuronSimulator
+    start_min: Float64[np.ndarray, " recordings"]
+    conditions: tuple[Condition, ...]
+    window_ms: tuple[float, float]
+    presentation: Presentation | None
+    fidelities: tuple[Fidelity, ...]
+    findings: tuple[Finding, ...]
+
+    def __len__(self) -> int:
+        return len(self.start_min)
+
+    def row_at(self, minute: float) -> int:
+        """The newest recording at a minute: the last one that started at or before it (before all: the first)."""
+        return max(0, int(np.searchsorted(self.start_min, minute, side="right")) - 1)
+
+    def at(self, minute: float) -> NeuronSimulator:
+        """The simulator in use at a minute of the culture's clock."""
+        row = self.row_at(minute)
+        return jax.tree.map(lambda stacked: stacked[row], self.simulators)  # type: ignore[no-any-return]
+
+    def with_first_percentiles(self) -> SimulatorTimeline:
+        """The same simulators with the first recording's percentiles held, for mappings that do not move along."""
+        percentiles = self.simulators.percentiles
+        held = jnp.broadcast_to(percentiles[:1], percentiles.shape)
+        return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
+
+
+def fit_timeline(
+    series: Sequence[Responses], *, kind: Kind = "histogram", bins: int = 20, range_hz: float | None = None
+) -> SimulatorTimeline:
+    """Fit a simulator to each recording's responses and stack them in the order of time.
+
+    Args:
+        series: responses of the recordings, all with the same conditions, window and presentation, in any order.
+        kind: `"histogram"` (the paper) or `"empirical"` (draw a measured value).
+        bins: of a histogram.
+        range_hz: upper end of a histogram's range, Hz; None: from the first recording (`histogram_range_hz`), the
+            same for all.
+
+    Raises:
+        InvalidArgument: if there are no responses or the kind is unknown.
+        Mismatch: if the recordings differ in conditions, window or presentation, or two share a minute.
+        UnusableData: if a condition of a recording has no non-burst response.
+    """
+    if not series:
+        raise InvalidArgument("series: expected the responses of at least one recording, got none")
+    ordered = sorted(series, key=lambda responses: responses.start_min)
+    first = ordered[0]
+    for other in ordered[1:]:
+        for name in ("conditions", "window_ms", "presentation"):
+            if getattr(other, name) != getattr(first, name):
+                raise Mismatch(
+                    f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
+                    f"{first.start_min:g} min and {_words(getattr(other, name))} at {other.start_min:g} min"
+                )
+    start_min = np.array([responses.start_min for responses in ordered], dtype=np.float64)
+    if np.any(np.diff(start_min) == 0):
+        twice = start_min[:-1][np.diff(start_min) == 0][0]
+        raise Mismatch(f"start_min: expected one recording a minute mark, got two at {twice:g} min")
+
+    if kind == "histogram":
+        upper = histogram_range_hz(first) if range_hz is None else range_hz
+        fitted: list[NeuronSimulator] = [fit_histogram(r, bins=bins, range_hz=upper) for r in ordered]
+    elif kind == "empirical":
+        room = max(int(np.bincount(r.condition[~r.is_burst]).max()) for r in ordered)
+        fitted = [fit_empirical(r, room=room) for r in ordered]
+    else:
+        raise InvalidArgument(f"kind: expected 'histogram' or 'empirical', got {kind!r}")
+
+    fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
+    findings = tuple(
+        replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}")
+        for responses, kept in zip(ordered, fidelities, strict=True)
+        for finding in (*responses.findings, *kept.findings())
+    )
+    return SimulatorTimeline(
+        simulators=jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted),
+        start_min=start_min,
+        conditions=first.conditions,
+        window_ms=first.window_ms,
+        presentation=first.presentation,
+        fidelities=fidelities,
+        findings=findings,
+    )
+
+
+def _words(value: object) -> str:
+    if isinstance(value, tuple) and value and isinstance(value[0], Condition):
+        return ", ".join(condition.label for condition in value)
+    return str(value)

@@ -1,0 +1,148 @@
+"""Policies that are trained side by side in one process: chunk after chunk, with a checkpoint to go on from."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.neurons.timeline import SimulatorTimeline
+from animat.training.policy import Policy
+from animat.training.sac import Learner, begin, train_chunk
+from animat.training.specification import CHUNKS, Training
+from animat.writing import written_whole
+
+Report = Callable[[int, float], None]
+"""Told after each chunk how many are done, and the mean return of the episodes that ended in it (NaN for none)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Some of a training's policies, and what they are trained on.
+
+    Attributes:
+        training: what is trained.
+        members: which of its policies, by number.
+        timeline: the culture's simulators; None without neurons.
+        fingerprint: of training and timeline together; a checkpoint of another one is refused.
+        provenance: goes into the policies.
+    """
+
+    training: Training
+    members: tuple[int, ...]
+    timeline: SimulatorTimeline | None
+    fingerprint: str
+    provenance: dict[str, Any]
+
+
+def train_group(group: Group, checkpoint: Path, report: Report) -> list[Policy]:
+    """Train a group of policies, going on from its checkpoint where there is one.
+
+    The result is the same, bit for bit, however often the training was stopped and started again.
+
+    Args:
+        group: the policies to train.
+        checkpoint: file to write after each chunk, complete or absent; the caller removes it when it is done with.
+        report: told after each chunk.
+
+    Raises:
+        InvalidFile: if the checkpoint cannot be read or written, or is of another training.
+    """
+    training, timeline = group.training, group.timeline
+    if timeline is not None and training.percentiles == "first":
+        timeline = timeline.with_first_percentiles()
+    environment = training.environment(0 if timeline is None else len(timeline.conditions))
+    settings = training.algorithm
+
+    chunk = jax.jit(
+        jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)), donate_argnums=0
+    )
+    keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
+    learners = jax.jit(jax.vmap(partial(begin, environment, settings)))(keys)
+    curve = np.full((CHUNKS, len(group.members), 3), np.nan)
+    done = 0
+    if checkpoint.exists():
+        done, learners, curve = _read_checkpoint(checkpoint, group.fingerprint, learners, curve)
+
+    start_min = 0.0 if timeline is None else float(timeline.start_min[0])
+    for index in range(done, CHUNKS):
+        first, last = training.chunk(index)
+        simulator = None if timeline is None else timeline.at(start_min + training.minute(index))
+        learners, finished = chunk(learners, simulator, jnp.int32(first), jnp.int32(last))
+        episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
+        with np.errstate(invalid="ignore"):
+            curve[index] = np.stack(
+                [np.full(len(episodes), last * settings.environments), episodes, returns / episodes], axis=1
+            )
+        _write_checkpoint(checkpoint, group.fingerprint, index + 1, learners, curve)
+        report(index + 1, float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan"))
+    return [
+        _policy(
+            group,
+            environment.scales,
+            jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), learners.trained),
+            curve[:, i],
+        )
+        for i in range(len(group.members))
+    ]
+
+
+def _policy(group: Group, scales: np.ndarray, trained: Any, curve: np.ndarray) -> Policy:
+    training, timeline = group.training, group.timeline
+    through_neurons = training.mapping is not None and timeline is not None
+    return Policy(
+        weights=tuple(layer.weight for layer in trained.actor),
+        biases=tuple(layer.bias[0] for layer in trained.actor),
+        scales=scales,
+        robot=training.robot,
+        mapping=training.mapping,
+        conditions=timeline.conditions if through_neurons and timeline else (),
+        commands=training.commands,
+        window_ms=timeline.window_ms if timeline else None,
+        presentation=timeline.presentation if timeline else None,
+        provenance=group.provenance,
+        learning_curve=curve,
+    )
+
+
+def _write_checkpoint(path: Path, fingerprint: str, done: int, learners: Learner[Any], curve: np.ndarray) -> None:
+    leaves = jax.tree.leaves(learners._replace(key=jax.random.key_data(learners.key)))
+    arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    with written_whole(path) as beside, beside.open("wb") as file:
+        np.savez(file, fingerprint=np.array(fingerprint), done=np.array(done), curve=curve, **arrays)
+
+
+def _read_checkpoint(
+    path: Path, fingerprint: str, like: Learner[Any], curve: np.ndarray
+) -> tuple[int, Learner[Any], np.ndarray]:
+    like = like._replace(key=jax.random.key_data(like.key))
+    leaves, structure = jax.tree.flatten(like)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["fingerprint"]) != fingerprint:
+                raise InvalidFile(f"{path}: expected a checkpoint of this training, got one of another; remove it")
+            read = [jnp.asarray(file[f"leaf{i}"]) for i in range(len(leaves))]
+            done, curve = int(file["done"]), file["curve"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InvalidFile(
+            f"{path}: expected a checkpoint, got a file that cannot be read ({error}); remove it"
+        ) from error
+    learners = jax.tree.unflatten(structure, read)
+    return done, learners._replace(key=jax.random.wrap_key_data(learners.key)), curve
+
+
+def split_groups(policies: int, largest: int = 5) -> list[tuple[int, ...]]:
+    """Cut the numbers of the policies into groups as even as possible, none larger than `largest`.
+
+    It depends on nothing else, not on the machine: how many are trained side by side could change the last bits.
+    """
+    n_groups = -(-policies // largest)
+    return [tuple(int(i) for i in part) for part in np.array_split(np.arange(policies), n_groups)]

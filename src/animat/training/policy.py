@@ -1,0 +1,195 @@
+"""What training yields and a closed loop runs: a small network with everything that is needed to use it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+from collections.abc import Mapping as Dict
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from animat.errors import AnimatError, InvalidArgument, InvalidFile
+from animat.mapping import Mapping, mapping_named
+from animat.neurons.conditions import Condition
+from animat.recordings.protocol import Presentation
+from animat.robots.base import Robot
+from animat.robots.registry import robot_from_dict, robot_to_dict
+from animat.writing import written_whole
+
+FORMAT = "animat-policy-1"
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained controller, run in numpy: nothing of JAX is imported to load it or to act.
+
+    The network has two hidden layers of rectified units; its outputs are the logits of the actions, or mean and log
+    deviation of a continuous one, which tanh takes into [-1, 1].
+
+    Attributes:
+        weights, biases: of the three layers, shapes (inputs, outputs) and (outputs,).
+        scales: what observations are divided by first, shape (observations,).
+        robot: the robot it was trained on.
+        mapping: from a response to a command; None for a policy without neurons.
+        conditions: what the actions are, for a policy that acts through neurons.
+        commands: what the actions are, for one without neurons; None there means a continuous command.
+        window_ms: the response window, for a policy that acts through neurons.
+        presentation: how stimuli were presented when the neurons were recorded; None where it is not known.
+        provenance: what it was trained on and how, as plain data.
+        learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
+    """
+
+    weights: tuple[Float32[np.ndarray, "inputs outputs"], ...]
+    biases: tuple[Float32[np.ndarray, " outputs"], ...]
+    scales: Float32[np.ndarray, " observations"]
+    robot: Robot[Any]
+    mapping: Mapping | None
+    conditions: tuple[Condition, ...] = ()
+    commands: tuple[float, ...] | None = None
+    window_ms: tuple[float, float] | None = None
+    presentation: Presentation | None = None
+    provenance: Dict[str, Any] = field(default_factory=dict)
+    learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def __post_init__(self) -> None:
+        n_outputs = 2 if self.n_actions is None else self.n_actions
+        widths = [len(self.robot.quantities), *(len(bias) for bias in self.biases)]
+        shapes = [weight.shape for weight in self.weights]
+        if widths[-1] != n_outputs or shapes != list(itertools.pairwise(widths)):
+            raise InvalidArgument(
+                f"weights: expected layers from {widths[0]} observations of {self.robot.name} to {n_outputs} outputs, "
+                f"got shapes {shapes}"
+            )
+        if self.scales.shape != (widths[0],):
+            raise InvalidArgument(f"scales: expected one for each of {widths[0]} observations, got {self.scales.shape}")
+        if not all(np.all(np.isfinite(array)) for array in (*self.weights, *self.biases, self.scales)):
+            raise InvalidArgument("weights: expected finite numbers, got NaN or infinite ones")
+
+    @property
+    def n_actions(self) -> int | None:
+        """How many discrete actions there are; None: one continuous command in [-1, 1]."""
+        if self.mapping is not None:
+            return len(self.conditions)
+        return None if self.commands is None else len(self.commands)
+
+    def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
+        """The network's outputs for an observation in the robot's own units."""
+        hidden = observation / self.scales
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = hidden @ weight
+            hidden += bias
+            np.maximum(hidden, 0.0, out=hidden)
+        return hidden @ self.weights[-1] + self.biases[-1]  # type: ignore[no-any-return]
+
+    def probabilities(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " actions"]:
+        """The probability of each discrete action: softmax of the outputs."""
+        logits = self.outputs(observation)
+        exponentials = np.exp(logits - logits.max())
+        return exponentials / exponentials.sum()  # type: ignore[no-any-return]
+
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int | float:
+        """Draw an action from the policy: the index of a condition (or command), or a continuous command.
+
+        Args:
+            observation: in the robot's own units, shape (observations,).
+            rng: source of the draw.
+        """
+        if self.n_actions is None:
+            mean, log_std = self.outputs(observation)
+            return math.tanh(mean + math.exp(min(max(log_std, -5.0), 2.0)) * rng.standard_normal())
+        below = np.cumsum(self.probabilities(observation))
+        return min(int(np.searchsorted(below, rng.random() * below[-1], side="right")), len(below) - 1)
+
+    def act_greedily(self, observation: Float[np.ndarray, " observations"]) -> int | float:
+        """The most probable action (the middle of the distribution, for a continuous one)."""
+        outputs = self.outputs(observation)
+        return math.tanh(outputs[0]) if self.n_actions is None else int(outputs.argmax())
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the policy as safetensors, with everything that is not an array as JSON in its metadata.
+
+        Raises:
+            InvalidFile: if it cannot be written; what stood there before is unchanged.
+        """
+        from safetensors.numpy import save
+
+        arrays = {"scales": self.scales, "learning_curve": self.learning_curve}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            arrays |= {f"layer{i}.weight": weight, f"layer{i}.bias": bias}
+        described = {
+            "robot": robot_to_dict(self.robot),
+            "mapping": None if self.mapping is None else self.mapping.name,
+            "conditions": [asdict(condition) for condition in self.conditions],
+            "commands": self.commands,
+            "window_ms": self.window_ms,
+            "presentation": None if self.presentation is None else asdict(self.presentation),
+            "provenance": dict(self.provenance),
+        }
+        metadata = {"format": FORMAT, "animat": json.dumps(described, sort_keys=True)}
+        data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
+        with written_whole(path) as beside:
+            beside.write_bytes(data)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Policy:
+        """Read a policy that `save` wrote.
+
+        Raises:
+            InvalidFile: if the file is missing, damaged, or not a policy of this format.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        path = Path(path)
+        if not path.is_file():
+            raise InvalidFile(f"{path}: expected a policy file, got {'a folder' if path.is_dir() else 'no such file'}")
+        try:
+            with safe_open(path, framework="numpy") as file:
+                metadata = file.metadata() or {}
+                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError, ValueError) as error:
+            raise InvalidFile(
+                f"{path}: expected a policy (safetensors), got a file that cannot be read: {error}"
+            ) from error
+        if metadata.get("format") != FORMAT:
+            raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {metadata.get('format', 'none')!r}")
+        try:
+            described = json.loads(metadata["animat"])
+            layers = range(sum(name.endswith(".weight") for name in arrays))
+            return Policy(
+                weights=tuple(arrays[f"layer{i}.weight"] for i in layers),
+                biases=tuple(arrays[f"layer{i}.bias"] for i in layers),
+                scales=arrays["scales"],
+                robot=robot_from_dict(described["robot"]),
+                mapping=None if described["mapping"] is None else mapping_named(described["mapping"]),
+                conditions=tuple(Condition(**condition) for condition in described["conditions"]),
+                commands=None if described["commands"] is None else tuple(described["commands"]),
+                window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
+                presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
+                provenance=described["provenance"],
+                learning_curve=arrays["learning_curve"],
+            )
+        except (KeyError, TypeError, ValueError, AnimatError) as error:
+            raise InvalidFile(
+                f"{path}: expected a whole policy, got one that does not fit together: {error}"
+            ) from error
+
+
+def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
+    """Read one policy file, or all of a folder, by name, in the order of their numbers (p2 before p10).
+
+    Raises:
+        InvalidFile: if there is none, or one cannot be read.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return {path.stem: Policy.load(path)}
+    files = sorted(path.glob("*.safetensors"), key=lambda file: (len(file.name), file.name))
+    if not files:
+        raise InvalidFile(f"{path}: expected policies (*.safetensors) in the folder, got none; train them first")
+    return {file.stem: Policy.load(file) for file in files}

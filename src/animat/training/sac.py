@@ -1,0 +1,377 @@
+"""Soft Actor-Critic, whole: networks, replay, losses, and the loop of acting and learning, as one jittable chunk.
+
+Discrete actions after Christodoulou (2019, arXiv:1910.07207), continuous ones after Haarnoja et al. (2018,
+arXiv:1812.05905), with two critics, target critics that follow slowly, and an entropy bonus whose weight alpha is
+learned so that the policy keeps a wanted entropy.
+
+Made for many small policies: everything of one policy is one pytree (`Learner`), so `jax.vmap` trains several side by
+side; a transition is one packed row; the random numbers of an iteration are one block; time limits bootstrap and
+terminations do not.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from animat.animat import Environment, EpisodeState, RobotState
+from animat.errors import InvalidArgument
+from animat.neurons.simulator import NeuronSimulator
+
+
+@dataclass(frozen=True)
+class SAC:
+    """The algorithm's settings; all of them static under jit.
+
+    Attributes:
+        environments: episodes run side by side by one policy.
+        updates: gradient updates after each step of all of them; updates / environments is the replay ratio.
+        batch: transitions in one update.
+        replay: transitions remembered; the oldest are forgotten first.
+        hidden: width of each of the two hidden layers of actor and critics.
+        learning_rate: of Adam, for actor, critics and alpha.
+        discount: gamma.
+        follow: share of the critics that the target critics take over at each update (tau).
+        reward_scale: rewards are multiplied by it inside the learner only.
+        first_alpha: weight of the entropy bonus at the start.
+        entropy_share: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
+        entropy_nats: the entropy that a continuous action keeps.
+
+    Raises:
+        InvalidArgument: for a count below 1, or a replay that is no multiple of the environments.
+    """
+
+    environments: int = 32
+    updates: int = 4
+    batch: int = 64
+    replay: int = 131_072
+    hidden: int = 64
+    learning_rate: float = 1e-3
+    discount: float = 0.99
+    follow: float = 0.005
+    reward_scale: float = 0.1
+    first_alpha: float = 0.1
+    entropy_share: float = 0.1
+    entropy_nats: float = -1.0
+
+    def __post_init__(self) -> None:
+        for name in ("environments", "updates", "batch", "replay", "hidden"):
+            if getattr(self, name) < 1:
+                raise InvalidArgument(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.replay % self.environments:
+            raise InvalidArgument(
+                f"replay: expected a multiple of environments ({self.environments}), got {self.replay}"
+            )
+
+
+class Layer(NamedTuple):
+    """Weights and biases of one layer; leading axes stack networks."""
+
+    weight: Float[Array, "*stack inputs outputs"]
+    bias: Float[Array, "*stack 1 outputs"]
+
+
+Network = tuple[Layer, ...]
+
+
+class Trained(NamedTuple):
+    """What gradients change: the actor, two critics stacked, and the entropy bonus's weight."""
+
+    actor: Network
+    critics: Network
+    log_alpha: Float[Array, ""]
+
+
+class Learner(NamedTuple, Generic[RobotState]):
+    """One policy while it is trained: everything that the next iteration depends on."""
+
+    trained: Trained
+    targets: Network
+    optimiser: Any
+    replay: Float[Array, "transitions row"]
+    episodes: EpisodeState[RobotState]
+    returns: Float[Array, " environments"]
+    key: PRNGKeyArray
+
+
+class Batch(NamedTuple):
+    """Transitions; observations and rewards are scaled, actions and terminations are floats."""
+
+    observation: Float[Array, "batch observations"]
+    next_observation: Float[Array, "batch observations"]
+    action: Float[Array, " batch"]
+    reward: Float[Array, " batch"]
+    terminated: Float[Array, " batch"]
+
+
+class Finished(NamedTuple):
+    """Episodes that ended in a chunk of training: how many, and the sum of their returns in the task's units."""
+
+    episodes: Float[Array, ""]
+    returns: Float[Array, ""]
+
+
+# --- networks -------------------------------------------------------------------------------------------------------
+
+
+def initial_networks(key: PRNGKeyArray, *shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> list[Network]:
+    """New networks of the given sizes (inputs, hidden, ..., outputs) and stacks (how many of them side by side).
+
+    Weights are uniform in +-1/sqrt(inputs), a hundred times smaller in the last layer: a policy starts undecided.
+    """
+    counts = [math.prod(stack) * sum(i * o for i, o in itertools.pairwise(sizes)) for sizes, stack in shapes]
+    # Drawn at once and cut up: a random generator in the program costs more to compile than to run.
+    draws = jax.random.uniform(key, (sum(counts),), minval=-1.0, maxval=1.0)
+    networks = []
+    for sizes, stack in shapes:
+        layers = []
+        for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+            shape = (*stack, inputs, outputs)
+            used, draws = draws[: math.prod(shape)], draws[math.prod(shape) :]
+            limit = (0.01 if i == len(sizes) - 2 else 1.0) / math.sqrt(inputs)
+            layers.append(Layer(limit * used.reshape(shape), jnp.zeros((*stack, 1, outputs))))
+        networks.append(tuple(layers))
+    return networks
+
+
+def forward(network: Network, inputs: Float[Array, "*stack batch inputs"]) -> Float[Array, "*stack batch outputs"]:
+    """Hidden layers of rectified units, then a linear one."""
+    hidden = inputs
+    for layer in network[:-1]:
+        hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
+    return hidden @ network[-1].weight + network[-1].bias
+
+
+def squashed_normal(
+    outputs: Float[Array, "batch 2"], uniforms: Float[Array, " batch"]
+) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
+    """A continuous action a = tanh(z), z normal with the actor's mean and log deviation, and log p(a)."""
+    mean, log_std = outputs[:, 0], jnp.clip(outputs[:, 1], -5.0, 2.0)
+    standard = ndtri(jnp.clip(uniforms, 1e-6, 1.0 - 1e-6))
+    z = mean + jnp.exp(log_std) * standard
+    log_normal = -0.5 * standard**2 - log_std - 0.5 * math.log(2.0 * math.pi)
+    # log(1 - tanh(z)^2), in the form that does not lose its digits for large |z|
+    log_slope = 2.0 * (math.log(2.0) - z - jax.nn.softplus(-2.0 * z))
+    return jnp.tanh(z), log_normal - log_slope
+
+
+# --- losses ---------------------------------------------------------------------------------------------------------
+
+
+def discrete_losses(
+    trained: Trained, targets: Network, batch: Batch, settings: SAC
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The losses of critics, actor and alpha; each has a gradient for its own parameters only.
+
+    With Q the smaller of the two critics (of the two target critics where it says Q_target) and d for terminated:
+
+    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) sum_a' pi(a'|s') (Q_target(s', a') - alpha log pi(a'|s')))^2 / 2
+    actor:   mean sum_a pi(a|s) (alpha log pi(a|s) - Q(s, a))
+    alpha:   mean log alpha (H(pi(.|s)) - H_wanted)
+    """
+    fixed = jax.lax.stop_gradient
+    alpha = jnp.exp(fixed(trained.log_alpha))
+
+    log_next = jax.nn.log_softmax(forward(fixed(trained.actor), batch.next_observation))
+    next_q = jnp.min(forward(targets, batch.next_observation), axis=0)
+    next_value = jnp.sum(jnp.exp(log_next) * (next_q - alpha * log_next), axis=-1)
+    target = fixed(batch.reward + settings.discount * (1.0 - batch.terminated) * next_value)
+    q = forward(trained.critics, batch.observation)
+    taken = jax.nn.one_hot(batch.action.astype(jnp.int32), q.shape[-1])
+    critic_loss = 0.5 * jnp.sum(jnp.mean((jnp.sum(q * taken, axis=-1) - target) ** 2, axis=-1))
+
+    log_pi = jax.nn.log_softmax(forward(trained.actor, batch.observation))
+    pi = jnp.exp(log_pi)
+    actor_loss = jnp.mean(jnp.sum(pi * (alpha * log_pi - fixed(jnp.min(q, axis=0))), axis=-1))
+
+    entropy = fixed(-jnp.sum(pi * log_pi, axis=-1))
+    alpha_loss = trained.log_alpha * jnp.mean(entropy - settings.entropy_share * math.log(q.shape[-1]))
+    return critic_loss, actor_loss, alpha_loss
+
+
+def continuous_losses(
+    trained: Trained, targets: Network, batch: Batch, uniforms: Float[Array, "2 batch"], settings: SAC
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The same for one continuous action, with a' and a_new drawn from the policy (reparameterised).
+
+    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - alpha log pi(a'|s')))^2 / 2
+    actor:   mean alpha log pi(a_new|s) - Q(s, a_new)
+    alpha:   mean log alpha (-log pi(a_new|s) - H_wanted)
+    """
+    fixed = jax.lax.stop_gradient
+    alpha = jnp.exp(fixed(trained.log_alpha))
+
+    def critic(critics: Network, observation: Array, action: Array) -> Float[Array, "2 batch"]:
+        return forward(critics, jnp.concatenate([observation, action[:, None]], axis=1))[..., 0]
+
+    next_action, log_next = squashed_normal(forward(fixed(trained.actor), batch.next_observation), uniforms[0])
+    next_q = jnp.min(critic(targets, batch.next_observation, next_action), axis=0)
+    target = batch.reward + settings.discount * (1.0 - batch.terminated) * (next_q - alpha * log_next)
+    q = critic(trained.critics, batch.observation, batch.action)
+    critic_loss = 0.5 * jnp.sum(jnp.mean((q - fixed(target)) ** 2, axis=-1))
+
+    action, log_pi = squashed_normal(forward(trained.actor, batch.observation), uniforms[1])
+    new_q = jnp.min(critic(fixed(trained.critics), batch.observation, action), axis=0)
+    actor_loss = jnp.mean(alpha * log_pi - new_q)
+
+    alpha_loss = trained.log_alpha * jnp.mean(fixed(-log_pi) - settings.entropy_nats)
+    return critic_loss, actor_loss, alpha_loss
+
+
+# --- acting and learning --------------------------------------------------------------------------------------------
+
+
+def begin(environment: Environment[RobotState], settings: SAC, key: PRNGKeyArray) -> Learner[RobotState]:
+    """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
+    weight_key, reset_key, key = jax.random.split(key, 3)
+    n, n_actions, hidden = environment.n_observations, environment.n_actions, settings.hidden
+    inputs, values, outputs = (n + 1, 1, 2) if n_actions is None else (n, n_actions, n_actions)
+    actor, critics = initial_networks(
+        weight_key, ((n, hidden, hidden, outputs), ()), ((inputs, hidden, hidden, values), (2,))
+    )
+    trained = Trained(actor, critics, jnp.float32(math.log(settings.first_alpha)))
+    return Learner(
+        trained=trained,
+        targets=critics,
+        optimiser=_adam(settings).init(trained),
+        replay=jnp.zeros((settings.replay, 2 * n + 3)),
+        episodes=jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments)),
+        returns=jnp.zeros(settings.environments),
+        key=key,
+    )
+
+
+def train_chunk(
+    environment: Environment[RobotState],
+    settings: SAC,
+    learner: Learner[RobotState],
+    simulator: NeuronSimulator | None,
+    first_round: Int[Array, ""],
+    last_round: Int[Array, ""],
+) -> tuple[Learner[RobotState], Finished]:
+    """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
+
+    Args:
+        environment: what the policy acts in (static).
+        settings: of the algorithm (static).
+        learner: the policy under training.
+        simulator: the neurons' answers during this chunk; None without neurons.
+        first_round, last_round: the chunk is the rounds from the first up to, not including, the last; the same for
+            all policies that are trained side by side.
+
+    Returns:
+        The learner after the chunk, and the episodes that ended in it.
+    """
+    # The uniforms that a round acts with and learns with: one block, drawn at once.
+    acting = (settings.environments, environment.noise_size + 1)
+    learning = (settings.updates, 1 if environment.n_actions is not None else 3, settings.batch)
+    n_acting = math.prod(acting)
+
+    def one_round(
+        index: Int[Array, ""], carry: tuple[Learner[RobotState], Finished]
+    ) -> tuple[Learner[RobotState], Finished]:
+        learner, before = carry
+        key, use, reset_key = jax.random.split(learner.key, 3)
+        uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
+        written = index * settings.environments
+        learner, finished = _act(
+            environment, settings, learner, simulator, written, uniforms[:n_acting].reshape(acting), reset_key
+        )
+        available = jnp.minimum(written + settings.environments, settings.replay)
+        learner = _learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
+        return learner._replace(key=key), jax.tree.map(jnp.add, before, finished)
+
+    nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
+    trained: tuple[Learner[RobotState], Finished] = jax.lax.fori_loop(
+        first_round, last_round, one_round, (learner, nothing)
+    )
+    return trained
+
+
+def _act(
+    environment: Environment[RobotState],
+    settings: SAC,
+    learner: Learner[RobotState],
+    simulator: NeuronSimulator | None,
+    written: Int[Array, ""],
+    uniforms: Float[Array, "environments noise"],
+    reset_key: PRNGKeyArray,
+) -> tuple[Learner[RobotState], Finished]:
+    """One step of every environment, remembered in the replay; ended episodes start anew."""
+    scales = environment.scales
+
+    observation = jax.vmap(environment.observe)(learner.episodes) / scales
+    action = draw_action(environment, learner.trained.actor, observation, uniforms[:, 0])
+    outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], learner.episodes, action, simulator)
+    # The observation before a reset: at a time limit the value of what would have come next is still wanted.
+    next_observation = jax.vmap(environment.observe)(outcome.state) / scales
+    row = jnp.stack([action, settings.reward_scale * outcome.reward, outcome.terminated], axis=1, dtype=jnp.float32)
+    rows = jnp.concatenate([observation, next_observation, row], axis=1)
+
+    ended = outcome.terminated | outcome.truncated
+    returns = learner.returns + outcome.reward
+    started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
+    learner = learner._replace(
+        replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
+        episodes=jax.tree.map(lambda new, old: jnp.where(ended, new, old), started, outcome.state),
+        returns=jnp.where(ended, 0.0, returns),
+    )
+    return learner, Finished(jnp.sum(ended, dtype=jnp.float32), jnp.sum(jnp.where(ended, returns, 0.0)))
+
+
+def draw_action(
+    environment: Environment[RobotState],
+    actor: Network,
+    observation: Float[Array, "batch observations"],
+    uniforms: Float[Array, " batch"],
+) -> Array:
+    """Draw an action from the policy for each scaled observation, by the inverse of its cumulative distribution."""
+    outputs = forward(actor, observation)
+    if environment.n_actions is None:
+        return squashed_normal(outputs, uniforms)[0]
+    below = jnp.cumsum(jax.nn.softmax(outputs), axis=-1)[:, :-1]
+    return jnp.sum(uniforms[:, None] >= below, axis=-1)
+
+
+def _learn(
+    environment: Environment[RobotState],
+    settings: SAC,
+    learner: Learner[RobotState],
+    available: Int[Array, ""],
+    uniforms: Float[Array, "updates blocks batch"],
+) -> Learner[RobotState]:
+    """`settings.updates` gradient steps on transitions drawn from the replay."""
+    adam = _adam(settings)
+    n = environment.n_observations
+
+    def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
+        if environment.n_actions is None:
+            return sum(continuous_losses(trained, targets, batch, noise, settings), jnp.float32(0.0))
+        return sum(discrete_losses(trained, targets, batch, settings), jnp.float32(0.0))
+
+    def update(carry: tuple[Trained, Network, Any], uniforms: Float[Array, "blocks batch"]) -> tuple[Any, None]:
+        trained, targets, optimiser = carry
+        rows = learner.replay[(uniforms[0] * available).astype(jnp.int32)]
+        batch = Batch(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1], rows[:, 2 * n + 2])
+        gradient = jax.grad(losses)(trained, targets, batch, uniforms[1:])
+        steps, optimiser = adam.update(gradient, optimiser)
+        trained = optax.apply_updates(trained, steps)
+        targets = jax.tree.map(lambda t, c: t + settings.follow * (c - t), targets, trained.critics)
+        return (trained, targets, optimiser), None
+
+    (trained, targets, optimiser), _ = jax.lax.scan(
+        update, (learner.trained, learner.targets, learner.optimiser), uniforms
+    )
+    return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
+
+
+def _adam(settings: SAC) -> optax.GradientTransformation:
+    return optax.adam(settings.learning_rate)

@@ -1,0 +1,205 @@
+"""Training of several policies: groups of them on processes, one a core, into a folder that can be gone on with."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import pickle
+import selectors
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
+from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress, Silent
+from animat.training.group import Group, split_groups
+from animat.training.policy import Policy
+from animat.training.specification import CHUNKS, Training
+from animat.writing import written_whole
+
+MANIFEST = "training.json"
+_UNFINISHED = ".unfinished"
+
+
+def train(
+    training: Training,
+    timeline: SimulatorTimeline | None,
+    folder: str | os.PathLike[str],
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    sources: Sequence[str] = (),
+) -> dict[str, Policy]:
+    """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which says what they are.
+
+    Stopped at any moment, also by SIGKILL, and called again, it goes on from the last chunk and ends in the same bits
+    as if it had not been stopped, with any number of workers. On a finished folder it reads the policies and returns.
+
+    Args:
+        training: what is trained.
+        timeline: the culture's simulators; None for a training without neurons.
+        folder: where the policies go; made where it is missing.
+        workers: processes to use, each pinned to a core of its own; None: as many as there are cores.
+        progress: told how far it is.
+        sources: names of the recordings, for the manifest.
+
+    Returns:
+        The policies by name, `p0` first.
+
+    Raises:
+        InvalidArgument: if neurons are missing for a mapping or given without one, or for fewer workers than one.
+        Mismatch: if the folder holds another training.
+        InvalidFile: if a file cannot be read or written.
+    """
+    if (timeline is None) != (training.mapping is None):
+        raise InvalidArgument(
+            "timeline: expected the culture's simulators with a mapping, and None without, got "
+            f"{'none' if timeline is None else 'some'} with mapping {training.mapping and training.mapping.name}"
+        )
+    if workers is not None and workers < 1:
+        raise InvalidArgument(f"workers: expected at least 1, got {workers}")
+    progress = progress or Silent()
+    folder = Path(folder)
+    manifest = describe(training, timeline, sources)
+    _claim(folder, manifest)
+
+    groups = [
+        Group(training, members, _on_host(timeline), manifest["fingerprint"], _provenance(manifest, members))
+        for members in split_groups(training.policies)
+    ]
+    _run([group for group in groups if not _is_trained(group, folder)], folder, workers, progress)
+    shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
+    return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+
+
+def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
+    """What decides how policies come out, as plain data, with a fingerprint over all of it."""
+    manifest: dict[str, Any] = {
+        "training": training.to_dict(),
+        "conditions": [] if timeline is None else [condition.label for condition in timeline.conditions],
+        "recorded_at_min": [] if timeline is None else timeline.start_min.tolist(),
+        "versions": {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")},
+    }
+    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode())
+    for leaf in jax.tree.leaves(_on_host(timeline).simulators if timeline else ()):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    # Names of files are told but do not decide: the same recordings in another place are the same.
+    return manifest | {"sources": list(sources), "fingerprint": digest.hexdigest()}
+
+
+def _claim(folder: Path, manifest: dict[str, Any]) -> None:
+    """Make the folder this training's, or see that it is."""
+    path = folder / MANIFEST
+    if path.exists():
+        try:
+            found = json.loads(path.read_text())
+            fingerprint = found["fingerprint"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
+        if fingerprint != manifest["fingerprint"]:
+            difference = _first_difference(found, manifest)
+            raise Mismatch(
+                f"{folder}: expected a folder of this training, got one of another ({difference}); "
+                "give another folder, or remove this one"
+            )
+        return
+    if folder.exists() and not folder.is_dir():
+        raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
+    if folder.is_dir() and any(folder.glob("*.safetensors")):
+        raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
+    with written_whole(path) as beside:
+        beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+
+
+def _first_difference(found: Any, wanted: Any, name: str = "") -> str:
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in sorted(set(found) | set(wanted)):
+            if key not in ("fingerprint", "sources") and found.get(key) != wanted.get(key):
+                return _first_difference(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
+        return "other responses"
+    return f"{name}: {found!r} there, {wanted!r} now"
+
+
+def _provenance(manifest: dict[str, Any], members: tuple[int, ...]) -> dict[str, Any]:
+    return {key: value for key, value in manifest.items() if key != "sources"}
+
+
+def _is_trained(group: Group, folder: Path) -> bool:
+    for member in group.members:
+        path = folder / f"p{member}.safetensors"
+        if not path.exists() or Policy.load(path).provenance.get("fingerprint") != group.fingerprint:
+            return False
+    return True
+
+
+def _on_host(timeline: SimulatorTimeline | None) -> Any:
+    """The timeline with numpy arrays: they go to another process without a device."""
+    if timeline is None:
+        return None
+    from dataclasses import replace
+
+    return replace(timeline, simulators=jax.device_get(timeline.simulators))
+
+
+def _run(groups: list[Group], folder: Path, workers: int | None, progress: Progress) -> None:
+    """Train the groups on processes, each pinned to its own core; the first error ends all."""
+    cores = sorted(os.sched_getaffinity(0))
+    free = cores[: min(len(cores), len(groups), workers or len(cores))]
+    waiting = list(groups)
+    total = sum(len(group.members) for group in groups) * CHUNKS
+    done: dict[tuple[int, ...], int] = {}
+    running: dict[int, tuple[subprocess.Popen[bytes], Group]] = {}
+    selector = selectors.DefaultSelector()
+    try:
+        while waiting or running:
+            while waiting and free:
+                group, core = waiting.pop(0), free.pop(0)
+                process = _start(group, folder, core)
+                assert process.stdout is not None
+                selector.register(process.stdout, selectors.EVENT_READ, core)
+                running[core] = (process, group)
+            for key, _ in selector.select():
+                process, group = running[key.data]
+                assert process.stdout is not None
+                line = process.stdout.readline()
+                if line:
+                    told = json.loads(line)
+                    if "error" in told:
+                        raise InvalidFile(told["error"])
+                    done[group.members] = told["done"] * len(group.members)
+                    mean = told["mean_return"]
+                    progress.update(sum(done.values()), total, "" if math.isnan(mean) else f"return {mean:.1f}")
+                    continue
+                selector.unregister(process.stdout)
+                del running[key.data]
+                free.append(key.data)
+                if process.wait() != 0:
+                    raise AnimatError(
+                        f"training: the process of policies {group.members} ended with status {process.returncode}; "
+                        "start again to go on from its last checkpoint"
+                    )
+    finally:
+        for process, _ in running.values():
+            process.kill()
+            process.wait()
+
+
+def _start(group: Group, folder: Path, core: int) -> subprocess.Popen[bytes]:
+    checkpoint = folder / _UNFINISHED / f"from-p{group.members[0]}.npz"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "animat.training.worker", str(core)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert process.stdin is not None
+    process.stdin.write(pickle.dumps((group, folder, checkpoint)))
+    process.stdin.close()
+    return process

@@ -1,0 +1,53 @@
+"""A process that trains one group of policies on one core: `python -m animat.training.worker CPU`, started by `train`.
+
+The job comes pickled on standard input, from the process that started it; progress goes out as JSON lines.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import pickle
+import signal
+import sys
+from pathlib import Path
+
+
+def main() -> int:
+    """Read a job, train it, write its policies; report each chunk as a line."""
+    # JAX sizes its thread pool by the cores it may use, and one pinned core beats two shared ones: pin first.
+    os.sched_setaffinity(0, {int(sys.argv[1])})
+    _end_with_parent()
+
+    from animat.compilation import keep_compilations
+    from animat.errors import AnimatError
+    from animat.training.group import Group, train_group
+
+    keep_compilations()
+    group: Group
+    folder: Path
+    checkpoint: Path
+    group, folder, checkpoint = pickle.load(sys.stdin.buffer)
+
+    def report(done: int, mean_return: float) -> None:
+        print(json.dumps({"done": done, "mean_return": mean_return}), flush=True)
+
+    try:
+        for member, policy in zip(group.members, train_group(group, checkpoint, report), strict=True):
+            policy.save(folder / f"p{member}.safetensors")
+        checkpoint.unlink(missing_ok=True)
+    except AnimatError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 1
+    return 0
+
+
+def _end_with_parent() -> None:
+    """Ask the kernel to kill this process when the one that started it is gone, however that ended."""
+    PR_SET_PDEATHSIG = 1
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
