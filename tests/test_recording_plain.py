@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
+from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
 from animat.recordings.noticed import noticed
 from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording, read_recordings
@@ -112,6 +114,24 @@ def test_units_become_channels_with_the_electrode_at_their_position(tmp_path: Pa
     assert recording.channels.electrode.tolist() == [12, -1]
     assert recording.stimuli.pattern.tolist() == [1, 0]
     assert recording.provenance["patterns"] == "0: sensory, 1: train"
+
+
+def test_text_may_be_bytes_and_a_pattern_without_a_name_is_unknown(tmp_path: Path) -> None:
+    labels = np.array(["é", "b"])
+    recording = read_recording(
+        npz(
+            tmp_path,
+            spike_time_s=np.array([0.0]),
+            spike_channel=np.char.encode(labels[:1], "utf-8"),
+            channel_label=np.char.encode(labels, "utf-8"),
+            stimulus_time_s=np.array([0.0, 1.0]),
+            stimulus_pattern=np.array([b"", b"left"]),
+            presentation_order=b"blocked",
+        )
+    )
+    assert recording.channels.label.tolist() == ["é", "b"]
+    assert recording.stimuli.pattern.tolist() == [-1, 0]
+    assert recording.presentation == Presentation("blocked")
 
 
 @FEW
@@ -223,6 +243,23 @@ def test_a_bad_npz_is_one_clear_line_that_names_the_file(case: str, tmp_path: Pa
         read_recording(npz(tmp_path, **arrays))
     assert str(caught.value).startswith(str(tmp_path / "a.npz"))
     assert "\n" not in str(caught.value)
+
+
+ARRAYS = npst.arrays(
+    st.sampled_from(["f8", "f4", "i8", "u1", "?", "c16", "U2", "S2", "M8[s]", "i4,f4"]),
+    npst.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3),
+)
+
+
+@settings(FEW, max_examples=200)
+@given(
+    arrays=st.dictionaries(st.sampled_from([*KEYS, *OTHER_NAMES, *ROUTING]), ARRAYS, max_size=5), whole=st.booleans()
+)
+def test_any_arrays_at_all_are_read_or_are_one_clear_line(arrays: dict[str, Any], whole: bool, tmp_path: Path) -> None:
+    try:
+        read_recording(npz(tmp_path, **((SPIKES | STIMULI if whole else {}) | arrays)))
+    except InvalidFile as error:
+        assert "\n" not in str(error)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.9, 0.99])

@@ -32,8 +32,8 @@ class PlainColumns:
         channel_electrode: the electrode each channel reads, -1 for unknown, shape (channels,).
         channel_xy_um: the electrode's position, NaN for unknown, shape (channels, 2).
         stimulus_frequency_hz: NaN for unknown, shape (stimuli,).
-        stimulus_pattern: whole numbers, -1 for unknown, or names, which are numbered in alphabetical order,
-            shape (stimuli,).
+        stimulus_pattern: whole numbers, -1 for unknown, or names, which are numbered in alphabetical order (an empty
+            one is unknown), shape (stimuli,).
         stimulus_electrodes: electrodes pulsed together, padded with -1, shape (stimuli, electrodes) or (stimuli,).
         stimulus_presentation: presentation of each pulse, shape (stimuli,); by default each pulse is one of its own.
         sampling_rate_hz: of the raw signal, NaN for unknown.
@@ -110,9 +110,9 @@ class PlainColumns:
         if not _is_text(values):
             values = _whole("spike_channel", values)
         lengths = {
-            name: len(column)
+            name: _length(name, column)
             for name in ("channel_label", "channel_electrode", "channel_xy_um")
-            if (column := getattr(self, name)) is not None and np.ndim(column) > 0
+            if (column := getattr(self, name)) is not None
         }
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
@@ -154,10 +154,11 @@ class PlainColumns:
         patterns = _column("stimulus_pattern", self.stimulus_pattern, n)
         if not _is_text(patterns):
             return _whole("stimulus_pattern", patterns), {}
-        names, index = np.unique(patterns, return_inverse=True)
-        return index.reshape(-1).astype(np.int64), {
-            "patterns": ", ".join(f"{i}: {name}" for i, name in enumerate(names))
-        }
+        named = patterns != ""
+        names, numbers = np.unique(patterns[named], return_inverse=True)
+        index = np.full(n, UNKNOWN)
+        index[named] = numbers
+        return index, {"patterns": ", ".join(f"{i}: {name}" for i, name in enumerate(names))}
 
     def _electrodes(self, n: int) -> Int64[np.ndarray, "stimuli electrodes"]:
         if self.stimulus_electrodes is None:
@@ -252,6 +253,12 @@ def _looked_up(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
             f"{len(unknown)} unknown channels (such as {str(unknown[0])!r})"
         )
     return rows[which.reshape(-1)]
+
+
+def _length(name: str, column: Column) -> int:
+    if np.ndim(column) == 0:
+        raise UnusableData(f"{name}: expected a value a channel, got a single one")
+    return len(column)
 
 
 def _column(name: str, column: Column, n: int, expected: str = "one value a stimulus") -> Column:

@@ -12,13 +12,14 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.recording import UNKNOWN, Recording
@@ -26,7 +27,8 @@ from animat.recordings.recording import UNKNOWN, Recording
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
 WORDS = ("presentation_order",)
-SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", "presentation_pulses", *WORDS)
+WHOLE = ("presentation_pulses",)
+SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *WORDS)
 OTHER_NAMES = {
     "stim_tag": "stimulus_pattern",
     "spike_unit": "spike_channel",
@@ -50,7 +52,8 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     columns, routing, left_out = _loaded(path)
     missing = [key for key in REQUIRED if key not in columns]
     if missing:
-        found = ", ".join([*columns, *routing, *left_out]) or "none"
+        keys = [*columns, *routing, *left_out]
+        found = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
         raise InvalidFile(
             f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {found}"
         )
@@ -79,9 +82,9 @@ def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
                 if name in columns:
                     raise InvalidFile(f"{path}: expected {name} once, got it under two names (one is {key})")
                 if name in SINGLE:
-                    columns[name] = _single(path, key, archive[key])
+                    columns[name] = _single(path, key, _array(archive, key))
                 elif name in KEYS:
-                    columns[name] = archive[key]
+                    columns[name] = _array(archive, key)
                 elif key in ROUTING:
                     routing[key] = archive[key]
                 else:
@@ -93,13 +96,19 @@ def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
     except ValueError as error:
         # numpy's only other ValueErrors are about damaged headers; both mean that the file cannot be read as it is.
         pickled = "Object arrays" in str(error)
-        what = "pickled objects, which are never read" if pickled else f"a damaged array ({error})"
+        what = "pickled objects, which are never read" if pickled else f"a damaged array ({_first_line(error)})"
         raise InvalidFile(f"{path}: expected plain arrays of numbers or text, got {what}; save it anew") from error
-    except (OSError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise InvalidFile(
-            f"{path}: expected a whole NPZ archive, but it is cut off or damaged ({error}); copy or save it again"
+            f"{path}: expected a whole NPZ archive, but it is cut off or damaged ({_first_line(error)}); "
+            "copy or save it again"
         ) from error
     return columns, {key: routing[key] for key in ROUTING if key in routing}, left_out
+
+
+def _array(archive: Mapping[str, Column], key: str) -> Column:
+    array = archive[key]
+    return np.char.decode(array, "utf-8", "replace") if array.dtype.kind == "S" else array
 
 
 def _single(path: Path, key: str, array: Column) -> Any:
@@ -108,14 +117,32 @@ def _single(path: Path, key: str, array: Column) -> Any:
         raise InvalidFile(f"{path}: {key}: expected one value, got shape {array.shape}")
     value = array.reshape(-1)[0].item()
     name = OTHER_NAMES.get(key, key)
-    if isinstance(value, bytes):
-        value = value.decode("utf-8", "replace")
-    if isinstance(value, str) is not (name in WORDS):
-        raise InvalidFile(f"{path}: {key}: expected {'a word' if name in WORDS else 'a number'}, got {value!r}")
-    return value
+    if name in WORDS:
+        if isinstance(value, str):
+            return value
+        raise InvalidFile(f"{path}: {key}: expected a word, got {value!r}")
+    if not isinstance(value, int | float):
+        raise InvalidFile(f"{path}: {key}: expected a number, got {value!r}")
+    if name in WHOLE:
+        if not float(value).is_integer():
+            raise InvalidFile(f"{path}: {key}: expected a whole number, got {value!r}")
+        return int(value)
+    return float(value)
 
 
 def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) -> Column:
     """The electrode routed at each position, unknown where there is none."""
-    at = {tuple(xy): e for xy, e in zip(electrode_xy_um.tolist(), electrode.tolist(), strict=False)}
-    return np.array([at.get(tuple(xy), UNKNOWN) for xy in xy_um.tolist()], dtype=np.int64)
+    n = len(electrode) if electrode.ndim == 1 else -1
+    if electrode_xy_um.shape != (n, 2):
+        raise UnusableData(
+            "mapping_electrode, mapping_xy_um: expected shapes (electrodes,) and (electrodes, 2), "
+            f"got {electrode.shape} and {electrode_xy_um.shape}"
+        )
+    if xy_um.ndim != 2:
+        raise UnusableData(f"channel_xy_um: expected shape (channels, 2) in micrometres, got {xy_um.shape}")
+    at = {tuple(xy): e for xy, e in zip(electrode_xy_um.tolist(), electrode.tolist(), strict=True)}
+    return np.array([at.get(tuple(xy), UNKNOWN) for xy in xy_um.tolist()])
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().partition("\n")[0] or type(error).__name__

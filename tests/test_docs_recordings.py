@@ -1,0 +1,27 @@
+"""The examples of docs/recordings.md run as they are printed, one after the other."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from animat.recordings.reading import read_recording
+
+
+def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "recordings.md").read_text()
+    examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(examples) == 5
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for example in examples:
+        exec(compile(example, "docs/recordings.md", "exec"), names)
+    mine = read_recording("mine.nwb")
+    assert (len(mine.channels), mine.start_min, mine.stimuli.electrodes.tolist()) == (
+        3,
+        30.0,
+        [[9001, 9320], [9001, -1]],
+    )
+    assert read_recording("monday.nwb").provenance["experimenter"] == "Doe, Jane"

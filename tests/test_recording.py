@@ -1,0 +1,144 @@
+"""The recording noun: what it refuses, that it cannot be changed, and when two are equal. Hand-made cases."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument, UnusableData
+from animat.recordings.findings import Finding
+from animat.recordings.noticed import as_provenance, noticed
+from animat.recordings.protocol import Presentation
+from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+
+
+def channels(n: int = 3) -> Channels:
+    return Channels(np.arange(n).astype(str), np.arange(n), np.zeros(n), np.zeros(n))
+
+
+def stimuli(**changes: Any) -> Stimuli:
+    table = {
+        "time_s": [0.0, 1.0],
+        "frequency_hz": [5.0, np.nan],
+        "pattern": [0, UNKNOWN],
+        "electrodes": [[1, 2], [3, UNKNOWN]],
+        "presentation": [0, 1],
+    }
+    return Stimuli(**(table | changes))
+
+
+def recording(**changes: Any) -> Recording:
+    parts: dict[str, Any] = {
+        "spike_times_s": [-1.0, 0.5, 0.5],
+        "spike_channels": [2, 0, 1],
+        "channels": channels(),
+        "stimuli": stimuli(),
+        "sampling_rate_hz": np.nan,
+        "start_s": -1.0,
+        "duration_s": 3.0,
+    }
+    return Recording(**(parts | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"spike_times_s": [0.0, np.nan, 1.0]}, "spike_times_s: expected finite times in seconds, got 1 of 3"),
+        ({"spike_times_s": [0.0, 1.0, 0.5]}, "spike_times_s: expected times that do not fall"),
+        ({"spike_times_s": [0.0, 1.0]}, "spike_channels: expected 2 values"),
+        ({"spike_channels": [0, 1, 3]}, r"rows of the channel table \(0 to 2\), got 3 \(1 spikes on unknown"),
+        ({"spike_channels": [0, 1, -1]}, "rows of the channel table"),
+        ({"duration_s": 1.0}, r"spike_times_s: expected times within the recording \(-1 to 0 s\)"),
+        ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
+        ({"start_s": np.nan}, "start_s, duration_s: expected finite seconds"),
+    ],
+)
+def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UnusableData, match=message):
+        recording(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"time_s": [1.0, 0.0]}, "stimuli.time_s: expected times that do not fall"),
+        ({"frequency_hz": [5.0, -5.0]}, "stimuli.frequency_hz: expected positive frequencies in Hz, or NaN, got -5"),
+        ({"frequency_hz": [0.0, 5.0]}, "expected positive frequencies"),
+        ({"electrodes": [1, 2]}, r"stimuli.electrodes: expected shape \(stimuli, electrodes\)"),
+        ({"presentation": [1, 0]}, "stimuli.presentation: expected numbers that do not fall"),
+        ({"pattern": [1]}, "pattern: expected 2 values"),
+    ],
+)
+def test_a_stimulus_table_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UnusableData, match=message):
+        stimuli(**changes)
+
+
+def test_a_presentation_refuses_what_cannot_be() -> None:
+    with pytest.raises(InvalidArgument, match="pulses: expected at least 1 pulse"):
+        Presentation("mixed", 0)
+    with pytest.raises(InvalidArgument, match="order: expected 'blocked' or 'mixed'"):
+        Presentation("shuffled")  # type: ignore[arg-type]
+
+
+def test_a_recording_cannot_be_changed_nor_does_it_hold_on_to_what_made_it() -> None:
+    times = np.array([-1.0, 0.5, 0.5])
+    made = recording(spike_times_s=times, spike_channels=[2, 1, 0])
+    times[0] = 7.0
+    assert made.spike_times_s[0] == -1.0
+    for array in (made.spike_times_s, made.spike_channels, made.stimuli.time_s, made.channels.x_um):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        made.start_s = 0.0  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        made.provenance["a"] = "b"  # type: ignore[index]
+
+
+def test_simultaneous_spikes_have_one_order() -> None:
+    assert recording(spike_channels=[2, 1, 0]).equals(recording(spike_channels=[2, 0, 1]))
+    assert not recording(spike_channels=[2, 0, 0]).equals(recording(spike_channels=[2, 0, 1]))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"start_min": 1.0},
+        {"sampling_rate_hz": 20_000.0},
+        {"presentation": Presentation("mixed")},
+        {"provenance": {"source": "elsewhere"}},
+        {"stimuli": stimuli(frequency_hz=[5.0, 5.0])},
+        {"stimuli": stimuli(electrodes=[[1, 2, UNKNOWN], [3, UNKNOWN, UNKNOWN]])},
+        {"channels": channels(4)},
+    ],
+)
+def test_recordings_that_differ_in_anything_are_not_equal(changes: dict[str, Any]) -> None:
+    assert recording().equals(recording())
+    assert not recording(**changes).equals(recording())
+
+
+def test_the_response_is_read_after_the_last_pulse_of_a_presentation() -> None:
+    table = Stimuli(np.arange(5.0), np.full(5, 5.0), np.zeros(5), np.zeros((5, 1)), np.array([0, 0, 0, 4, 4]))
+    assert table.is_last_of_presentation.tolist() == [False, False, True, False, True]
+
+
+def test_findings_travel_in_the_provenance_and_are_found_again() -> None:
+    noted = (Finding("a-thing", "warning", "something: odd", 3.0), Finding("another", "note", "less odd"))
+    found = noticed(recording(provenance={"source": "here: a rig", **as_provenance(noted)}))
+    assert [(f.name, f.severity, f.sentence) for f in found[:2]] == [
+        ("a-thing", "warning", "something: odd"),
+        ("another", "note", "less odd"),
+    ]
+    assert [f.name for f in found[2:]] == ["presentation-unknown"]
+
+
+def test_what_is_seen_in_the_data_is_said() -> None:
+    silent = recording(spike_times_s=[], spike_channels=[], stimuli=Stimuli([], [], [], np.empty((0, 1)), []))
+    assert {f.name: f.severity for f in noticed(silent)} == {"no-stimuli": "refuse", "no-spikes": "refuse"}
+    electrodes = np.full((2, 2), UNKNOWN)
+    partly = recording(spike_channels=[0, 0, 0], stimuli=stimuli(electrodes=electrodes))
+    found = {f.name: f.value for f in noticed(partly)}
+    assert found == {"silent-channels": 2.0, "stimulus-electrodes-unknown": 2.0, "presentation-unknown": None}
