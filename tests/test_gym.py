@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import subprocess
 import sys
 
@@ -104,6 +106,18 @@ def test_a_seed_decides_everything(id_: str) -> None:
         np.testing.assert_array_equal(a, b)
     assert one[4] == same[4]
     assert [info["rate_hz"] for info in one[4]] != [info["rate_hz"] for info in other[4]]
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_in_the_middle_of_an_episode_goes_on_in_the_same_way(copied) -> None:
+    env = gymnasium.make("Animat/Cartpole-v0").unwrapped
+    env.reset(seed=0)
+    env.step(1)
+    other = copied(env)
+    for action in (0, 4, 2):
+        one, another = env.step(action), other.step(action)
+        np.testing.assert_array_equal(one[0], another[0])
+        assert one[1:] == another[1:]
 
 
 def test_truncation_is_not_termination() -> None:

@@ -43,6 +43,10 @@ class CompiledAnimat:
         self._animat, self._simulator = setup.animat, setup.simulator
         self._noise_size = setup.animat.noise_size
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Compiled functions stay behind when an environment is pickled; they are made again where it arrives."""
+        return {name: value for name, value in vars(self).items() if name != "_functions"}
+
     def start(self, n: int, rng: np.random.Generator) -> tuple[Rows, Rows]:
         """(states, observations) at the start of `n` episodes."""
         seeds = rng.integers(0, 2**32, n, dtype=np.uint32)
