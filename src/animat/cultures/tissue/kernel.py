@@ -26,23 +26,23 @@ SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 class Constants(NamedTuple):
     """Numbers that hold for all neurons; factors are per time step, conductances in units of the leak."""
 
-    block: tuple[np.float32, np.float32, np.float32, np.float32]  # B(V) = b0 + b1 V + b2 V^2 + b3 V^3
-    block_low_mv: np.float32  # the cubic holds between these
-    block_high_mv: np.float32
+    block: tuple[np.float32, ...]  # B(V) = b0 + b1 y + ... + b7 y^7
+    block_middle_mv: np.float32  # y = (V - middle) / half, between -1 and 1
+    block_per_mv: np.float32  # 1 / half
     leak_mv: np.float32
     threshold_mv: np.float32
     reset_mv: np.float32
     potassium_mv: np.float32
     gaba_mv: np.float32
-    keep_ampa: np.float32
-    keep_nmda: np.float32
-    keep_gaba: np.float32
-    keep_potassium: np.float32
-    keep_adaptation: np.float32
+    lose_ampa: np.float32
+    lose_nmda: np.float32
+    lose_gaba: np.float32
+    lose_potassium: np.float32
+    lose_adaptation: np.float32
     keep_noise: np.float32
     noise_scale_mv: np.float32
-    nmda_ratio: np.float32
-    nmda_fill: np.float32  # 1 / the conductance at which NMDA is saturated
+    nmda_saturation: np.float32
+    nmda_fill: np.float32  # share of what is missing to saturation that a unit of AMPA adds
     hyperpolarisation: np.float32
     adaptation_mv: np.float32
     step_s: float
@@ -73,8 +73,9 @@ class Wiring(NamedTuple):
 class State(NamedTuple):
     """All that changes. Columns of `x` and `u` are towards excitatory and towards inhibitory neurons.
 
-    `drive` is the noisy drive in mV; `refractory` the steps left; `arriving_*` a ring of the conductances under way,
-    one row a step; `x`, `u`, `available` and `release` are as they were just after each neuron's last spike.
+    `drive` is the noisy drive in mV; `refractory` the steps left; `arriving_*` a ring of what is under way, one row a
+    step: for AMPA and GABA conductance, for NMDA the share of what is missing to saturation that will be filled; `x`,
+    `u`, `available` and `release` are as they were just after each neuron's last spike.
     """
 
     v_mv: Float32[np.ndarray, " neurons"]
@@ -85,8 +86,9 @@ class State(NamedTuple):
     potassium: Float32[np.ndarray, " neurons"]
     adaptation_mv: Float32[np.ndarray, " neurons"]
     refractory: Int32[np.ndarray, " neurons"]
-    arriving_e: Float32[np.ndarray, "ring neurons"]
-    arriving_i: Float32[np.ndarray, "ring neurons"]
+    arriving_ampa: Float32[np.ndarray, "ring neurons"]
+    arriving_nmda: Float32[np.ndarray, "ring neurons"]
+    arriving_gaba: Float32[np.ndarray, "ring neurons"]
     last_spike: Int64[np.ndarray, " neurons"]
     x: Float64[np.ndarray, "neurons 2"]
     u: Float64[np.ndarray, "neurons 2"]
@@ -119,13 +121,13 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
     """One step of V, exact for conductances held over the step, up to (1 - exp(-z)) / z = 1 / (1 + z/2 + z^2/12)."""
     v_mv, drive_mv, ampa, nmda, gaba = state.v_mv, state.drive_mv, state.ampa, state.nmda, state.gaba
     potassium, refractory = state.potassium, state.refractory
-    b0, b1, b2, b3 = constants.block
-    low_mv, high_mv = constants.block_low_mv, constants.block_high_mv
+    b0, b1, b2, b3, b4, b5, b6, b7 = constants.block
+    middle_mv, per_mv = constants.block_middle_mv, constants.block_per_mv
     leak_mv, potassium_mv, gaba_mv = constants.leak_mv, constants.potassium_mv, constants.gaba_mv
     for i in range(v_mv.size):
         v = v_mv[i]
-        within = min(max(v, low_mv), high_mv)
-        unblocked = ((b3 * within + b2) * within + b1) * within + b0
+        y = min(max((v - middle_mv) * per_mv, -ONE), ONE)
+        unblocked = ((((((b7 * y + b6) * y + b5) * y + b4) * y + b3) * y + b2) * y + b1) * y + b0
         total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
         current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
         z = total * step_over_membrane[i]
@@ -149,10 +151,10 @@ def move_noise(
 
 
 @compiled
-def decay(values: Float32[np.ndarray, " neurons"], keep: np.float32) -> None:
-    """One step of an exponential decay."""
+def decay(values: Float32[np.ndarray, " neurons"], lose: np.float32) -> None:
+    """One step of an exponential decay; single precision holds the small share lost better than what is kept."""
     for i in range(values.size):
-        values[i] = values[i] * keep + FAINT
+        values[i] = values[i] - values[i] * lose + FAINT
 
 
 @compiled
@@ -166,16 +168,17 @@ def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
 def arrive(constants: Constants, state: State, slot: int) -> None:
     """Add what arrives in this step to the conductances, and empty its row of the ring."""
     ampa, nmda, gaba = state.ampa, state.nmda, state.gaba
-    excitation, inhibition = state.arriving_e[slot], state.arriving_i[slot]
-    ratio, fill = constants.nmda_ratio, constants.nmda_fill
+    to_ampa, to_nmda, to_gaba = state.arriving_ampa[slot], state.arriving_nmda[slot], state.arriving_gaba[slot]
+    saturation = constants.nmda_saturation
     for i in range(ampa.size):
-        nmda[i] += ratio * excitation[i] * (ONE - fill * nmda[i])
-    for i in range(ampa.size):
-        ampa[i] += excitation[i]
-        excitation[i] = f4(0.0)
+        ampa[i] += to_ampa[i]
+        to_ampa[i] = f4(0.0)
+    for i in range(nmda.size):
+        nmda[i] += to_nmda[i] * (saturation - nmda[i])
+        to_nmda[i] = f4(0.0)
     for i in range(gaba.size):
-        gaba[i] += inhibition[i]
-        inhibition[i] = f4(0.0)
+        gaba[i] += to_gaba[i]
+        to_gaba[i] = f4(0.0)
 
 
 @compiled
@@ -210,12 +213,18 @@ def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, 
     to_e = strength * release_of(constants, state, i, kind, 0, elapsed_s)
     to_i = strength * release_of(constants, state, i, kind, 1, elapsed_s)
 
-    ring = state.arriving_e if kind == 0 else state.arriving_i
-    last_row = ring.shape[0] - 1
+    last_row = state.arriving_ampa.shape[0] - 1
     for synapse in range(wiring.start[i], wiring.start[i + 1]):
         target = wiring.target[synapse]
-        released = to_e if target < constants.n_excitatory else to_i
-        ring[(step + wiring.delay_steps[synapse]) & last_row, target] += f4(wiring.weight[synapse] * released)
+        arriving = f4(wiring.weight[synapse] * (to_e if target < constants.n_excitatory else to_i))
+        row = (step + wiring.delay_steps[synapse]) & last_row
+        if kind == 0:
+            state.arriving_ampa[row, target] += arriving
+            # Two arrivals in one step fill a share each of what the other leaves: as if one came after the other.
+            filled = min(constants.nmda_fill * arriving, ONE)
+            state.arriving_nmda[row, target] += filled * (ONE - state.arriving_nmda[row, target])
+        else:
+            state.arriving_gaba[row, target] += arriving
 
     state.v_mv[i] = constants.reset_mv
     state.potassium[i] += constants.hyperpolarisation
@@ -264,7 +273,7 @@ def advance(
         The steps taken, the kicks passed, and the spikes written.
     """
     n = state.v_mv.size
-    last_row = state.arriving_e.shape[0] - 1
+    last_row = state.arriving_ampa.shape[0] - 1
     kicks = 0
     spikes = 0
     for step in range(first_step, first_step + n_steps):
@@ -280,11 +289,11 @@ def advance(
             kicks += 1
         move_membrane(constants, state, wiring.step_over_membrane)
         move_noise(constants, state.drive_mv, wiring.drive_mv, wiring.noise_key, step)
-        decay(state.ampa, constants.keep_ampa)
-        decay(state.nmda, constants.keep_nmda)
-        decay(state.gaba, constants.keep_gaba)
-        decay(state.potassium, constants.keep_potassium)
-        decay(state.adaptation_mv, constants.keep_adaptation)
+        decay(state.ampa, constants.lose_ampa)
+        decay(state.nmda, constants.lose_nmda)
+        decay(state.gaba, constants.lose_gaba)
+        decay(state.potassium, constants.lose_potassium)
+        decay(state.adaptation_mv, constants.lose_adaptation)
         if over_threshold(constants, state) > 0:
             for i in range(n):
                 if state.v_mv[i] > constants.threshold_mv + state.adaptation_mv[i]:

@@ -9,16 +9,16 @@ from animat.cultures.tissue import kernel
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
 
-BLOCK_LOW_MV, BLOCK_HIGH_MV = -80.0, -50.0
-"""Where the cubic stands for the NMDA block; outside, its value at the nearer end holds."""
+BLOCK_MIDDLE_MV, BLOCK_HALF_MV, BLOCK_DEGREE = -60.0, 25.0, 7
+"""Where a polynomial stands for the NMDA block, to 1e-6; outside, its value at the nearer end holds."""
 
 
 def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
     """The parameters as the kernel takes them: per step, and in single precision."""
     f4, step_ms = np.float32, parameters.step_ms
 
-    def keep(time_constant_ms: float) -> np.float32:
-        return f4(np.exp(-step_ms / time_constant_ms))
+    def lose(time_constant_ms: float) -> np.float32:
+        return f4(-np.expm1(-step_ms / time_constant_ms))
 
     def table(of: str) -> Float64[np.ndarray, "from_type to_type"]:
         kinds: tuple[tuple[ShortTerm, ShortTerm], ...] = (
@@ -29,23 +29,23 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
 
     noise_keep = np.exp(-step_ms / parameters.noise_ms)
     return kernel.Constants(
-        block=block_cubic(),
-        block_low_mv=f4(BLOCK_LOW_MV),
-        block_high_mv=f4(BLOCK_HIGH_MV),
+        block=block_polynomial(),
+        block_middle_mv=f4(BLOCK_MIDDLE_MV),
+        block_per_mv=f4(1 / BLOCK_HALF_MV),
         leak_mv=f4(parameters.leak_mv),
         threshold_mv=f4(parameters.threshold_mv),
         reset_mv=f4(parameters.reset_mv),
         potassium_mv=f4(parameters.potassium_mv),
         gaba_mv=f4(parameters.gaba_mv),
-        keep_ampa=keep(parameters.ampa_ms),
-        keep_nmda=keep(parameters.nmda_ms),
-        keep_gaba=keep(parameters.gaba_ms),
-        keep_potassium=keep(parameters.hyperpolarisation_ms),
-        keep_adaptation=keep(parameters.adaptation_ms),
+        lose_ampa=lose(parameters.ampa_ms),
+        lose_nmda=lose(parameters.nmda_ms),
+        lose_gaba=lose(parameters.gaba_ms),
+        lose_potassium=lose(parameters.hyperpolarisation_ms),
+        lose_adaptation=lose(parameters.adaptation_ms),
         keep_noise=f4(noise_keep),
         noise_scale_mv=f4(parameters.noise_mv * np.sqrt(1 - noise_keep**2) / kernel.SUM_OF_FOUR_SD),
-        nmda_ratio=f4(parameters.nmda_ratio),
-        nmda_fill=f4(1 / parameters.nmda_saturation),
+        nmda_saturation=f4(parameters.nmda_saturation),
+        nmda_fill=f4(parameters.nmda_ratio / parameters.nmda_saturation),
         hyperpolarisation=f4(parameters.hyperpolarisation),
         adaptation_mv=f4(parameters.adaptation_mv),
         step_s=step_ms / 1000,
@@ -68,12 +68,11 @@ def nmda_block(v_mv: Float64[np.ndarray, " potentials"]) -> Float64[np.ndarray, 
     return 1 / (1 + np.exp(-0.062 * v_mv) / 3.57)
 
 
-def block_cubic() -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """The cubic through B(V) at the four Chebyshev nodes of the range where neurons live, constant term first."""
-    middle, half = (BLOCK_LOW_MV + BLOCK_HIGH_MV) / 2, (BLOCK_HIGH_MV - BLOCK_LOW_MV) / 2
-    nodes_mv = middle + half * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
-    b0, b1, b2, b3 = np.polynomial.Polynomial.fit(nodes_mv, nmda_block(nodes_mv), 3).convert().coef
-    return np.float32(b0), np.float32(b1), np.float32(b2), np.float32(b3)
+def block_polynomial() -> tuple[np.float32, ...]:
+    """The coefficients of B(V) in y = (V - middle) / half, constant term first, through the Chebyshev nodes."""
+    y = np.cos(np.pi * (np.arange(BLOCK_DEGREE + 1) + 0.5) / (BLOCK_DEGREE + 1))
+    coefficients = np.polynomial.polynomial.polyfit(y, nmda_block(BLOCK_MIDDLE_MV + BLOCK_HALF_MV * y), BLOCK_DEGREE)
+    return tuple(np.float32(coefficient) for coefficient in coefficients)
 
 
 def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> kernel.Wiring:
@@ -118,8 +117,9 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
         potassium=zeros(n),
         adaptation_mv=zeros(n),
         refractory=np.zeros(n, np.int32),
-        arriving_e=zeros(ring, n),
-        arriving_i=zeros(ring, n),
+        arriving_ampa=zeros(ring, n),
+        arriving_nmda=zeros(ring, n),
+        arriving_gaba=zeros(ring, n),
         last_spike=np.zeros(n, np.int64),
         x=np.ones((n, 2)),
         u=use,

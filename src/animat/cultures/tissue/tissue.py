@@ -160,24 +160,25 @@ class Tissue:
         steps = self._now_ns // self._step_ns - self._step
         if steps == 0:
             return
-        constants, state = self._constants, self._state
-        for values, keep in (
-            (state.ampa, constants.keep_ampa),
-            (state.nmda, constants.keep_nmda),
-            (state.gaba, constants.keep_gaba),
-            (state.potassium, constants.keep_potassium),
-            (state.adaptation_mv, constants.keep_adaptation),
+        parameters, constants, state = self.parameters, self._constants, self._state
+        rested_ms = float(steps) * parameters.step_ms
+        for values, time_constant_ms in (
+            (state.ampa, parameters.ampa_ms),
+            (state.nmda, parameters.nmda_ms),
+            (state.gaba, parameters.gaba_ms),
+            (state.potassium, parameters.hyperpolarisation_ms),
+            (state.adaptation_mv, parameters.adaptation_ms),
         ):
-            values *= np.float32(float(keep) ** steps)
+            values *= np.float32(np.exp(-rested_ms / time_constant_ms))
         rng = np.random.default_rng([self.seed, 6, self._step])
-        kept = float(constants.keep_noise) ** steps
-        spread_mv = self.parameters.noise_mv * np.sqrt(1 - kept**2)
+        kept = float(np.exp(-rested_ms / parameters.noise_ms))
+        spread_mv = parameters.noise_mv * np.sqrt(1 - kept**2)
         mean_mv = self._wiring.drive_mv
         state.drive_mv[:] = mean_mv + (state.drive_mv - mean_mv) * kept + spread_mv * rng.standard_normal(len(mean_mv))
         state.v_mv[:] = np.minimum(constants.leak_mv + state.drive_mv, constants.reset_mv)
         state.refractory[:] = np.maximum(state.refractory - steps, 0)
-        state.arriving_e[:] = 0
-        state.arriving_i[:] = 0
+        for ring in (state.arriving_ampa, state.arriving_nmda, state.arriving_gaba):
+            ring[:] = 0
         # x, u, availability and release are kept as of each neuron's last spike: moving the clock recovers them.
         self._step += steps
         self._kicks = NO_KICKS
