@@ -137,6 +137,7 @@ def test_who_recorded_what_goes_into_the_fields_of_nwb(made_up: Recording, tmp_p
 
 @pytest.mark.oracle
 def test_nwbinspector_finds_nothing_critical_and_no_violation(made_up: Recording, tmp_path: Path) -> None:
+    pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
     from nwbinspector import Importance, inspect_nwbfile
 
     with_subject(made_up).save(tmp_path / "a.nwb")
