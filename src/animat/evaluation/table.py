@@ -87,6 +87,24 @@ class Evaluation:
             "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
         }
 
+    def to_text(self) -> str:
+        """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
+        first = self.rows[0].episodes.returns
+        on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
+        lines = [
+            f"{self.robot}, {on}: {first.shape[0]} policies, {first.shape[1]} episodes each",
+            f"  {'':16} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}",
+        ]
+        for row in self.rows:
+            told = row.to_dict()
+            error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
+            lines.append(
+                f"  {row.name:16} {told['mean_return']:11.1f}  {error:>5}  {told['mean_length']:10.1f}"
+                f"  {100 * told['terminated_share']:9.0f} %  {row.meaning}"
+            )
+        each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
+        return "\n".join([*lines, f"  each policy: {each}"])
+
 
 def evaluate(
     policies: Mapping[str, Policy],

@@ -12,11 +12,11 @@ import numpy as np
 from gymnasium import spaces
 
 from animat.animat import Animat, Delivery
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument
 from animat.mapping import Mapping, mapping_named
 from animat.neurons.conditions import conditions_named
 from animat.neurons.made_up import LABELS, made_up_simulator
-from animat.neurons.responses import extract_responses
+from animat.neurons.series import extract_series
 from animat.neurons.simulator import Kind, NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.neurons.windows import DEFAULT_WINDOW_MS
@@ -107,10 +107,8 @@ def _simulator_of(
     recordings: Paths, at_min: float, conditions: str | None, window_ms: tuple[float, float], kind: Kind
 ) -> tuple[NeuronSimulator, tuple[str, ...]]:
     by = None if conditions is None else conditions_named(conditions)
-    timeline = fit_timeline([extract_responses(r, by, window_ms) for r in read_recordings(recordings)], kind=kind)
+    timeline = fit_timeline(extract_series(read_recordings(recordings), by, window_ms), kind=kind)
     for finding in timeline.findings:
-        if finding.severity == "refuse":
-            raise UnusableData(f"recordings: {finding.sentence}")
         if finding.severity == "warning":
             warnings.warn(finding.sentence, stacklevel=3)
     return timeline.at(at_min), tuple(condition.label for condition in timeline.conditions)

@@ -81,9 +81,7 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
         InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings of one time.
         InvalidArgument: if no path is given.
     """
-    files = [file for path in _listed(paths) for file in _files(path)]
-    if not files:
-        raise InvalidArgument("paths: expected at least one file or folder of recordings, got none")
+    files = list_recordings(paths)
     read = sorted(((read_recording(file), file) for file in files), key=lambda pair: pair[0].start_min)
     for (earlier, file), (later, other) in pairwise(read):
         if earlier.start_min == later.start_min:
@@ -92,6 +90,19 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
                 f"{later.start_min:g} min; leave one out, or save it anew with read_recording(path, start_min=...)"
             )
     return [recording for recording, _ in read]
+
+
+def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The files of recordings among paths: files themselves, and the recordings in folders, in the order of names.
+
+    Raises:
+        InvalidFile: for a folder without recordings.
+        InvalidArgument: if no path is given.
+    """
+    files = [file for path in _listed(paths) for file in _files(path)]
+    if not files:
+        raise InvalidArgument("paths: expected at least one file or folder of recordings, got none")
+    return files
 
 
 def _listed(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:

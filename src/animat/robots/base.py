@@ -53,6 +53,9 @@ class Robot(abc.ABC, Generic[State]):
     noise_size: ClassVar[int]
     """How many uniform random numbers in [0, 1) one iteration consumes."""
 
+    paper_iterations: ClassVar[int]
+    """Iterations that the paper trained a policy for on this task."""
+
     episode_limit: int
     """Iterations after which an episode is cut off."""
 

@@ -69,6 +69,7 @@ class Cartpole(Robot[CartpoleState]):
 
     name: ClassVar[str] = "cartpole"
     noise_size: ClassVar[int] = 1
+    paper_iterations: ClassVar[int] = 800_000
 
     def __post_init__(self) -> None:
         positive = (_TINY, _HUGE)

@@ -63,6 +63,7 @@ class Navigation(Robot[NavigationState]):
 
     name: ClassVar[str] = "navigation"
     noise_size: ClassVar[int] = 0
+    paper_iterations: ClassVar[int] = 500_000
 
     def __post_init__(self) -> None:
         positive = (_TINY, _HUGE)

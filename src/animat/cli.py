@@ -1,0 +1,325 @@
+"""The command line: parses, calls, prints. What the commands do is in the modules that they call."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcommand
+
+from animat.errors import AnimatError, InvalidArgument
+from animat.recordings.findings import Finding
+
+if TYPE_CHECKING:
+    from animat.neurons.timeline import SimulatorTimeline
+
+
+@dataclass(frozen=True)
+class Responding:
+    """How responses are read from recordings; the same in every command that reads them."""
+
+    conditions: str | None = None
+    """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, all; default: by frequency"""
+    window_ms: tuple[float, float] = (2.0, 10.0)
+    """Start and end of the response window after a stimulus, in ms"""
+
+
+@dataclass(frozen=True)
+class Fitting(Responding):
+    """How a neuron simulator is made of responses."""
+
+    simulator: Literal["histogram", "empirical"] = "histogram"
+    """histogram: a distribution in bins (the paper); empirical: draw a measured value"""
+    bins: int = 20
+    """Bins of a histogram"""
+    range_hz: float | None = None
+    """Upper end of a histogram's range, in Hz (the paper: 120); default: from the first recording"""
+    despite: tuple[str, ...] = ()
+    """Findings to go on in spite of, by name, such as dead-window"""
+
+    def timeline(self, recordings: Sequence[Path]) -> SimulatorTimeline:
+        """Read the recordings and fit a simulator to each."""
+        from animat.neurons.conditions import conditions_named
+        from animat.neurons.series import extract_series
+        from animat.neurons.timeline import fit_timeline
+        from animat.recordings.reading import read_recordings
+
+        if not recordings:
+            raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
+        by = None if self.conditions is None else conditions_named(self.conditions)
+        series = extract_series(read_recordings(recordings), by, self.window_ms, despite=self.despite)
+        timeline = fit_timeline(series, kind=self.simulator, bins=self.bins, range_hz=self.range_hz)
+        _say_findings(timeline.findings)
+        return timeline
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record a culture: one NWB file a recording. Goes on where it stopped."""
+
+    culture: Literal["made-up"] = "made-up"
+    """made-up: responses of known distributions, to start without a laboratory"""
+    seed: int = 1
+    """Which culture"""
+    sessions: int = 15
+    """How many recordings"""
+    interval_min: float = 10.0
+    """Minutes from one recording to the next"""
+    out: Path = Path("recordings")
+    """Folder for the files"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Record."""
+        from animat.progress import Bar
+        from animat.recordings.made_up import write_made_up_series
+
+        with Bar("recording") as progress:
+            files = write_made_up_series(
+                self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
+            )
+        print(f"{len(files)} recordings in {self.out}")
+        return {"recordings": [str(file) for file in files]}
+
+
+@dataclass(frozen=True)
+class Inspect(Responding):
+    """Say what is in recordings, whether an Animat can be made of them, and what is wrong with them."""
+
+    recordings: Positional[tuple[Path, ...]] = ()
+    """Files, or folders of them: NWB, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv beside it)"""
+    out: Path | None = None
+    """Folder for figures; default: none are drawn"""
+    format: Literal["png", "svg", "pdf"] = "png"
+    """Of the figures"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Inspect each file."""
+        from animat.neurons.conditions import conditions_named
+        from animat.neurons.inspection import inspect_recording
+        from animat.recordings.reading import list_recordings, read_recording
+        from animat.report.inspection import draw_inspection, inspection_text
+
+        by = None if self.conditions is None else conditions_named(self.conditions)
+        inspected = []
+        for file in list_recordings(self.recordings):
+            recording = read_recording(file)
+            inspection = inspect_recording(recording, by, self.window_ms, name=file.name)
+            print(inspection_text(inspection), end="\n\n")
+            inspected.append(inspection.to_dict())
+            if self.out is not None:
+                figures = [str(figure) for figure in draw_inspection(recording, inspection, self.out, self.format)]
+                print(f"figures: {', '.join(figures)}\n")
+                inspected[-1]["figures"] = figures
+        return {"recordings": inspected}
+
+
+@dataclass(frozen=True)
+class Train(Fitting):
+    """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
+
+    robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
+    """The robot to drive"""
+    recordings: tuple[Path, ...] = ()
+    """Files or folders of recordings of one culture"""
+    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] = "1-threshold"
+    """From responses to motor commands; none: the baseline without neurons"""
+    policies: int = 10
+    """How many policies, each from its own random numbers"""
+    iterations: int | None = None
+    """Training iterations of each; default: the paper's, 800000 for cartpole and 500000 for navigation"""
+    seed: int = 1
+    """Decides every random draw"""
+    shadowing: Literal["on", "off"] = "on"
+    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout"""
+    duration_min: float = 60.0
+    """Minutes of the culture's clock that training stands for"""
+    percentiles: Literal["moving", "first"] = "moving"
+    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    delivery: Literal["chosen", "shuffled"] = "chosen"
+    """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
+    parameters: tuple[str, ...] = ()
+    """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
+    workers: int | None = None
+    """Processes, each on its own core; default: one a core"""
+    out: Path = Path("policies")
+    """Folder for the policies"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Train."""
+        from animat.mapping import mapping_named
+        from animat.progress import Bar
+        from animat.robots.registry import robot_named
+
+        robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
+        for caveat in robot.caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+        timeline = None if self.mapping == "none" else self.timeline(self.recordings)
+
+        from animat.training.specification import Training
+        from animat.training.trainer import train
+
+        training = Training(
+            robot=robot,
+            mapping=None if self.mapping == "none" else mapping_named(self.mapping),
+            policies=self.policies,
+            iterations=robot.paper_iterations if self.iterations is None else self.iterations,
+            seed=self.seed,
+            shadowing=self.shadowing == "on",
+            duration_min=self.duration_min,
+            percentiles=self.percentiles,
+            delivery=self.delivery,
+            commands=(-1.0, 1.0) if self.mapping == "none" and self.robot == "cartpole" else None,
+        )
+        if timeline is not None:
+            print(_controllability(timeline))
+        with Bar("training") as progress:
+            trained = train(
+                training,
+                timeline,
+                self.out,
+                workers=self.workers,
+                progress=progress,
+                sources=[str(path) for path in self.recordings],
+            )
+        last = {name: policy.learning_curve[-1, 2].item() for name, policy in trained.items()}
+        print(f"{len(trained)} policies in {self.out}; mean return at the end of training, over policies: ", end="")
+        print(f"{sum(last.values()) / len(last):.1f}")
+        return {"policies": [str(self.out / f"{name}.safetensors") for name in trained], "last_returns": last}
+
+
+@dataclass(frozen=True)
+class Evaluate(Fitting):
+    """Run trained policies, and controls beside them, on the simulator of a recording."""
+
+    policies: Positional[Path] = Path("policies")
+    """A policy file or a folder of them"""
+    recordings: tuple[Path, ...] = ()
+    """Files or folders of recordings of one culture"""
+    at_min: float | None = None
+    """Minute on the culture's clock whose newest recording answers; default: the last recording"""
+    episodes: int = 100
+    """Episodes of each policy and control"""
+    robot: Literal["cartpole", "navigation"] | None = None
+    """The robot that is expected; default: the one the policies were trained on"""
+    greedy: bool = False
+    """Take the most probable action instead of drawing from the policy"""
+    seed: int = 1
+    """Decides every random draw"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Evaluate."""
+        from animat.compilation import keep_compilations
+        from animat.errors import Mismatch
+        from animat.training.policy import load_policies
+
+        if self.episodes < 1:
+            raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
+        policies = load_policies(self.policies)
+        for name, policy in policies.items():
+            if self.robot is not None and policy.robot.name != self.robot:
+                raise Mismatch(f"{name}: expected a policy for {self.robot}, got one for {policy.robot.name}")
+        through_neurons = any(policy.mapping is not None for policy in policies.values())
+        timeline = self.timeline(self.recordings) if through_neurons else None
+
+        from animat.evaluation.table import evaluate
+
+        keep_compilations()
+        evaluation = evaluate(
+            policies, timeline, at_min=self.at_min, episodes=self.episodes, seed=self.seed, greedy=self.greedy
+        )
+        _say_findings(evaluation.findings)
+        print(evaluation.to_text())
+        return evaluation.to_dict()
+
+
+Command = (
+    Annotated[Record, subcommand("record")]
+    | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
+    try:
+        command = _parse(sys.argv[1:] if arguments is None else list(arguments))
+    except InvalidArgument as error:
+        print(f"animat: {error}", file=sys.stderr)
+        return 2
+    try:
+        results = command.run()
+    except AnimatError as error:
+        print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("animat: interrupted; what was finished is kept, start again to go on", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # Whoever read the output closed it; Python would complain once more while exiting.
+        sys.stderr.close()
+        return 141
+    if command.json:
+        print(json.dumps(results))
+    return 0
+
+
+def _parse(arguments: list[str]) -> Record | Inspect | Train | Evaluate:
+    """Read the command line; usage errors come in one line, not in a box."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                Command,
+                prog="animat",
+                description="Drive a robot with a living neuronal culture.",
+                args=arguments,
+                config=(FlagCreatePairsOff, OmitArgPrefixes),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()]
+        rules = [i for i, line in enumerate(lines) if set(line) == {"─"}]
+        what = " ".join(line for line in lines[1 : rules[0] if rules else None] if line)
+        raise InvalidArgument(f"{what}; see animat {' '.join(arguments[:1])} --help") from None
+
+
+def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
+    numbers = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
+    return numbers
+
+
+def _say_findings(findings: Sequence[Finding]) -> None:
+    """Warnings go to standard error, so that they are seen and results stay readable; notes are for `inspect`."""
+    for finding in findings:
+        if finding.severity != "note":
+            print(f"warning: {finding.sentence}", file=sys.stderr)
+
+
+def _controllability(timeline: SimulatorTimeline) -> str:
+    """How much the conditions differ, which bounds what any controller can do."""
+    shares = timeline.fidelities[0].in_simulator
+    told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
+    return f"P(x >= P50) at {timeline.start_min[0]:g} min: {told}"

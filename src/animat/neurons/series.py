@@ -1,0 +1,42 @@
+"""From the recordings of one culture to their responses, with what makes training on them pointless refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from animat.errors import UnusableData
+from animat.neurons.conditions import Conditions
+from animat.neurons.responses import Responses, extract_responses
+from animat.neurons.windows import DEFAULT_WINDOW_MS
+from animat.recordings.recording import Recording
+
+
+def extract_series(
+    recordings: Sequence[Recording],
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    *,
+    despite: Sequence[str] = (),
+) -> list[Responses]:
+    """Extract the responses of recordings that are to be learned from.
+
+    Args:
+        recordings: of one culture.
+        by: what makes a condition; None: by frequency where it is known, else all in one.
+        window_ms: start and end of the window after the pulse.
+        despite: names of findings (`"dead-window"`) to go on in spite of.
+
+    Raises:
+        UnusableData: if a finding says that learning from a recording makes no sense, and is not in `despite`.
+    """
+    series = []
+    for recording in recordings:
+        responses = extract_responses(recording, by, window_ms)
+        for finding in responses.findings:
+            if finding.severity == "refuse" and finding.name not in despite:
+                raise UnusableData(
+                    f"the recording at {recording.start_min:g} min: {finding.sentence} [to go on in spite of it: "
+                    f"despite {finding.name}]"
+                )
+        series.append(responses)
+    return series
