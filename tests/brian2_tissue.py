@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
 from animat.cultures.tissue.coupling import Kicks
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import TissueParameters

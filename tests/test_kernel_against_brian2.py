@@ -1,13 +1,16 @@
 """The tissue's kernel against the same equations in Brian2, an independent simulator.
 
 Brian2 2.9 needs NumPy below 2.4, so it may have to live in an environment of its own: install `brian2`, `numba`,
-`jaxtyping`, `pytest` and `hypothesis` there and run `PYTHONPATH=src python -m pytest -m oracle tests/test_kernel_against_brian2.py`.
+`gymnasium`, `jaxtyping` and `pytest` there, and with `PYTHONPATH=src` run `python -m pytest -m oracle` on this file.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
 
 brian2 = pytest.importorskip(
@@ -21,11 +24,9 @@ DURATION_MS = 200.0
 
 
 def quiet(**changes: float) -> TissueParameters:
-    """50 neurons without noise, driven so that most of them spike, close enough for delays under a refractory period."""
-    settings = dict(
-        neurons=50, width_um=400.0, height_um=400.0, in_degree_e=12, in_degree_i=5, noise_mv=0.0, drive_mv=24.0
-    )
-    return TissueParameters(**{**settings, **changes})  # type: ignore[arg-type]
+    """50 neurons without noise, driven so that they spike, close enough for delays under a refractory period."""
+    parameters = TissueParameters(neurons=50, width_um=400.0, height_um=400.0, in_degree_e=12, in_degree_i=5)
+    return replace(parameters, noise_mv=0.0, drive_mv=24.0, **changes)
 
 
 def both(seed: int, parameters: TissueParameters, pulses: list[Pulse]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -49,7 +50,7 @@ def both(seed: int, parameters: TissueParameters, pulses: list[Pulse]) -> list[t
     return results
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
 def test_the_same_spikes_to_one_step(seed: int) -> None:
     (steps, neurons), (expected_steps, expected_neurons) = both(seed, quiet(), [])
     assert len(expected_steps) > 100
@@ -57,7 +58,7 @@ def test_the_same_spikes_to_one_step(seed: int) -> None:
     assert np.max(np.abs(steps - expected_steps)) <= 1
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
 def test_the_same_spikes_to_one_step_with_a_pulse(seed: int) -> None:
     pulse = Pulse(0.05, np.array([120.0, 300.0]), np.array([150.0, 280.0]))
     (steps, neurons), (expected_steps, expected_neurons) = both(seed, quiet(), [pulse])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -203,7 +204,7 @@ class Tissue:
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
 
     def _kicks_of(self, pulse: Pulse, end_ns: int) -> Kicks:
-        pulse_ns = round(pulse.time_s * NS)
+        pulse_ns = round(pulse.time_s * NS) if isfinite(pulse.time_s) else -1
         if not self._now_ns <= pulse_ns < end_ns:
             raise InvalidArgument(
                 f"pulses: expected times from {self.now_s:g} s to before {end_ns / NS:g} s on the tissue's clock, "
