@@ -24,3 +24,15 @@ class UnusableData(AnimatError):
 
 class Mismatch(AnimatError):
     """Two things that must belong together do not (a policy for another robot, conditions of another recording)."""
+
+
+class UnsafeStimulus(AnimatError):
+    """A stimulus is outside what the culture's safety limits allow; nothing of the request was delivered.
+
+    Attributes:
+        limit: the name of the limit, a field of `animat.cultures.safety.Limits` or `"sites"`, `"overlap"`, `"stopped"`.
+    """
+
+    def __init__(self, limit: str, message: str) -> None:
+        super().__init__(f"{limit}: {message}; nothing was delivered")
+        self.limit = limit

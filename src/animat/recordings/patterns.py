@@ -1,0 +1,84 @@
+"""Stimulation patterns: sets of electrodes that are pulsed together, none near another."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from animat.errors import InvalidArgument
+from animat.recordings.array import ElectrodeArray
+
+_TRIES_A_PATTERN = 200
+
+
+def draw_patterns(
+    array: ElectrodeArray,
+    electrodes: Int64[np.ndarray, " electrodes"],
+    *,
+    seed: int,
+    patterns: int = 100,
+    size: int = 5,
+    spacing_um: float = 100.0,
+) -> Int64[np.ndarray, "patterns size"]:
+    """Draw different patterns of electrodes, every two of a pattern more than `spacing_um` apart.
+
+    Every set that keeps the distance is equally likely.
+
+    Args:
+        array: where the electrodes are.
+        electrodes: to choose from.
+        seed: decides the draw.
+        patterns: how many, no two of them the same set.
+        size: electrodes in each.
+        spacing_um: the distance that every pair must exceed.
+
+    Returns:
+        Electrodes of each pattern, rising.
+
+    Raises:
+        InvalidArgument: if there are not that many; it says how many there are and what to relax.
+
+    Source: the paper's methods (5 of 32 electrodes, more than 100 um apart, 100 patterns).
+    """
+    electrodes = np.unique(np.asarray(electrodes, dtype=np.int64))
+    for name, number in (("patterns", patterns), ("size", size)):
+        if number < 1:
+            raise InvalidArgument(f"{name}: expected at least 1, got {number}")
+    rng = np.random.default_rng([seed, 5])
+    is_far = array.distance_um(electrodes, electrodes) > spacing_um
+    found: dict[tuple[int, ...], None] = {}
+    if size <= len(electrodes):
+        for _ in range(_TRIES_A_PATTERN * patterns):
+            chosen = np.sort(rng.choice(len(electrodes), size, replace=False))
+            if all(is_far[i, j] for i, j in itertools.combinations(chosen, 2)):
+                found[tuple(chosen.tolist())] = None
+                if len(found) == patterns:
+                    break
+    if len(found) < patterns:
+        # So few keep the distance that chance hardly meets them: there are few enough to list.
+        every = list(_cliques(is_far, size, limit=max(1_000_000, 10 * patterns)))
+        if len(every) < patterns:
+            raise InvalidArgument(
+                f"patterns: expected {patterns} different sets of {size} electrodes with every pair more than "
+                f"{spacing_um:g} um apart, but {len(electrodes)} electrodes make only {len(every)}: ask for fewer "
+                "patterns, fewer electrodes in each, a shorter distance, or more stimulation sites"
+            )
+        found = dict.fromkeys(every[i] for i in np.sort(rng.choice(len(every), patterns, replace=False)))
+    return electrodes[np.array(list(found), dtype=np.int64).reshape(patterns, size)]
+
+
+def _cliques(is_far: Bool[np.ndarray, "electrodes electrodes"], size: int, limit: int) -> list[tuple[int, ...]]:
+    """All sets of `size` that are far from each other, up to `limit` of them."""
+    found: list[tuple[int, ...]] = []
+    open_sets: list[tuple[tuple[int, ...], np.ndarray]] = [((), np.arange(len(is_far)))]
+    while open_sets and len(found) < limit:
+        chosen, possible = open_sets.pop()
+        if len(chosen) == size:
+            found.append(chosen)
+            continue
+        for i in possible:
+            later = possible[possible > i]
+            open_sets.append(((*chosen, int(i)), later[is_far[i, later]]))
+    return found

@@ -1,0 +1,74 @@
+"""What a scan of spontaneous activity found at each electrode, and what can be told from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import UnusableData
+
+
+@dataclass(frozen=True, eq=False)
+class ScannedActivity:
+    """Spontaneous activity of scanned electrodes, one row an electrode. Arrays are read-only.
+
+    Attributes:
+        electrode: number on the array, each once, shape (electrodes,).
+        rate_hz: spikes per second, shape (electrodes,).
+        amplitude_uv: mean size of the spikes' trough, NaN without spikes, shape (electrodes,).
+        noise_uv: root mean square of the noise, shape (electrodes,).
+        trough_to_peak_ms: of the mean waveform, NaN without spikes, shape (electrodes,).
+        recovery_ms: from its peak back to half of it, NaN without spikes, shape (electrodes,).
+    """
+
+    electrode: Int64[np.ndarray, " electrodes"]
+    rate_hz: Float64[np.ndarray, " electrodes"]
+    amplitude_uv: Float64[np.ndarray, " electrodes"]
+    noise_uv: Float64[np.ndarray, " electrodes"]
+    trough_to_peak_ms: Float64[np.ndarray, " electrodes"]
+    recovery_ms: Float64[np.ndarray, " electrodes"]
+
+    def __post_init__(self) -> None:
+        rows = np.shape(self.electrode)
+        for name, dtype in {**dict.fromkeys(_MEASURED, np.float64), "electrode": np.int64}.items():
+            column = np.array(getattr(self, name), dtype=dtype)
+            if column.ndim != 1 or column.shape != rows:
+                raise UnusableData(f"scan.{name}: expected one value an electrode {rows}, got shape {column.shape}")
+            column.setflags(write=False)
+            object.__setattr__(self, name, column)
+        if len(np.unique(self.electrode)) != len(self.electrode):
+            raise UnusableData("scan.electrode: expected each electrode once, got some twice or more")
+
+    def __len__(self) -> int:
+        return len(self.electrode)
+
+    @property
+    def signal_to_noise(self) -> Float64[np.ndarray, " electrodes"]:
+        """Mean size of the spikes over the noise; 0 without spikes."""
+        ratio = np.zeros(len(self))
+        np.divide(self.amplitude_uv, self.noise_uv, out=ratio, where=self.noise_uv > 0)
+        return np.nan_to_num(ratio, nan=0.0)
+
+    @property
+    def excitatory_score(self) -> Float64[np.ndarray, " electrodes"]:
+        """How much the waveform looks like an excitatory neuron's, from 0 to 1; 0 without spikes.
+
+            score = 1 / (1 + exp(-((trough_to_peak - 0.35 ms) / 0.05 ms + (recovery - 0.35 ms) / 0.1 ms) / 2))
+
+        Excitatory neurons have a longer trough-to-peak time (0.4-0.5 ms is common practice) and recover more slowly.
+        That waveforms tell types apart is contested, in culture above all, so it is a soft score and no label.
+        """
+        longer = (self.trough_to_peak_ms - 0.35) / 0.05
+        slower = (self.recovery_ms - 0.35) / 0.1
+        return np.nan_to_num(1 / (1 + np.exp(-np.clip((longer + slower) / 2, -50, 50))), nan=0.0)
+
+    @staticmethod
+    def of_blocks(blocks: list[ScannedActivity]) -> ScannedActivity:
+        """The blocks of a scan as one table."""
+        names = ("electrode", *_MEASURED)
+        return ScannedActivity(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})
+
+
+_MEASURED = ("rate_hz", "amplitude_uv", "noise_uv", "trough_to_peak_ms", "recovery_ms")
