@@ -1,0 +1,246 @@
+"""Soft Actor-Critic's loop: what is remembered, what the critics converge to, what is learned."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from animat.animat import Animat, Environment, WithoutNeurons
+from animat.mapping import mapping_named
+from animat.neurons.made_up import made_up_simulator
+from animat.neurons.simulator import NeuronSimulator
+from animat.robots.cartpole import Cartpole
+from animat.training.sac import (
+    SAC,
+    Batch,
+    Finished,
+    Learner,
+    Trained,
+    begin,
+    continuous_losses,
+    discrete_losses,
+    draw_action,
+    forward,
+    train_chunk,
+)
+from sac_toys import Follower, Payer
+
+SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)
+DISCRETE = (-1.0, 1.0)
+
+start = jax.jit(begin, static_argnums=(0, 1))
+chunk = jax.jit(train_chunk, static_argnums=(0, 1))
+
+
+def trained_for(
+    environment: Environment[Any],
+    settings: SAC,
+    rounds: int,
+    *,
+    seed: int = 0,
+    simulator: NeuronSimulator | None = None,
+    learner: Learner[Any] | None = None,
+) -> tuple[Learner[Any], Finished]:
+    learner = start(environment, settings, jax.random.key(seed)) if learner is None else learner
+    trained: tuple[Learner[Any], Finished] = chunk(
+        environment, settings, learner, simulator, jnp.int32(0), jnp.int32(rounds)
+    )
+    return trained
+
+
+# --- the replay -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rounds", [1, 4, 5, 7, 13])
+def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> None:
+    limit = 3  # no divisor of the five rounds that the replay holds, so a row tells which round it is of
+    environment = WithoutNeurons(Payer(pay=7.0, shows_iteration=True, episode_limit=limit), DISCRETE)
+    learner, finished = trained_for(environment, SMALL, rounds)
+    expected_rows = np.full((5, 2, 5), np.nan)
+    for index in range(rounds):
+        counted = index % limit
+        # scaled by 1/2; the next observation is the one before the reset, at the time limit too, which is no end
+        expected_rows[index % 5, :, :2] = counted / 2, (counted + 1) / 2
+        expected_rows[index % 5, :, 4] = 0.0
+    rows = np.asarray(learner.replay).reshape(5, 2, 5)
+    written = ~np.isnan(expected_rows[:, :, 0])
+    np.testing.assert_array_equal(rows[written][:, [0, 1, 4]], expected_rows[written][:, [0, 1, 4]])
+    np.testing.assert_allclose(
+        rows[written][:, 3], SMALL.reward_scale * 7.0 * np.array(DISCRETE)[rows[written][:, 2].astype(int)], rtol=1e-6
+    )
+    assert not rows[~written].any()
+    assert float(finished.episodes) == 2 * (rounds // limit)
+
+
+def test_terminations_are_remembered_and_episodes_start_anew() -> None:
+    environment = WithoutNeurons(Payer(ends=True, shows_iteration=True), DISCRETE)
+    rows = np.asarray(trained_for(environment, SMALL, 5)[0].replay)
+    np.testing.assert_array_equal(rows[:, [0, 1, 4]], np.tile([0.0, 0.5, 1.0], (10, 1)))
+
+
+def test_returns_are_counted_in_the_tasks_own_units() -> None:
+    environment = WithoutNeurons(Payer(pay=5.0, episode_limit=4), (1.0, 1.0))
+    learner, finished = trained_for(environment, SMALL, 11)
+    assert (float(finished.episodes), float(finished.returns)) == (4, 4 * 4 * 5.0)
+    np.testing.assert_array_equal(learner.returns, [15.0, 15.0])
+
+
+def test_only_what_was_written_is_learned_from() -> None:
+    settings = SAC(environments=2, updates=4, batch=64, replay=2000, hidden=8)
+    environment = WithoutNeurons(Cartpole(), DISCRETE)
+    learner = start(environment, settings, jax.random.key(0))
+    poisoned = learner._replace(replay=jnp.full_like(learner.replay, jnp.nan))
+    clean, _ = trained_for(environment, settings, 40, learner=learner)
+    learner, _ = trained_for(environment, settings, 40, learner=poisoned)
+    for leaf, other in zip(jax.tree.leaves(learner.trained), jax.tree.leaves(clean.trained), strict=True):
+        np.testing.assert_array_equal(leaf, other)
+
+
+# --- one update -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("commands", [DISCRETE, None])
+def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[float, ...] | None) -> None:
+    # One transition remembered, so the batch is known: that row, over and over.
+    settings = SAC(environments=1, updates=1, batch=4, replay=10, hidden=8, follow=0.25, learning_rate=0.01)
+    environment = WithoutNeurons(Cartpole(), commands)
+    before = start(environment, settings, jax.random.key(3))
+    after, _ = trained_for(environment, settings, 1, learner=before)
+    n = environment.n_observations
+    rows = jnp.tile(after.replay[:1], (4, 1))
+    batch = Batch(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1], rows[:, 2 * n + 2])
+
+    def loss(trained: Trained) -> jax.Array:
+        if commands is not None:
+            return sum(discrete_losses(trained, before.targets, batch, settings), jnp.float32(0))
+        # The noise of the update is drawn inside; the critics' output at the start hardly depends on it.
+        return sum(continuous_losses(trained, before.targets, batch, jnp.full((2, 4), 0.5), settings), jnp.float32(0))
+
+    gradient = jax.jit(jax.grad(loss))(before.trained)
+    parts = ("actor", "critics", "log_alpha") if commands is not None else ("log_alpha",)
+    for name in parts:
+        leaves = (jax.tree.leaves(getattr(tree, name)) for tree in (before.trained, after.trained, gradient))
+        for old, new, slope in zip(*leaves, strict=True):
+            # Adam's first step: mean and root of the mean square are the gradient and its size.
+            step = -0.01 * slope / (jnp.abs(slope) + 1e-8)
+            clear = np.abs(slope) > 1e-6
+            np.testing.assert_allclose(np.where(clear, new - old, 0), np.where(clear, step, 0), atol=2e-5, err_msg=name)
+    of_critics = map(jax.tree.leaves, (before.targets, after.targets, after.trained.critics))
+    for old, target, critic in zip(*of_critics, strict=True):
+        np.testing.assert_allclose(target, 0.75 * old + 0.25 * critic, rtol=1e-5, atol=1e-7)
+
+
+# --- what it converges to -------------------------------------------------------------------------------------------
+
+CLOSED_FORM = SAC(
+    environments=4, updates=4, batch=32, replay=1024, hidden=16, learning_rate=3e-3, discount=0.6, follow=0.05,
+    reward_scale=0.5, entropy_share=0.5,
+)  # fmt: skip
+
+
+def soft_solution(pay: float) -> tuple[float, float, float]:
+    """(alpha, probability of +1, value) of one state with rewards -pay and +pay, at the wanted entropy.
+
+    Critics differ by their rewards alone, so pi = softmax(rewards / alpha), alpha such that H(pi) is what is wanted,
+    and V = sum pi r + alpha H(pi) + discount V.
+    """
+    wanted = CLOSED_FORM.entropy_share * math.log(2)
+    p = brentq(lambda p: -p * math.log(p) - (1 - p) * math.log(1 - p) - wanted, 0.5, 1 - 1e-9)
+    alpha = 2 * pay / math.log(p / (1 - p))
+    return alpha, p, ((2 * p - 1) * pay + alpha * wanted) / (1 - CLOSED_FORM.discount)
+
+
+@pytest.mark.parametrize("ending", ["never", "truncated", "terminated"])
+def test_critics_converge_to_the_closed_form(ending: str) -> None:
+    """One state, two actions: time limits look ahead as if nothing ended, terminations do not."""
+    robot = Payer(pay=0.8, ends=ending == "terminated", episode_limit=1 if ending == "truncated" else 10**9)
+    environment = WithoutNeurons(robot, DISCRETE)
+    learner, _ = trained_for(environment, CLOSED_FORM, 3000)
+    pay = CLOSED_FORM.reward_scale * robot.pay
+    alpha, p, value = soft_solution(pay)
+    ahead = 0.0 if ending == "terminated" else CLOSED_FORM.discount * value
+    observation = jnp.ones((1, 1))
+    q = np.asarray(forward(learner.trained.critics, observation))[:, 0]
+    np.testing.assert_allclose(q, np.tile([ahead - pay, ahead + pay], (2, 1)), atol=0.02)
+    assert float(jnp.exp(learner.trained.log_alpha)) == pytest.approx(alpha, rel=0.06)
+    policy = jax.nn.softmax(forward(learner.trained.actor, observation))[0]
+    assert float(policy[1]) == pytest.approx(p, abs=0.02)
+
+
+# --- what it learns -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("commands", [(-0.8, 0.0, 0.8), None])
+def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
+    settings = SAC(
+        environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=1.0,
+        entropy_nats=-2.0,
+    )  # fmt: skip
+    environment = WithoutNeurons(Follower(), commands)
+    learner, _ = trained_for(environment, settings, 1500)
+    wanted = jnp.array([[-0.75], [0.0], [0.75]]).repeat(400, axis=0)
+    uniforms = jax.random.uniform(jax.random.key(9), (len(wanted),))
+    action = draw_action(environment, learner.trained.actor, wanted, uniforms)
+    command = np.asarray(action if commands is None else jnp.array(commands)[action])
+    mistake = np.abs(command - np.asarray(wanted)[:, 0])
+    # Acting at random misses by 0.7 on average; what is left is the entropy that the policy is told to keep.
+    assert mistake.mean() < 0.15
+
+
+# --- side by side, piece by piece -----------------------------------------------------------------------------------
+
+
+def animat() -> tuple[Environment[Any], NeuronSimulator]:
+    simulator = made_up_simulator()
+    return Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions), simulator
+
+
+def test_policies_side_by_side_are_what_they_are_alone() -> None:
+    environment, simulator = animat()
+    keys = jax.random.split(jax.random.key(5), 3)
+    together = jax.jit(jax.vmap(partial(train_chunk, environment, SMALL), in_axes=(0, None, None, None)))(
+        jax.jit(jax.vmap(partial(begin, environment, SMALL)))(keys), simulator, jnp.int32(0), jnp.int32(30)
+    )
+    for i, key in enumerate(keys):
+        learner = start(environment, SMALL, key)
+        alone = trained_for(environment, SMALL, 30, simulator=simulator, learner=learner)
+        of_both = (jax.tree.leaves(jax.tree.map(lambda leaf, i=i: leaf[i], together)), jax.tree.leaves(alone))
+        for leaf, other in zip(*of_both, strict=True):
+            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                leaf, other = jax.random.key_data(leaf), jax.random.key_data(other)
+            np.testing.assert_allclose(leaf, other, rtol=1e-3, atol=1e-4)
+
+
+def test_policies_of_different_keys_differ() -> None:
+    environment, simulator = animat()
+    first, second = (trained_for(environment, SMALL, 3, seed=seed, simulator=simulator)[0] for seed in (0, 1))
+    assert not np.array_equal(first.trained.actor[0].weight, second.trained.actor[0].weight)
+    assert not np.array_equal(first.replay, second.replay)
+
+
+def test_chunks_of_any_size_end_in_the_same_bits() -> None:
+    environment, simulator = animat()
+    whole, of_whole = trained_for(environment, SMALL, 40, seed=6, simulator=simulator)
+    pieces, episodes = start(environment, SMALL, jax.random.key(6)), 0.0
+    for first, last in ((0, 7), (7, 7), (7, 33), (33, 40)):
+        pieces, finished = chunk(environment, SMALL, pieces, simulator, jnp.int32(first), jnp.int32(last))
+        episodes += float(finished.episodes)
+    for leaf, other in zip(*map(jax.tree.leaves, (whole, pieces)), strict=True):
+        assert jnp.array_equal(leaf, other)
+    assert episodes == float(of_whole.episodes)
+
+
+def test_another_simulator_is_data_and_compiles_nothing() -> None:
+    environment, simulator = animat()
+    learner, _ = trained_for(environment, SMALL, 2, seed=7, simulator=simulator)
+    compiled = chunk._cache_size()  # type: ignore[attr-defined]
+    other = made_up_simulator((50, 40, 30, 20, 10))
+    chunk(environment, SMALL, learner, other, jnp.int32(2), jnp.int32(3))
+    assert chunk._cache_size() == compiled  # type: ignore[attr-defined]
