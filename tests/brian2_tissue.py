@@ -22,12 +22,6 @@ dgN/dt = -gN / tau_N : 1
 dgG/dt = -gG / tau_G : 1
 dgK/dt = -gK / tau_K : 1
 dtheta/dt = -theta / tau_theta : 1
-dxE/dt = (1 - xE) / tau_recE : 1
-dxI/dt = (1 - xI) / tau_recI : 1
-duE/dt = (U_E - uE) / tau_facE : 1
-duI/dt = (U_I - uI) / tau_facI : 1
-dh/dt = (1 - h) / tau_h : 1
-dR/dt = (1 - R) / tau_R : 1
 relE : 1
 relI : 1
 drive : 1
@@ -43,6 +37,33 @@ tau_recE : second (constant)
 tau_recI : second (constant)
 tau_facE : second (constant)
 tau_facI : second (constant)
+"""
+
+EVERY_STEP = """
+dxE/dt = (1 - xE) / tau_recE : 1
+dxI/dt = (1 - xI) / tau_recI : 1
+duE/dt = (U_E - uE) / tau_facE : 1
+duI/dt = (U_I - uI) / tau_facI : 1
+dh/dt = (1 - h) / tau_h : 1
+dR/dt = (1 - R) / tau_R : 1
+"""
+AT_SPIKES = """
+xE : 1
+xI : 1
+uE : 1
+uI : 1
+h : 1
+R : 1
+last : second
+"""
+RECOVER = """
+xE = 1 - (1 - xE) * exp((last - t) / tau_recE)
+xI = 1 - (1 - xI) * exp((last - t) / tau_recI)
+uE = U_E + (uE - U_E) * exp((last - t) / tau_facE)
+uI = U_I + (uI - U_I) * exp((last - t) / tau_facI)
+h = 1 - (1 - h) * exp((last - t) / tau_h)
+R = 1 - (1 - R) * exp((last - t) / tau_R)
+last = t
 """
 
 RESET = """
@@ -70,6 +91,7 @@ class Brian2Tissue:
         kicks: kicks by step, neuron and size, or None.
         noise: whether the drive is an Ornstein-Uhlenbeck process.
         target: Brian2's code generation, "numpy" or "cython".
+        at_spikes: whether plasticity recovers at spikes (fast) or at every step (another way of saying it).
     """
 
     def __init__(
@@ -82,6 +104,7 @@ class Brian2Tissue:
         kicks: Kicks | None = None,
         noise: bool = False,
         target: str = "numpy",
+        at_spikes: bool = False,
     ) -> None:
         import brian2 as b2
 
@@ -114,9 +137,9 @@ class Brian2Tissue:
         clock = b2.Clock(p.step_ms * ms)
         group: Any = b2.NeuronGroup(
             len(network),
-            EQUATIONS,
+            EQUATIONS + (AT_SPIKES if at_spikes else EVERY_STEP),
             threshold="v > v_threshold + theta",
-            reset=RESET,
+            reset=(RECOVER if at_spikes else "") + RESET,
             refractory="refractory_time",
             method="exponential_euler",
             clock=clock,

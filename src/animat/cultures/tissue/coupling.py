@@ -74,7 +74,7 @@ class Reach:
 
 
 class Kicks(NamedTuple):
-    """Kicks to neurons in the order of their steps, shape (kicks,) each."""
+    """Kicks to neurons: at which step, which neuron, by how much; shape (kicks,) each."""
 
     step: Int64[np.ndarray, " kicks"]
     neuron: Int64[np.ndarray, " kicks"]
@@ -110,7 +110,7 @@ class Coupling:
         return self._patterns[places]
 
     def kicks(self, pulse: Pulse, pulse_step: int) -> Kicks:
-        """The kicks that a pulse at `pulse_step` gives.
+        """The kicks that a pulse at `pulse_step` gives, in no order.
 
         An axonal spike passes with `axon_reliability` and arrives after its fixed latency and a jitter; both draws are
         functions of the pulse's step, so they do not depend on how time is cut.
@@ -124,14 +124,10 @@ class Coupling:
         passes = (draw < parameters.axon_reliability) & (reach.axon_rank < pulse.strength)
         latency_ms = reach.axon_latency_ms[passes] + parameters.axon_jitter_ms * jitter[passes]
         arrival = pulse_step + np.maximum(np.rint(latency_ms / parameters.step_ms), 0).astype(np.int64)
-        return in_order(
-            Kicks(
-                np.concatenate([np.full(len(reach.near), pulse_step, dtype=np.int64), arrival]),
-                np.concatenate([reach.near, reach.axons[passes]]),
-                np.concatenate(
-                    [reach.kick_mv * pulse.strength, np.full(len(arrival), AXONAL_KICK_MV)], dtype=np.float32
-                ),
-            )
+        return Kicks(
+            np.concatenate([np.full(len(reach.near), pulse_step, dtype=np.int64), arrival]),
+            np.concatenate([reach.near, reach.axons[passes]]),
+            np.concatenate([reach.kick_mv * pulse.strength, np.full(len(arrival), AXONAL_KICK_MV)], dtype=np.float32),
         )
 
     def _reach_of_one(self, place: tuple[int, int]) -> Reach:
@@ -154,9 +150,9 @@ class Coupling:
 
 
 def in_order(*kicks: Kicks) -> Kicks:
-    """All the kicks given, in the order of their steps, then neurons."""
+    """All the kicks given, in the order of their steps; those of one step stay in the order given."""
     step, neuron, mv = (np.concatenate(column) for column in zip(*kicks, strict=True))
-    order = np.lexsort((mv, neuron, step))
+    order = np.argsort(step, kind="stable")
     return Kicks(step[order], neuron[order], mv[order])
 
 

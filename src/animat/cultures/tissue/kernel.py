@@ -18,6 +18,7 @@ f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
 FAINT = f4(1e-20)
 """Added at every decay, so that silence ends at about 1e-17 and never at subnormal numbers, which are slow."""
+STRETCH = 128
 SUM_OF_FOUR_MEAN = f4(2 * 65535)
 SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 """Mean and standard deviation of the sum of four uniform 16-bit integers."""
@@ -97,9 +98,11 @@ class State(NamedTuple):
 
 
 compiled = numba.njit(cache=True, error_model="numpy", fastmath=False)
+# Without inlining, every call copies the description of every array of its arguments.
+inlined = numba.njit(cache=True, error_model="numpy", fastmath=False, forceinline=True)
 
 
-@compiled
+@inlined
 def mixed(key: np.uint64, step: int) -> np.uint64:
     """The 64 bits of SplitMix64 (Steele et al. 2014, doi 10.1145/2660193.2660195) for a key and a step."""
     z = key + np.uint64(step) * np.uint64(0x9E3779B97F4A7C15)
@@ -108,7 +111,7 @@ def mixed(key: np.uint64, step: int) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@compiled
+@inlined
 def sum_of_four(bits: np.uint64) -> np.float32:
     """The sum of the four 16-bit integers in 64 bits, less its mean: nearly normal (excess kurtosis -0.3)."""
     low = np.uint64(0xFFFF)
@@ -116,7 +119,7 @@ def sum_of_four(bits: np.uint64) -> np.float32:
     return f4(np.int32(total)) - SUM_OF_FOUR_MEAN
 
 
-@compiled
+@inlined
 def move_membrane(constants: Constants, state: State, step_over_membrane: Float32[np.ndarray, " neurons"]) -> None:
     """One step of V, exact for conductances held over the step, up to (1 - exp(-z)) / z = 1 / (1 + z/2 + z^2/12)."""
     v_mv, drive_mv, ampa, nmda, gaba = state.v_mv, state.drive_mv, state.ampa, state.nmda, state.gaba
@@ -135,7 +138,7 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
         v_mv[i] = moved if refractory[i] == 0 else v
 
 
-@compiled
+@inlined
 def move_noise(
     constants: Constants,
     drive_mv: Float32[np.ndarray, " neurons"],
@@ -150,21 +153,21 @@ def move_noise(
         drive_mv[i] = mean_mv[i] + (drive_mv[i] - mean_mv[i]) * keep + noise_mv
 
 
-@compiled
+@inlined
 def decay(values: Float32[np.ndarray, " neurons"], lose: np.float32) -> None:
     """One step of an exponential decay; single precision holds the small share lost better than what is kept."""
     for i in range(values.size):
         values[i] = values[i] - values[i] * lose + FAINT
 
 
-@compiled
+@inlined
 def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
     """One step of the refractory period."""
     for i in range(refractory.size):
         refractory[i] = max(refractory[i] - np.int32(1), np.int32(0))
 
 
-@compiled
+@inlined
 def arrive(constants: Constants, state: State, slot: int) -> None:
     """Add what arrives in this step to the conductances, and empty its row of the ring."""
     ampa, nmda, gaba = state.ampa, state.nmda, state.gaba
@@ -181,23 +184,23 @@ def arrive(constants: Constants, state: State, slot: int) -> None:
         to_gaba[i] = f4(0.0)
 
 
-@compiled
-def over_threshold(constants: Constants, state: State) -> np.int32:
-    """The number of neurons over their threshold; refractory ones lie at the reset."""
+@inlined
+def over_threshold(constants: Constants, state: State, first: int, last: int) -> np.int32:
+    """How many neurons from `first` to before `last` are over their threshold; refractory ones lie at the reset."""
     v_mv, adaptation_mv, threshold_mv = state.v_mv, state.adaptation_mv, constants.threshold_mv
     count = np.int32(0)
-    for i in range(v_mv.size):
+    for i in range(first, last):
         count += np.int32(v_mv[i] > threshold_mv + adaptation_mv[i])
     return count
 
 
-@compiled
+@inlined
 def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: float) -> float:
     """What an exponential recovery to `rest` has come to."""
     return rest + (value - rest) * math.exp(-elapsed_s / time_constant_s)
 
 
-@compiled
+@inlined
 def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, gain: float) -> None:
     """Let neuron i spike: release, depress, tire, send along every synapse, reset."""
     kind = 0 if i < constants.n_excitatory else 1
@@ -210,21 +213,27 @@ def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, 
         state.release[i] = release * (1.0 - constants.release_loss)
     available = recovered(state.available[i], 1.0, elapsed_s, constants.availability_s)
     state.available[i] = available * (1.0 - constants.availability_loss)
-    to_e = strength * release_of(constants, state, i, kind, 0, elapsed_s)
-    to_i = strength * release_of(constants, state, i, kind, 1, elapsed_s)
+    to_e = f4(strength * release_of(constants, state, i, kind, 0, elapsed_s))
+    to_i = f4(strength * release_of(constants, state, i, kind, 1, elapsed_s))
 
+    n, n_e = state.v_mv.size, constants.n_excitatory
     last_row = state.arriving_ampa.shape[0] - 1
-    for synapse in range(wiring.start[i], wiring.start[i + 1]):
-        target = wiring.target[synapse]
-        arriving = f4(wiring.weight[synapse] * (to_e if target < constants.n_excitatory else to_i))
-        row = (step + wiring.delay_steps[synapse]) & last_row
-        if kind == 0:
-            state.arriving_ampa[row, target] += arriving
+    first, last = wiring.start[i], wiring.start[i + 1]
+    if kind == 0:
+        to_ampa, to_nmda = state.arriving_ampa.ravel(), state.arriving_nmda.ravel()
+        for synapse in range(first, last):
+            target = wiring.target[synapse]
+            arriving = wiring.weight[synapse] * (to_e if target < n_e else to_i)
+            place = ((step + wiring.delay_steps[synapse]) & last_row) * n + target
+            to_ampa[place] += arriving
             # Two arrivals in one step fill a share each of what the other leaves: as if one came after the other.
-            filled = min(constants.nmda_fill * arriving, ONE)
-            state.arriving_nmda[row, target] += filled * (ONE - state.arriving_nmda[row, target])
-        else:
-            state.arriving_gaba[row, target] += arriving
+            to_nmda[place] += min(constants.nmda_fill * arriving, ONE) * (ONE - to_nmda[place])
+    else:
+        to_gaba = state.arriving_gaba.ravel()
+        for synapse in range(first, last):
+            target = wiring.target[synapse]
+            place = ((step + wiring.delay_steps[synapse]) & last_row) * n + target
+            to_gaba[place] += wiring.weight[synapse] * (to_e if target < n_e else to_i)
 
     state.v_mv[i] = constants.reset_mv
     state.potassium[i] += constants.hyperpolarisation
@@ -232,7 +241,7 @@ def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, 
     state.refractory[i] = wiring.refractory_steps[i]
 
 
-@compiled
+@inlined
 def release_of(constants: Constants, state: State, i: int, kind: int, towards: int, elapsed_s: float) -> float:
     """Recover u and x since the last spike, release u x, and leave them as they are after it."""
     use = constants.use[kind, towards]
@@ -294,13 +303,16 @@ def advance(
         decay(state.gaba, constants.lose_gaba)
         decay(state.potassium, constants.lose_potassium)
         decay(state.adaptation_mv, constants.lose_adaptation)
-        if over_threshold(constants, state) > 0:
-            for i in range(n):
-                if state.v_mv[i] > constants.threshold_mv + state.adaptation_mv[i]:
-                    spike_step[spikes] = step
-                    spike_neuron[spikes] = i
-                    spikes += 1
-                    fire(constants, wiring, state, i, step, gain)
+        # A stretch is counted in vector code, and looked at neuron by neuron only where one of them spikes.
+        for first in range(0, n, STRETCH):
+            last = min(first + STRETCH, n)
+            if over_threshold(constants, state, first, last) > 0:
+                for i in range(first, last):
+                    if state.v_mv[i] > constants.threshold_mv + state.adaptation_mv[i]:
+                        spike_step[spikes] = step
+                        spike_neuron[spikes] = i
+                        spikes += 1
+                        fire(constants, wiring, state, i, step, gain)
         arrive(constants, state, step & last_row)
     return n_steps, kicks, spikes
 

@@ -12,7 +12,7 @@ from animat.cultures.tissue.parameters import TissueParameters
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Neurons and synapses; excitatory neurons come first. Synapses of neuron i are rows start[i] to start[i + 1].
+    """Neurons, excitatory ones first, and synapses: those of neuron i are rows start[i] to start[i + 1], by delay.
 
     Attributes:
         x_um, y_um: positions, shape (neurons,).
@@ -69,14 +69,16 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
         sources.append(chosen.ravel())
         targets.append(np.repeat(np.arange(n), degree))
     source, target = np.concatenate(sources), np.concatenate(targets)
-    order = np.lexsort((target, source))
-    source, target = source[order], target[order]
+    delay_ms = parameters.delay_ms + distance_um[target, source] / parameters.conduction_um_per_ms
+    delay_steps = np.maximum(np.rint(delay_ms / parameters.step_ms), 1).astype(np.int32)
+    # Each neuron's synapses by delay: what arrives in one step lies together in memory.
+    order = np.lexsort((target, delay_steps, source))
+    source, target, delay_steps = source[order], target[order], delay_steps[order]
 
     mean = np.array([[parameters.weight_ee, parameters.weight_ei], [parameters.weight_ie, parameters.weight_ii]])
     sigma = parameters.weight_sigma
     spread = rng.lognormal(-(sigma**2) / 2, sigma, len(source))
     weight = mean[(source >= n_e).astype(int), (target >= n_e).astype(int)] * spread
-    delay_ms = parameters.delay_ms + distance_um[target, source] / parameters.conduction_um_per_ms
     return Network(
         x_um=x_um,
         y_um=y_um,
@@ -85,5 +87,5 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
         start=np.searchsorted(source, np.arange(n + 1)).astype(np.int64),
         target=target.astype(np.int32),
         weight=weight.astype(np.float32),
-        delay_steps=np.maximum(np.rint(delay_ms / parameters.step_ms), 1).astype(np.int32),
+        delay_steps=delay_steps,
     )

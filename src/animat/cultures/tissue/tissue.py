@@ -113,7 +113,7 @@ class Tissue:
             InvalidArgument: for a negative duration, or a pulse outside this stretch of time; nothing has then passed.
         """
         end_ns = self._now_ns + _nanoseconds("duration_s", duration_s)
-        new = [self._kicks_of(pulse, end_ns) for pulse in pulses]
+        new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
         if new:
             self._kicks = in_order(self._kicks, *new)
         self._now_ns = end_ns
