@@ -19,6 +19,7 @@ from animat.recordings.findings import Finding
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -64,14 +65,20 @@ class Fitting(Responding):
 class Record:
     """Record a culture: one NWB file a recording. Goes on where it stopped."""
 
-    culture: Literal["made-up"] = "made-up"
-    """made-up: responses of known distributions, to start without a laboratory"""
+    culture: Literal["virtual", "made-up"] = "virtual"
+    """virtual: simulated neurons on a simulated array; made-up: responses of known distributions, no neurons"""
     seed: int = 1
     """Which culture"""
     sessions: int = 15
     """How many recordings"""
     interval_min: float = 10.0
     """Minutes from one recording to the next"""
+    order: Literal["blocked", "mixed"] = "blocked"
+    """blocked: all stimuli of a frequency together (the paper); mixed: shuffled, as a closed loop meets them"""
+    pulses: int = 1
+    """Pulses a presentation, the last one read; for a closed loop: mixed with 5"""
+    presentations: int = 100
+    """Presentations at each frequency"""
     out: Path = Path("recordings")
     """Folder for the files"""
     json: bool = False
@@ -80,14 +87,37 @@ class Record:
     def run(self) -> dict[str, Any]:
         """Record."""
         from animat.progress import Bar
-        from animat.recordings.made_up import write_made_up_series
 
         with Bar("recording") as progress:
-            files = write_made_up_series(
-                self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
-            )
+            files = self._made_up(progress) if self.culture == "made-up" else self._virtual(progress)
         print(f"{len(files)} recordings in {self.out}")
         return {"recordings": [str(file) for file in files]}
+
+    def _made_up(self, progress: Progress) -> list[Path]:
+        from animat.recordings.made_up import write_made_up_series
+
+        if (self.order, self.pulses, self.presentations) != ("blocked", 1, 100):
+            raise InvalidArgument(
+                "--order, --pulses, --presentations: made-up recordings are blocked, with one pulse and 100 "
+                "presentations; --culture virtual takes others"
+            )
+        return write_made_up_series(
+            self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
+        )
+
+    def _virtual(self, progress: Progress) -> list[Path]:
+        from animat.cultures.series import record_virtual_series
+        from animat.cultures.virtual import VirtualCulture
+        from animat.recordings.protocol import Protocol
+
+        return record_virtual_series(
+            lambda: VirtualCulture(self.seed, progress=progress),
+            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations),
+            self.out,
+            sessions=self.sessions,
+            interval_min=self.interval_min,
+            progress=progress,
+        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,339 @@
+"""The contract of everything that can be stimulated and recorded, simulated or alive."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, ClassVar, Self, final
+
+import numpy as np
+from jaxtyping import Int64
+
+from animat.cultures.observed import Observed, Spikes, assembled, stimulus_table
+from animat.cultures.safety import Admitted, Guard, Limits
+from animat.errors import InvalidArgument
+from animat.progress import Progress, Silent
+from animat.recordings.protocol import Presentation, Protocol
+from animat.recordings.recording import Channels, Recording
+from animat.recordings.schedule import Schedule, make_schedule
+from animat.recordings.stimulus import Pulse, Stimulus
+
+
+class Culture(abc.ABC):
+    """A culture on an array: open it, stimulate it, record it, let time pass, close it.
+
+    What a user calls is final; it checks, asks the guard, and then calls what a backend implements, whose names begin
+    with an underscore. Nothing is delivered but what the guard admitted: `_deliver` takes `Admitted` stimuli, which
+    nothing else can make. A culture has a state and a clock of its own; everything takes time on it.
+
+    A backend implements `name`, the data (`channels`, `stimulation_electrodes`, `patterns`, `device_limits`, `now_s`,
+    `sampling_rate_hz`, `provenance`) and `_open`, `_deliver`, `_rest`, `_halt` and `_close`; it passes
+    `animat.cultures.contract.CultureContract`.
+
+    Args:
+        limits: tighter limits than the device's; None: the device's.
+    """
+
+    name: ClassVar[str]
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        overridden = [name for name in _FINAL if name in vars(cls)]
+        if overridden and cls.__module__ != __name__:
+            raise TypeError(
+                f"{cls.__name__}.{overridden[0]}: final in Culture; implement the methods that begin with _"
+            )
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self._asked_limits = limits
+        self._guard: Guard | None = None
+
+    # What a backend is: data. Valid once it is open.
+
+    @property
+    @abc.abstractmethod
+    def channels(self) -> Channels:
+        """The recording electrodes."""
+
+    @property
+    @abc.abstractmethod
+    def stimulation_electrodes(self) -> tuple[int, ...]:
+        """The electrodes that can stimulate."""
+
+    @property
+    @abc.abstractmethod
+    def patterns(self) -> Int64[np.ndarray, "patterns size"]:
+        """Electrodes of each stimulation pattern, padded with -1."""
+
+    @property
+    @abc.abstractmethod
+    def device_limits(self) -> Limits:
+        """What the device and the culture stand."""
+
+    @property
+    @abc.abstractmethod
+    def now_s(self) -> float:
+        """The culture's clock."""
+
+    @property
+    @abc.abstractmethod
+    def sampling_rate_hz(self) -> float:
+        """Of the raw signal that spikes are detected in."""
+
+    @property
+    @abc.abstractmethod
+    def provenance(self) -> dict[str, str]:
+        """What a recording says about where it came from."""
+
+    # What a backend does.
+
+    @abc.abstractmethod
+    def _open(self) -> None:
+        """Get ready: connect, route, scan."""
+
+    @abc.abstractmethod
+    def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        """Deliver stimuli, let `duration_s` pass from now, and say what was seen."""
+
+    @abc.abstractmethod
+    def _rest(self, duration_s: float) -> None:
+        """Let time pass unobserved."""
+
+    @abc.abstractmethod
+    def _halt(self) -> None:
+        """Stop whatever is being delivered, at once; may be called from another thread, and when nothing is."""
+
+    @abc.abstractmethod
+    def _close(self) -> None:
+        """Leave the device safe and let go of it; also called where `_open` failed half way."""
+
+    # What a user calls.
+
+    @final
+    def open(self) -> Self:
+        """Get ready, and begin a session: stimuli are counted anew and an emergency stop is lifted.
+
+        Raises:
+            InvalidArgument: if it is open already, or its limits are looser than the device's.
+        """
+        if self._guard is not None:
+            raise InvalidArgument("culture: expected a closed one to open, got one that is open")
+        if self._asked_limits is not None:
+            self._asked_limits.check_within(self.device_limits)
+        try:
+            self._open()
+        except BaseException:
+            self._close()
+            raise
+        self._guard = Guard(self.limits, self.stimulation_electrodes)
+        return self
+
+    @final
+    def close(self) -> None:
+        """Leave the device safe and let go of it; a closed culture stays closed."""
+        if self._guard is not None:
+            self._guard = None
+            self._close()
+
+    @final
+    def __enter__(self) -> Self:
+        return self.open()
+
+    @final
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    @final
+    def limits(self) -> Limits:
+        """The limits in force."""
+        return self._asked_limits or self.device_limits
+
+    @property
+    @final
+    def is_open(self) -> bool:
+        """Whether a session is under way."""
+        return self._guard is not None
+
+    @property
+    @final
+    def is_stopped(self) -> bool:
+        """Whether an emergency stop is in force."""
+        return self._guard is not None and self._guard.is_stopped
+
+    @property
+    @final
+    def delivered(self) -> int:
+        """Stimuli delivered in this session."""
+        return self._opened().delivered
+
+    @final
+    def stop(self, reason: str = "asked for") -> None:
+        """Emergency stop: deliver nothing more until the culture is closed and opened again. Safe from any thread."""
+        if self._guard is not None:
+            self._guard.stop(reason)
+        self._halt()
+
+    @final
+    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float) -> Observed:
+        """Deliver stimuli within the next `duration_s` and observe all channels meanwhile.
+
+        Args:
+            stimuli: in the order of time, counted from now.
+            duration_s: how long, zero or more; all stimuli begin within.
+
+        Raises:
+            UnsafeStimulus: naming the limit that one of them exceeds; nothing is then delivered, and no time passes.
+            InvalidArgument: for a culture that is not open, or stimuli outside this stretch of time.
+        """
+        guard = self._opened()
+        _check_duration("duration_s", duration_s)
+        outside = [stimulus for stimulus in stimuli if not stimulus.time_s < duration_s]
+        if outside:
+            raise InvalidArgument(
+                f"stimuli: expected times before the delivery ends ({duration_s:g} s), got {outside[0].time_s:g} s"
+            )
+        return self._deliver(guard.admit(stimuli, self.now_s), duration_s)
+
+    @final
+    def advance(self, duration_s: float) -> Spikes:
+        """Let time pass without a stimulus; spikes are counted from its start."""
+        return self.deliver((), duration_s).spikes
+
+    @final
+    def rest(self, duration_s: float) -> None:
+        """Let time pass unobserved, in closed form where the culture knows how.
+
+        Raises:
+            InvalidArgument: for a culture that is not open, or a negative time.
+        """
+        self._opened()
+        _check_duration("duration_s", duration_s)
+        self._rest(duration_s)
+
+    @final
+    def stimulate(
+        self, electrodes: Sequence[int], pulse: Pulse, window_ms: tuple[float, float] = (2.0, 10.0)
+    ) -> Spikes:
+        """Deliver one pulse now and return the spikes of a window after it; time passes to the window's end.
+
+        Args:
+            electrodes: that are pulsed together.
+            pulse: what each delivers.
+            window_ms: start and end of the window after the pulse.
+
+        Returns:
+            Spikes with start <= time < end, counted from the pulse.
+
+        Raises:
+            UnsafeStimulus, InvalidArgument: as `deliver` does.
+        """
+        start_ms, end_ms = window_ms
+        if not 0 <= start_ms < end_ms < float("inf"):
+            raise InvalidArgument(f"window_ms: expected a start from 0 and an end after it, got {window_ms}")
+        observed = self.deliver([Stimulus(0.0, tuple(electrodes), pulse)], end_ms * 1e-3)
+        since_s = observed.spikes.time_s - observed.stimulus_time_s[0]
+        # Spikes lie on samples: half a nanosecond off an edge is on it.
+        inside = (since_s >= start_ms * 1e-3 - 5e-10) & (since_s < end_ms * 1e-3 - 5e-10)
+        return Spikes(since_s[inside], observed.spikes.channel[inside])
+
+    @final
+    def present(
+        self, stimuli: Sequence[Stimulus], *, until_ms: float = 10.0, presentation: Presentation | None = None
+    ) -> Recording:
+        """Deliver the stimuli of a presentation and record up to `until_ms` after the last one.
+
+        What a closed loop does each time: the short recording is read by the same extraction of responses as any other.
+
+        Args:
+            stimuli: at least one, in the order of time, counted from now.
+            until_ms: the end of the response window.
+            presentation: how it is presented.
+
+        Raises:
+            UnsafeStimulus, InvalidArgument: as `deliver` does.
+        """
+        if not stimuli:
+            raise InvalidArgument("stimuli: expected at least one in a presentation, got none")
+        start_min = self.now_s / 60
+        observed = self.deliver(stimuli, stimuli[-1].time_s + until_ms * 1e-3)
+        return Recording(
+            spike_times_s=observed.spikes.time_s,
+            spike_channels=observed.spikes.channel,
+            channels=self.channels,
+            stimuli=stimulus_table(stimuli, observed.stimulus_time_s),
+            sampling_rate_hz=self.sampling_rate_hz,
+            start_s=0.0,
+            duration_s=observed.duration_s,
+            start_min=start_min,
+            presentation=presentation,
+        )
+
+    @final
+    def schedule(self, protocol: Protocol, seed: int = 0) -> Schedule:
+        """The stimuli that `record` would deliver."""
+        return make_schedule(protocol, self.patterns, seed)
+
+    @final
+    def record(self, protocol: Protocol, seed: int = 0, progress: Progress | None = None) -> Recording:
+        """Stimulate by a protocol and record.
+
+        The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
+        recording's clock, block following block.
+
+        Args:
+            protocol: what to do; it is kept in the recording's provenance, as JSON.
+            seed: decides the order of frequencies and patterns.
+            progress: told after each block.
+
+        Raises:
+            UnsafeStimulus, InvalidArgument: as `deliver` does.
+        """
+        schedule = self.schedule(protocol, seed)
+        progress = progress or Silent()
+        provenance = {**self.provenance, "protocol": protocol.to_json(), "protocol_seed": str(seed)}
+        self._rehearse(schedule)
+        start_min = self.now_s / 60
+        observed = []
+        for number, block in enumerate(schedule.blocks):
+            self.rest(block.setup_s)
+            observed.append(self.deliver(schedule.deliveries(block), block.duration_s))
+            progress.update(number + 1, len(schedule.blocks))
+        return assembled(
+            schedule,
+            observed,
+            channels=self.channels,
+            sampling_rate_hz=self.sampling_rate_hz,
+            start_min=start_min,
+            provenance=provenance,
+        )
+
+    def _rehearse(self, schedule: Schedule) -> None:
+        """Put the whole schedule before the guard, blocks at their times, delivering nothing."""
+        guard, offset_s, stimuli = self._opened(), 0.0, []
+        for block in schedule.blocks:
+            offset_s += block.setup_s
+            for stimulus in schedule.deliveries(block):
+                stimuli.append(Stimulus(offset_s + stimulus.time_s, stimulus.electrodes, stimulus.pulse))
+            offset_s += block.duration_s
+        guard.check(stimuli, self.now_s)
+
+    def _opened(self) -> Guard:
+        if self._guard is None:
+            raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
+        return self._guard
+
+
+_FINAL = tuple(
+    name
+    for name, member in vars(Culture).items()
+    if getattr(member.fget if isinstance(member, property) else member, "__final__", False)
+)
+
+
+def _check_duration(name: str, duration_s: float) -> None:
+    if not 0 <= duration_s < float("inf"):
+        raise InvalidArgument(f"{name}: expected finite seconds from 0, got {duration_s}")

@@ -1,0 +1,104 @@
+"""What was seen while stimuli were delivered, and how it becomes a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.schedule import Schedule
+from animat.recordings.stimulus import Stimulus
+
+
+class Spikes(NamedTuple):
+    """Spikes in the order of time.
+
+    Attributes:
+        time_s: counted from whatever the method that returned them says, shape (spikes,).
+        channel: row of the culture's channel table, shape (spikes,).
+    """
+
+    time_s: Float64[np.ndarray, " spikes"]
+    channel: Int64[np.ndarray, " spikes"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What was seen in a stretch of time.
+
+    Attributes:
+        start_s: on the culture's clock.
+        duration_s: how long was observed; at least as long as asked for, as a living culture's data may come late.
+        spikes: times counted from the start.
+        stimulus_time_s: when each stimulus really began, counted from the start, shape (stimuli,).
+    """
+
+    start_s: float
+    duration_s: float
+    spikes: Spikes
+    stimulus_time_s: Float64[np.ndarray, " stimuli"]
+
+
+def stimulus_table(stimuli: Sequence[Stimulus], time_s: Float64[np.ndarray, " stimuli"]) -> Stimuli:
+    """Delivered stimuli as a recording's table, at the times they really began."""
+    electrodes = np.full((len(stimuli), max(len(s.electrodes) for s in stimuli)), UNKNOWN, dtype=np.int64)
+    for row, stimulus in zip(electrodes, stimuli, strict=True):
+        row[: len(stimulus.electrodes)] = stimulus.electrodes
+    return Stimuli(
+        time_s=time_s,
+        frequency_hz=np.array([stimulus.frequency_hz for stimulus in stimuli]),
+        pattern=np.array([stimulus.pattern for stimulus in stimuli]),
+        electrodes=electrodes,
+        presentation=np.array([stimulus.presentation for stimulus in stimuli]),
+    )
+
+
+def assembled(
+    schedule: Schedule,
+    observed: Sequence[Observed],
+    *,
+    channels: Channels,
+    sampling_rate_hz: float,
+    start_min: float,
+    provenance: Mapping[str, str],
+) -> Recording:
+    """The blocks of a schedule, one after the other on one clock, as a recording.
+
+    Args:
+        schedule: that was delivered.
+        observed: what was seen, block by block.
+        channels: of the culture.
+        sampling_rate_hz: whose samples the spikes lie on.
+        start_min: of the recording on the culture's clock.
+        provenance: of the recording.
+    """
+    starts_s = np.cumsum([0.0, *(block.duration_s for block in observed)])
+    tables = [block.stimuli for block in schedule.blocks]
+
+    def on_samples(parts: Sequence[Float64[np.ndarray, " times"]]) -> Float64[np.ndarray, " times"]:
+        # Adding the blocks' starts leaves rounding errors behind.
+        times_s = np.concatenate([start_s + part for start_s, part in zip(starts_s, parts, strict=False)])
+        return np.asarray(np.rint(times_s * sampling_rate_hz) / sampling_rate_hz)
+
+    return Recording(
+        spike_times_s=on_samples([block.spikes.time_s for block in observed]),
+        spike_channels=np.concatenate([block.spikes.channel for block in observed]),
+        channels=channels,
+        stimuli=Stimuli(
+            time_s=on_samples([block.stimulus_time_s for block in observed]),
+            frequency_hz=np.concatenate([table.frequency_hz for table in tables]),
+            pattern=np.concatenate([table.pattern for table in tables]),
+            electrodes=np.concatenate([table.electrodes for table in tables]),
+            presentation=np.concatenate([table.presentation for table in tables]),
+        ),
+        sampling_rate_hz=sampling_rate_hz,
+        start_s=0.0,
+        duration_s=float(starts_s[-1]),
+        start_min=start_min,
+        presentation=schedule.protocol.presentation,
+        provenance=provenance,
+    )

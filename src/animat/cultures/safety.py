@@ -1,0 +1,293 @@
+"""What may be delivered to a culture: limits as data, and the guard that every stimulus passes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from math import isfinite
+from typing import Any, Final, NamedTuple
+
+from animat.errors import InvalidArgument, UnsafeStimulus
+from animat.recordings.stimulus import Kind, Pulse, Stimulus
+
+NS = 1_000_000_000
+_MAY_ADMIT: Final = object()
+_REMEMBERED_PULSES = 1000
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a culture and its device stand. Amplitudes are in mV and charges in mV ms where `kind` is `"voltage"`, in uA
+    and nC where it is `"current"` (see `Phase.charge`).
+
+    Attributes:
+        kind: what the device holds during a phase.
+        amplitude: largest magnitude of a phase.
+        phase_us: shortest and longest phase.
+        charge_per_phase: largest magnitude of a phase's charge.
+        net_charge: largest magnitude of the sum of a pulse's charges: what balance leaves over.
+        electrodes_at_once: most electrodes of one stimulus.
+        stimuli_per_electrode_s: most stimuli on one electrode in any second.
+        stimuli_per_s: most stimuli, on whatever electrodes, in any second.
+        stimuli_per_session: most stimuli from `open` to `close`.
+
+    Raises:
+        InvalidArgument: for a limit that is no number or below 0.
+    """
+
+    kind: Kind
+    amplitude: float
+    phase_us: tuple[float, float]
+    charge_per_phase: float
+    net_charge: float
+    electrodes_at_once: int
+    stimuli_per_electrode_s: int
+    stimuli_per_s: int
+    stimuli_per_session: int
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("voltage", "current"):
+            raise InvalidArgument(f"kind: expected 'voltage' or 'current', got {self.kind!r}")
+        shortest, longest = self.phase_us
+        if not (0 < shortest <= longest and isfinite(longest)):
+            raise InvalidArgument(f"phase_us: expected (shortest, longest), above 0 and finite, got {self.phase_us}")
+        for name in _NUMBERS:
+            if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
+
+    @property
+    def units(self) -> tuple[str, str]:
+        """Of amplitude and of charge."""
+        return ("mV", "mV ms") if self.kind == "voltage" else ("uA", "nC")
+
+    def check_within(self, device: Limits) -> None:
+        """Raise unless these limits are as tight as the device's or tighter.
+
+        Raises:
+            InvalidArgument: naming the limit that is looser.
+        """
+        if self.kind != device.kind:
+            raise InvalidArgument(f"limits.kind: expected {device.kind!r}, the device's, got {self.kind!r}")
+        looser = [name for name in _NUMBERS if getattr(self, name) > getattr(device, name)]
+        if self.phase_us[0] < device.phase_us[0] or self.phase_us[1] > device.phase_us[1]:
+            looser.append("phase_us")
+        if looser:
+            raise InvalidArgument(
+                f"limits.{looser[0]}: expected no looser than the device's {getattr(device, looser[0])}, got "
+                f"{getattr(self, looser[0])}: limits can be tightened, never loosened"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """As data for JSON."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+
+_NUMBERS = tuple(each.name for each in fields(Limits) if each.name not in ("kind", "phase_us"))
+
+
+class Admitted:
+    """Stimuli that passed a guard: the only thing a backend is given to deliver, and only a guard makes them.
+
+    Attributes:
+        stimuli: in the order of time, counted from the start of the delivery.
+    """
+
+    __slots__ = ("stimuli",)
+
+    def __init__(self, stimuli: Sequence[Stimulus], *, by: object) -> None:
+        if by is not _MAY_ADMIT:
+            raise InvalidArgument("Admitted: expected to be made by a Guard, which checks stimuli; use Culture.deliver")
+        self.stimuli = tuple(stimuli)
+
+
+class _Event(NamedTuple):
+    start_ns: int
+    end_ns: int
+    electrodes: tuple[int, ...]
+
+
+class Guard:
+    """Checks every stimulus of a request against limits, remembering what was delivered before.
+
+    A request passes as a whole or not at all. Times are compared in whole nanoseconds, so that pulses exactly a second
+    apart are a second apart.
+
+    Args:
+        limits: what may be delivered.
+        sites: electrodes that can stimulate.
+    """
+
+    def __init__(self, limits: Limits, sites: Iterable[int]) -> None:
+        self.limits = limits
+        self._sites = frozenset(sites)
+        self._safe_pulses: dict[Pulse, None] = {}
+        self._stopped: str | None = None
+        self.begin_session()
+
+    @property
+    def delivered(self) -> int:
+        """Stimuli that were admitted in this session."""
+        return self._delivered
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether an emergency stop is in force."""
+        return self._stopped is not None
+
+    def begin_session(self) -> None:
+        """Forget what was delivered, and lift an emergency stop."""
+        # The stimuli of the last second, and of each electrode; times are on the culture's clock.
+        self._recent: deque[int] = deque()
+        self._recent_on: dict[int, deque[int]] = {}
+        self._busy_until_ns = -NS
+        self._delivered = 0
+        self._stopped = None
+
+    def stop(self, reason: str) -> None:
+        """Refuse everything from now on, until a new session begins."""
+        self._stopped = reason
+
+    def check(self, stimuli: Sequence[Stimulus], now_s: float) -> None:
+        """Raise unless the request as a whole is within the limits; nothing is remembered.
+
+        Args:
+            stimuli: in the order of time, counted from now.
+            now_s: the culture's clock.
+
+        Raises:
+            UnsafeStimulus: naming the limit, the value, and what to do.
+        """
+        self._examine(stimuli, now_s)
+
+    def admit(self, stimuli: Sequence[Stimulus], now_s: float) -> Admitted:
+        """Check a request and remember it as delivered.
+
+        Raises:
+            UnsafeStimulus: as `check` does; nothing is then remembered.
+        """
+        events = self._examine(stimuli, now_s)
+        for event in events:
+            self._remember(event, self._recent, self._recent_on)
+            self._busy_until_ns = event.end_ns
+        self._delivered += len(events)
+        self._forget()
+        return Admitted(stimuli, by=_MAY_ADMIT)
+
+    def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> list[_Event]:
+        limits = self.limits
+        if not stimuli:
+            return []
+        if self._stopped is not None:
+            raise UnsafeStimulus("stopped", f"an emergency stop is in force ({self._stopped}): close and open again")
+        if self._delivered + len(stimuli) > limits.stimuli_per_session:
+            raise UnsafeStimulus(
+                "stimuli_per_session",
+                f"expected at most {limits.stimuli_per_session} stimuli in a session, got {len(stimuli)} more after "
+                f"{self._delivered}: ask for fewer, or begin a new session after a rest",
+            )
+        events = []
+        recent, recent_on, busy_until_ns = deque(self._recent), dict(self._recent_on), self._busy_until_ns
+        copied: set[int] = set()
+        for stimulus in stimuli:
+            self._check_one(stimulus)
+            if not (isfinite(stimulus.time_s) and stimulus.time_s >= 0):
+                raise UnsafeStimulus("overlap", f"expected finite times from 0 s on, got {stimulus.time_s}")
+            start_ns = round((now_s + stimulus.time_s) * NS)
+            if start_ns < busy_until_ns:
+                raise UnsafeStimulus(
+                    "overlap",
+                    f"expected each stimulus to begin after the one before has ended, got one {stimulus.time_s:g} s "
+                    f"from now, {(busy_until_ns - start_ns) / 1000:g} us too early: put them in the order of time, "
+                    "further apart",
+                )
+            event = _Event(start_ns, start_ns + round(stimulus.pulse.duration_us * 1000), stimulus.electrodes)
+            # Histories are copied before they are written to: a request that fails must leave no trace.
+            for electrode in event.electrodes:
+                if electrode not in copied:
+                    copied.add(electrode)
+                    recent_on[electrode] = deque(recent_on.get(electrode, ()))
+            self._remember(event, recent, recent_on)
+            self._check_rates(event, recent, recent_on)
+            busy_until_ns = event.end_ns
+            events.append(event)
+        return events
+
+    def _check_one(self, stimulus: Stimulus) -> None:
+        """The limits that hold for a stimulus by itself."""
+        limits, electrodes = self.limits, stimulus.electrodes
+        if not 1 <= len(electrodes) <= limits.electrodes_at_once:
+            raise UnsafeStimulus(
+                "electrodes_at_once", f"expected 1 to {limits.electrodes_at_once} electrodes, got {len(electrodes)}"
+            )
+        if len(set(electrodes)) < len(electrodes):
+            raise UnsafeStimulus("sites", f"expected each electrode once in a stimulus, got {electrodes}")
+        strange = [electrode for electrode in electrodes if electrode not in self._sites]
+        if strange:
+            raise UnsafeStimulus(
+                "sites",
+                f"expected stimulation sites of this culture, got electrode {strange[0]}: choose among them",
+            )
+        if stimulus.pulse not in self._safe_pulses:
+            self._check_pulse(stimulus.pulse)
+            if len(self._safe_pulses) >= _REMEMBERED_PULSES:
+                self._safe_pulses.clear()
+            self._safe_pulses[stimulus.pulse] = None
+
+    def _check_pulse(self, pulse: Pulse) -> None:
+        limits = self.limits
+        amplitude_unit, charge_unit = limits.units
+        if pulse.kind != limits.kind:
+            raise UnsafeStimulus("kind", f"expected {limits.kind} pulses, got a {pulse.kind} pulse ({pulse})")
+        for phase in pulse.phases:
+            if abs(phase.amplitude) > limits.amplitude:
+                raise UnsafeStimulus(
+                    "amplitude",
+                    f"expected at most {limits.amplitude:g} {amplitude_unit}, got {phase.amplitude:g}: lower it",
+                )
+            shortest, longest = limits.phase_us
+            if not shortest <= phase.duration_us <= longest:
+                raise UnsafeStimulus(
+                    "phase_us", f"expected phases of {shortest:g} to {longest:g} us, got {phase.duration_us:g}"
+                )
+            if abs(phase.charge) > limits.charge_per_phase:
+                raise UnsafeStimulus(
+                    "charge_per_phase",
+                    f"expected at most {limits.charge_per_phase:g} {charge_unit} a phase, got {phase.charge:g}: lower "
+                    "the amplitude or shorten the phase",
+                )
+        if abs(pulse.net_charge) > limits.net_charge:
+            raise UnsafeStimulus(
+                "net_charge",
+                f"expected phases that balance to {limits.net_charge:g} {charge_unit}, got {pulse.net_charge:g} "
+                f"({pulse}): give the phases equal and opposite charge",
+            )
+
+    def _check_rates(self, event: _Event, recent: deque[int], recent_on: dict[int, deque[int]]) -> None:
+        limits = self.limits
+        if len(recent) > limits.stimuli_per_s:
+            raise UnsafeStimulus(
+                "stimuli_per_s",
+                f"expected at most {limits.stimuli_per_s} stimuli in any second, got {len(recent)}: slow down",
+            )
+        for electrode in event.electrodes:
+            if len(recent_on[electrode]) > limits.stimuli_per_electrode_s:
+                raise UnsafeStimulus(
+                    "stimuli_per_electrode_s",
+                    f"expected at most {limits.stimuli_per_electrode_s} stimuli on an electrode in any second, got "
+                    f"{len(recent_on[electrode])} on electrode {electrode}: slow down, or use more patterns",
+                )
+
+    @staticmethod
+    def _remember(event: _Event, recent: deque[int], recent_on: dict[int, deque[int]]) -> None:
+        """Add an event and drop what lies a second or more before it."""
+        for history in (recent, *(recent_on.setdefault(electrode, deque()) for electrode in event.electrodes)):
+            history.append(event.start_ns)
+            while history[0] <= event.start_ns - NS:
+                history.popleft()
+
+    def _forget(self) -> None:
+        """Drop electrodes whose last stimulus lies a second back, so that the histories stay small."""
+        if self._recent:
+            old = self._recent[-1] - NS
+            self._recent_on = {e: times for e, times in self._recent_on.items() if times[-1] > old}

@@ -1,0 +1,153 @@
+"""A series of recordings of one culture over time, one NWB file each, that goes on where it stopped."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from animat.cultures.virtual import VirtualCulture
+from animat.errors import InvalidArgument, Mismatch
+from animat.progress import Progress, Silent
+from animat.recordings.protocol import Protocol
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+
+STATE_FILE = "culture.state"
+SELECTION_FILE = "selection.json"
+
+
+def recording_name(start_min: float) -> str:
+    """The file name of a recording that starts at a minute of the culture's clock."""
+    return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
+
+
+def record_virtual_series(
+    make_culture: Callable[[], VirtualCulture],
+    protocol: Protocol,
+    folder: str | os.PathLike[str],
+    *,
+    sessions: int = 15,
+    interval_min: float = 10.0,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Record a virtual culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
+
+    Whatever interrupts it, at whatever moment, calling it again gives the very recordings that an undisturbed run
+    gives. Every file is complete or absent. After each recording the culture's state is written (`culture.state`); a
+    series goes on from it. What lies between the state and the recordings that are there is recorded again and
+    compared; where there is no state, that is all. The electrodes in use are written to `selection.json`.
+
+    Args:
+        make_culture: makes the culture, new and closed.
+        protocol: of every recording; the order of stimuli differs from one to the next.
+        folder: where the files go; made if it is missing.
+        sessions: number of recordings.
+        interval_min: minutes between the starts of two recordings.
+        progress: told about the scan and after each block.
+
+    Returns:
+        The files, in the order of time.
+
+    Raises:
+        InvalidArgument: for no sessions, or an interval shorter than a recording.
+        Mismatch: if a file of the series is there but from another culture, protocol or version.
+        InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
+    """
+    if sessions < 1:
+        raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
+    if not 0 < interval_min < float("inf"):
+        raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
+    folder, progress = Path(folder), progress or Silent()
+    files = [folder / recording_name(session * interval_min) for session in range(sessions)]
+    there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
+    fresh = make_culture()
+    for session, file in enumerate(files):
+        if file.exists():
+            _expect_of_series(file, fresh, protocol, session, 60 * session * interval_min)
+    if there == sessions:
+        progress.update(sessions, sessions, "all there already")
+        return files
+    culture, recorded = _resume(make_culture, folder / STATE_FILE, there)
+    with culture:
+        _check_interval(culture, protocol, sessions, interval_min)
+        culture.selection.save(folder / SELECTION_FILE)
+        if not recorded:
+            culture.save_state(folder / STATE_FILE, sessions=0)
+        for session in range(recorded, sessions):
+            culture.rest(max(0.0, 60 * session * interval_min - culture.now_s))
+            part = _Part(progress, session, sessions, files[session].name)
+            recording = culture.record(protocol, _seed(culture, session), part)
+            if files[session].exists():
+                _expect_equal(files[session], recording)
+            else:
+                recording.save(files[session])
+            # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
+            culture.save_state(folder / STATE_FILE, sessions=session + 1)
+            progress.update(session + 1, sessions, files[session].name)
+    return files
+
+
+def _seed(culture: VirtualCulture, session: int) -> int:
+    """Of a session's schedule: other cultures and other sessions have other orders."""
+    return culture.seed * 10_000 + session
+
+
+def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int) -> tuple[VirtualCulture, int]:
+    """The culture as it was after the recordings that are there, or as near before that as is known."""
+    culture = make_culture()
+    if state.exists():
+        recorded = culture.restore_state(state)["sessions"]
+        if recorded <= there:
+            return culture, recorded
+        # Recordings were taken away that came before the state: only the beginning is before them.
+        culture = make_culture()
+    return culture, 0
+
+
+def _check_interval(culture: VirtualCulture, protocol: Protocol, sessions: int, interval_min: float) -> None:
+    takes_min = culture.schedule(protocol).duration_s / 60
+    if sessions > 1 and interval_min < takes_min:
+        raise InvalidArgument(
+            f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"
+        )
+
+
+def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, session: int, start_s: float) -> None:
+    there = read_recording(file)
+    expected = {
+        **culture.settings,
+        "protocol": protocol.to_json(),
+        "protocol_seed": str(_seed(culture, session)),
+    }
+    for name, words in expected.items():
+        got = there.provenance.get(name)
+        if got != words:
+            raise Mismatch(
+                f"{file}: expected a recording of the same culture and protocol ({name} {_short(words)}), got another "
+                f"({_short(got)}): remove it, or choose another folder"
+            )
+    if abs(there.start_min * 60 - start_s) > 1e-6:
+        raise Mismatch(f"{file}: expected a recording at {start_s / 60:g} min, got one at {there.start_min:g} min")
+
+
+def _expect_equal(file: Path, again: Recording) -> None:
+    if not read_recording(file).equals(again):
+        raise Mismatch(
+            f"{file}: expected what recording it again gives, got another culture's, protocol's or version's "
+            "recording: remove it, or choose another folder"
+        )
+
+
+def _short(words: str | None) -> str:
+    return "nothing" if words is None else words if len(words) <= 60 else f"{words[:57]}..."
+
+
+class _Part:
+    """The progress of one session as a part of the series'."""
+
+    def __init__(self, whole: Progress, session: int, sessions: int, note: str) -> None:
+        self._whole, self._session, self._sessions, self._note = whole, session, sessions, note
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        self._whole.update(self._session + done / total, self._sessions, note or self._note)

@@ -1,0 +1,310 @@
+"""The virtual culture: a simulated tissue on a simulated MaxOne, behind the contract that hardware has."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.cultures.base import Culture
+from animat.cultures.observed import Observed, Spikes
+from animat.cultures.safety import Admitted, Limits
+from animat.cultures.visibility import Visibility
+from animat.errors import InvalidArgument
+from animat.progress import Progress, Silent
+from animat.recordings.array import MAXONE
+from animat.recordings.recording import Channels
+from animat.recordings.scan import ScannedActivity
+from animat.recordings.selection import Selection, SelectionRule, select_electrodes
+from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+
+if TYPE_CHECKING:
+    from animat.cultures.tissue import Tissue, TissueParameters
+
+NS = 1_000_000_000
+WARM_UP_S = 5.0
+"""Passes before anything is measured: a fresh tissue is not in its stride."""
+
+VIRTUAL_LIMITS = Limits(
+    kind="voltage",
+    amplitude=400.0,
+    phase_us=(50.0, 1000.0),
+    charge_per_phase=200.0,
+    net_charge=25.0,
+    electrodes_at_once=32,
+    stimuli_per_electrode_s=100,
+    stimuli_per_s=200,
+    stimuli_per_session=10_000_000,
+)
+"""A simulation comes to no harm, so these are wide. `net_charge` lets even the paper's pulse pass, which as printed
+leaves 20 mV ms over; the limits of a living culture must not."""
+
+
+class VirtualCulture(Culture):
+    """A simulated culture; `docs/virtual-culture.md` says what of.
+
+    Its clock is the tissue's, starting at 0 when it is first opened, after the array was scanned and electrodes were
+    chosen. Time is exact to the nanosecond, however it is cut: the same requests give the same spikes. A pulse acts
+    with a strength in proportion to the charge of its largest cathodic (negative) phase, the published pulse being 1;
+    nothing blinds the electrodes after a pulse (for the artefact of a real one see `animat.cultures.traces`).
+
+    Args:
+        seed: which culture: decides the tissue, the spike shapes, and the patterns; zero or more.
+        parameters: of the tissue.
+        selection: electrodes to use; None: scan and choose, which takes some seconds.
+        rule: by which they are chosen.
+        scan_s: how long each block of 1,024 electrodes is scanned; 20 s (the paper) find 1,024 electrodes on most
+            seeds, 5 s, in a quarter of the time, about 930, as neurons that are silent meanwhile stay unseen.
+        limits: tighter limits than `VIRTUAL_LIMITS`.
+        progress: told about the scan.
+
+    Raises:
+        InvalidArgument: for a setting that cannot be.
+    """
+
+    name: ClassVar[str] = "virtual"
+
+    def __init__(
+        self,
+        seed: int,
+        *,
+        parameters: TissueParameters | None = None,
+        selection: Selection | None = None,
+        rule: SelectionRule | None = None,
+        scan_s: float = 20.0,
+        limits: Limits | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        super().__init__(limits)
+        if seed < 0:
+            raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+        if not 0 < scan_s <= 3600:
+            raise InvalidArgument(f"scan_s: expected above 0 to 3600 s a block, got {scan_s}")
+        self.seed = seed
+        self._parameters, self._rule, self._scan_s = parameters, rule, scan_s
+        self._progress = progress or Silent()
+        self._selection = selection
+        self._scan: ScannedActivity | None = None
+        self._tissue: Tissue | None = None
+        self._zero_ns = 0
+        self._now_ns = 0
+        # Spikes of the step that the clock is in the middle of, on the tissue's clock.
+        self._held_ns, self._held_neuron = np.empty(0, np.int64), np.empty(0, np.int64)
+
+    @property
+    def tissue(self) -> Tissue:
+        """The tissue itself, for looking into; advancing it behind the culture's back breaks the culture's clock.
+
+        Raises:
+            InvalidArgument: for a culture that was never opened.
+        """
+        if self._tissue is None:
+            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
+        return self._tissue
+
+    @property
+    def selection(self) -> Selection:
+        """The electrodes in use."""
+        if self._selection is None:
+            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
+        return self._selection
+
+    @property
+    def scan(self) -> ScannedActivity | None:
+        """What the scan found; None where electrodes were given or restored."""
+        return self._scan
+
+    @property
+    def visibility(self) -> Visibility:
+        """Which electrode sees which neuron, and how."""
+        _ = self.tissue
+        return self._visibility
+
+    @property
+    def channels(self) -> Channels:
+        """The recording electrodes."""
+        _ = self.selection
+        return self._channels
+
+    @property
+    def stimulation_electrodes(self) -> tuple[int, ...]:
+        """The electrodes that can stimulate."""
+        return tuple(self.selection.stimulation.tolist())
+
+    @property
+    def patterns(self) -> Int64[np.ndarray, "patterns size"]:
+        """Electrodes of each stimulation pattern."""
+        return self.selection.patterns
+
+    @property
+    def device_limits(self) -> Limits:
+        """`VIRTUAL_LIMITS`."""
+        return VIRTUAL_LIMITS
+
+    @property
+    def now_s(self) -> float:
+        """The culture's clock: 0 when it was first opened."""
+        return (self._now_ns - self._zero_ns) / NS
+
+    @property
+    def sampling_rate_hz(self) -> float:
+        """As a MaxOne's; spikes fall on the tissue's steps, which are four of these samples long."""
+        return 20_000.0
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """The settings, and the electrodes in use."""
+        return {
+            **self.settings,
+            "stimulation_electrodes": " ".join(map(str, self.selection.stimulation.tolist())),
+            "selection": f"{len(self.selection.recording)} of {self.selection.passed} electrodes that passed, of "
+            f"{self.selection.scanned} scanned",
+        }
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What decides everything that the culture does, known before it is opened."""
+        from animat.cultures.tissue import TissueParameters
+
+        return {
+            "source": "virtual culture: simulated by animat.cultures.virtual",
+            "seed": str(self.seed),
+            "scan_s": str(self._scan_s),
+            "selection_rule": json.dumps(dataclasses.asdict(self._rule or SelectionRule())),
+            "tissue_parameters": json.dumps(dataclasses.asdict(self._parameters or TissueParameters())),
+        }
+
+    def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
+        """Write all that decides what comes next, to go on from bit for bit; the file is complete or absent.
+
+        Args:
+            path: the file.
+            remarks: whole numbers to keep with it.
+
+        Raises:
+            InvalidFile: if it cannot be written.
+        """
+        from animat.cultures.virtual_state import write_state
+
+        write_state(self, path, remarks)
+
+    def restore_state(self, path: str | os.PathLike[str]) -> dict[str, int]:
+        """Make this culture, not yet opened, what another of the same seed and settings was; returns the remarks.
+
+        Raises:
+            InvalidFile: if the file is missing or damaged.
+            Mismatch: for the state of another culture.
+            InvalidArgument: for a culture that is open.
+        """
+        from animat.cultures.virtual_state import read_state
+
+        if self.is_open:
+            raise InvalidArgument("culture: expected a closed one to restore, got one that is open")
+        return read_state(self, path)
+
+    def _open(self) -> None:
+        if self._tissue is None:
+            self._grow()
+            tissue = self.tissue
+            tissue.advance(WARM_UP_S)
+            if self._selection is None:
+                self._scan = self._scan_array()
+                self._selection = select_electrodes(MAXONE, self._scan, self._rule, seed=self.seed)
+            self._zero_ns = self._now_ns = round(tissue.now_s * NS)
+        self._look()
+
+    def _grow(self) -> None:
+        from animat.cultures.tissue import Tissue
+
+        tissue = Tissue(self.seed, self._parameters)
+        self._tissue = tissue
+        self._step_ns = round(tissue.parameters.step_ms * 1e6)
+        self._visibility = Visibility(self.seed, MAXONE, tissue.x_um, tissue.y_um, tissue.is_excitatory)
+
+    def _scan_array(self) -> ScannedActivity:
+        """Spontaneous activity of the whole array, block after block."""
+        blocks, found = MAXONE.scan_blocks(), []
+        rng = np.random.default_rng([self.seed, 12])
+        neurons = len(self.tissue.x_um)
+        for number, block in enumerate(blocks):
+            spikes = self.tissue.advance(self._scan_s)
+            spikes_of = np.bincount(spikes.neuron, minlength=neurons)
+            found.append(self._visibility.measure(block, spikes_of, self._scan_s, rng))
+            self._progress.update(0, 1, f"scanning the array: block {number + 1} of {len(blocks)}")
+        return ScannedActivity.of_blocks(found)
+
+    def _look(self) -> None:
+        """Which channels see each neuron, neuron by neuron."""
+        selection = self.selection
+        self._channels = selection.channels
+        pairs = self._visibility.pairs_of(selection.recording)
+        order = np.lexsort((pairs.electrode, pairs.neuron))
+        self._seen_by = pairs.electrode[order]
+        self._n_seen_by = np.bincount(pairs.neuron, minlength=len(self.tissue.x_um))
+        self._first_seen = np.cumsum(self._n_seen_by) - self._n_seen_by
+
+    def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        from animat.cultures import tissue as living
+
+        start_ns, tissue = self._now_ns, self.tissue
+        end_ns = start_ns + round(duration_s * NS)
+        tissue_ns = round(tissue.now_s * NS)
+        pulses, stimulus_ns = [], []
+        for stimulus in admitted.stimuli:
+            stimulus_ns.append(round(stimulus.time_s * NS))
+            x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
+            half_um = MAXONE.pitch_um / 2
+            # The tissue may be up to a step ahead; a pulse in the middle of a step acts at its end anyway.
+            time_ns = max(start_ns + stimulus_ns[-1], tissue_ns)
+            pulses.append(living.Pulse(time_ns / NS, x_um + half_um, y_um + half_um, _strength(stimulus.pulse)))
+        # To the end of the step that the end lies in, so that every spike before the end is known.
+        target_ns = -(-end_ns // self._step_ns) * self._step_ns
+        if pulses and target_ns <= tissue_ns:
+            target_ns = tissue_ns + self._step_ns
+        if target_ns > tissue_ns:
+            spikes = tissue.advance((target_ns - tissue_ns) / NS, pulses)
+            time_ns_of = np.concatenate([self._held_ns, np.rint(spikes.time_s * NS).astype(np.int64)])
+            neuron = np.concatenate([self._held_neuron, spikes.neuron])
+        else:
+            time_ns_of, neuron = self._held_ns, self._held_neuron
+        known = int(np.searchsorted(time_ns_of, end_ns))
+        self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
+        self._now_ns = end_ns
+        return Observed(
+            start_s=(start_ns - self._zero_ns) / NS,
+            duration_s=(end_ns - start_ns) / NS,
+            spikes=self._on_channels((time_ns_of[:known] - start_ns) / NS, neuron[:known]),
+            stimulus_time_s=np.array(stimulus_ns, dtype=np.float64) / NS,
+        )
+
+    def _on_channels(self, time_s: Float64[np.ndarray, " spikes"], neuron: Int64[np.ndarray, " spikes"]) -> Spikes:
+        """Every spike once on each channel that sees its neuron."""
+        copies = self._n_seen_by[neuron]
+        place = np.arange(copies.sum()) - np.repeat(np.cumsum(copies) - copies, copies)
+        channel = self._seen_by[np.repeat(self._first_seen[neuron], copies) + place]
+        return Spikes(np.repeat(time_s, copies), channel)
+
+    def _rest(self, duration_s: float) -> None:
+        self._now_ns += round(duration_s * NS)
+        target_ns = -(-self._now_ns // self._step_ns) * self._step_ns
+        self.tissue.rest(max(0, target_ns - round(self.tissue.now_s * NS)) / NS)
+        held = self._held_ns >= self._now_ns
+        self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
+
+    def _halt(self) -> None:
+        # Delivery happens within a call, and the guard refuses the next one.
+        pass
+
+    def _close(self) -> None:
+        # The tissue lives on: a culture that is opened again is where it was.
+        pass
+
+
+def _strength(pulse: Pulse) -> float:
+    """Charge of the largest cathodic phase, in those of the published pulse."""
+    cathodic = max(-phase.charge for phase in pulse.phases)
+    return max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)

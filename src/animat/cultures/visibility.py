@@ -1,0 +1,127 @@
+"""How electrodes see the neurons of a virtual tissue: which, how large, and with what shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from animat.recordings.array import ElectrodeArray
+from animat.recordings.scan import ScannedActivity
+
+REACH_UM = 25.0
+"""An electrode sees every neuron within this distance, and none beyond."""
+HALF_UM = 15.0
+"""Spikes are half as large at this distance from the soma."""
+NOISE_UV = 2.4
+"""Root mean square of the chip's noise in 100-3000 Hz (unsure; see the reference page on the virtual culture)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Which electrode sees which neuron, in the order of electrodes, then neurons; arrays of shape (pairs,)."""
+
+    electrode: Int64[np.ndarray, " pairs"]
+    neuron: Int64[np.ndarray, " pairs"]
+    distance_um: Float64[np.ndarray, " pairs"]
+
+
+class Visibility:
+    """Spike shapes of neurons and how they fall off with distance d:
+
+        amplitude(d) = amplitude(0) / (1 + (d / 15 um)^2)   up to 25 um.
+
+    At the soma amplitudes are log-normal about 110 uV, between 60 and 300 uV, so that at 25 um the smallest is 16 uV,
+    above five standard deviations of the noise: within its reach an electrode misses no spike. Trough-to-peak times
+    are 0.45 +- 0.06 ms for excitatory and 0.25 +- 0.05 ms for inhibitory neurons, the recovery 0.45 +- 0.1 and
+    0.25 +- 0.06 ms: they overlap, as in life.
+
+    Args:
+        seed: decides the shapes.
+        array: the electrodes; its electrode 0 is half a pitch from the corner of the tissue.
+        x_um, y_um: of the neurons, from the tissue's corner.
+        is_excitatory: their types.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        array: ElectrodeArray,
+        x_um: Float64[np.ndarray, " neurons"],
+        y_um: Float64[np.ndarray, " neurons"],
+        is_excitatory: Bool[np.ndarray, " neurons"],
+    ) -> None:
+        rng = np.random.default_rng([seed, 11])
+        n = len(x_um)
+        self.array = array
+        self.amplitude_uv = np.clip(110.0 * rng.lognormal(0.0, 0.4, n), 60.0, 300.0)
+        draw = rng.standard_normal((2, n))
+        self.trough_to_peak_ms = np.clip(
+            np.where(is_excitatory, 0.45 + 0.06 * draw[0], 0.25 + 0.05 * draw[0]), 0.12, 0.8
+        )
+        self.recovery_ms = np.clip(np.where(is_excitatory, 0.45 + 0.1 * draw[1], 0.25 + 0.06 * draw[1]), 0.1, 0.9)
+        self._x_um, self._y_um = x_um, y_um
+        self.pairs = self._see()
+
+    def pairs_of(self, electrodes: Int64[np.ndarray, " electrodes"]) -> Pairs:
+        """The pairs of some electrodes, in their order; `electrode` becomes the row in the list given."""
+        first = np.searchsorted(self.pairs.electrode, electrodes, side="left")
+        counts = np.searchsorted(self.pairs.electrode, electrodes, side="right") - first
+        row = np.repeat(np.arange(len(electrodes)), counts)
+        pair = np.repeat(first, counts) + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return Pairs(row, self.pairs.neuron[pair], self.pairs.distance_um[pair])
+
+    def amplitude_at(
+        self, neuron: Int64[np.ndarray, " pairs"], distance_um: Float64[np.ndarray, " pairs"]
+    ) -> Float64[np.ndarray, " pairs"]:
+        """Size of a neuron's spike at a distance, uV."""
+        return np.asarray(self.amplitude_uv[neuron] / (1 + (distance_um / HALF_UM) ** 2))
+
+    def measure(
+        self,
+        electrodes: Int64[np.ndarray, " electrodes"],
+        spikes_of: Int64[np.ndarray, " neurons"],
+        duration_s: float,
+        rng: np.random.Generator,
+    ) -> ScannedActivity:
+        """What electrodes measure of the spikes that each neuron fired: means over spikes, blurred by the noise."""
+        pairs = self.pairs_of(electrodes)
+        rows = len(electrodes)
+        weight = spikes_of[pairs.neuron].astype(np.float64)
+        count = np.bincount(pairs.electrode, weight, rows)
+        amplitude_uv = self.amplitude_at(pairs.neuron, pairs.distance_um)
+
+        def mean(of: Float64[np.ndarray, " pairs"]) -> Float64[np.ndarray, " electrodes"]:
+            total = np.bincount(pairs.electrode, weight * of, rows)
+            return np.asarray(np.divide(total, count, out=np.full(rows, np.nan), where=count > 0))
+
+        blur = rng.standard_normal((3, rows)) / np.sqrt(np.maximum(count, 1))
+        size_uv = mean(amplitude_uv)
+        # A time is read off a waveform the worse, the smaller that is.
+        jitter_ms = 0.5 * NOISE_UV / size_uv
+        return ScannedActivity(
+            electrode=electrodes,
+            rate_hz=count / duration_s,
+            amplitude_uv=size_uv + NOISE_UV * blur[0],
+            noise_uv=np.full(rows, NOISE_UV),
+            trough_to_peak_ms=mean(self.trough_to_peak_ms[pairs.neuron]) + jitter_ms * blur[1],
+            recovery_ms=mean(self.recovery_ms[pairs.neuron]) + jitter_ms * blur[2],
+        )
+
+    def _see(self) -> Pairs:
+        pitch_um = self.array.pitch_um
+        # Positions relative to electrode 0.
+        x_um, y_um = self._x_um - pitch_um / 2, self._y_um - pitch_um / 2
+        reach = int(np.ceil(REACH_UM / pitch_um))
+        steps = np.arange(-reach, reach + 1)
+        column = np.rint(x_um / pitch_um).astype(np.int64)[:, None, None] + steps[None, :, None]
+        row = np.rint(y_um / pitch_um).astype(np.int64)[:, None, None] + steps[None, None, :]
+        column, row = np.broadcast_arrays(column, row)
+        distance_um = np.hypot(column * pitch_um - x_um[:, None, None], row * pitch_um - y_um[:, None, None])
+        seen = (distance_um <= REACH_UM) & (column >= 0) & (column < self.array.columns)
+        seen &= (row >= 0) & (row < self.array.rows)
+        electrode = (row * self.array.columns + column)[seen]
+        neuron = np.nonzero(seen)[0]
+        order = np.lexsort((neuron, electrode))
+        return Pairs(electrode[order], neuron[order], distance_um[seen][order])
