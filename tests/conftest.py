@@ -7,6 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from animat.compilation import keep_compilations
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compilations_kept() -> None:
+    """Compile each program once a machine, not once a run of the tests."""
+    keep_compilations()
+
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:

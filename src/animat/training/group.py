@@ -126,7 +126,8 @@ def _read_checkpoint(
     like = like._replace(key=jax.random.key_data(like.key))
     leaves, structure = jax.tree.flatten(like)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here, as numpy leaves a file open that it cannot read.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             if str(file["fingerprint"]) != fingerprint:
                 raise InvalidFile(f"{path}: expected a checkpoint of this training, got one of another; remove it")
             read = [jnp.asarray(file[f"leaf{i}"]) for i in range(len(leaves))]

@@ -123,6 +123,7 @@ class Policy:
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"layer{i}.weight": weight, f"layer{i}.bias": bias}
         described = {
+            "format": FORMAT,
             "robot": robot_to_dict(self.robot),
             "mapping": None if self.mapping is None else self.mapping.name,
             "conditions": [asdict(condition) for condition in self.conditions],
@@ -131,7 +132,8 @@ class Policy:
             "presentation": None if self.presentation is None else asdict(self.presentation),
             "provenance": dict(self.provenance),
         }
-        metadata = {"format": FORMAT, "animat": json.dumps(described, sort_keys=True)}
+        # One entry only: safetensors writes several in random order, and a policy's file has one form.
+        metadata = {"animat": json.dumps(described, sort_keys=True)}
         data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
         with written_whole(path) as beside:
             beside.write_bytes(data)
@@ -156,10 +158,12 @@ class Policy:
             raise InvalidFile(
                 f"{path}: expected a policy (safetensors), got a file that cannot be read: {error}"
             ) from error
-        if metadata.get("format") != FORMAT:
-            raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {metadata.get('format', 'none')!r}")
+        if "animat" not in metadata:
+            raise InvalidFile(f"{path}: expected a policy of animat, got a safetensors file of other origin")
         try:
             described = json.loads(metadata["animat"])
+            if described["format"] != FORMAT:
+                raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {described['format']!r}")
             layers = range(sum(name.endswith(".weight") for name in arrays))
             return Policy(
                 weights=tuple(arrays[f"layer{i}.weight"] for i in layers),

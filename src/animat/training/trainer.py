@@ -181,6 +181,7 @@ def _run(groups: list[Group], folder: Path, workers: int | None, progress: Progr
                     progress.update(sum(done.values()), total, "" if math.isnan(mean) else f"return {mean:.1f}")
                     continue
                 selector.unregister(process.stdout)
+                process.stdout.close()
                 del running[key.data]
                 free.append(key.data)
                 if process.wait() != 0:
@@ -192,6 +193,9 @@ def _run(groups: list[Group], folder: Path, workers: int | None, progress: Progr
         for process, _ in running.values():
             process.kill()
             process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+        selector.close()
 
 
 def _start(group: Group, folder: Path, core: int) -> subprocess.Popen[bytes]:

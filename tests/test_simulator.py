@@ -1,0 +1,206 @@
+"""Neuron simulators against closed forms, numpy and scipy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.neurons.conditions import Condition
+from animat.neurons.fidelity import fidelity
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import fit_empirical, fit_histogram, histogram_range_hz, silenced
+from animat.neurons.timeline import fit_timeline
+from animat.recordings.protocol import Presentation
+
+FREQUENCIES = (5.0, 10.0, 20.0, 40.0, 80.0)
+
+
+def responses_of(
+    *values_hz: list[float] | np.ndarray, bursts_hz: tuple[float, ...] = (), start_min: float = 0.0, **changes: object
+) -> Responses:
+    """Responses with these values for each condition, and bursts of condition 0 beside them."""
+    x = np.concatenate([np.asarray(v, float) for v in values_hz] + [np.asarray(bursts_hz, float)])
+    condition = np.concatenate(
+        [np.full(len(v), i) for i, v in enumerate(values_hz)] + [np.zeros(len(bursts_hz), int)]
+    ).astype(int)
+    is_burst = np.arange(len(x)) >= len(x) - len(bursts_hz)
+    told = {
+        "condition": condition,
+        "rate_hz": x,
+        "active_ratio": np.where(is_burst, 0.9, 0.1),
+        "is_burst": is_burst,
+        "conditions": tuple(Condition(f"{f:g} Hz", f, "Hz") for f in FREQUENCIES[: len(values_hz)]),
+        "window_ms": (2.0, 10.0),
+        "n_channels": 100,
+        "threshold": 0.5,
+        "separability": 0.9,
+        "presentation": Presentation("blocked"),
+        "start_min": start_min,
+    }
+    return Responses(**(told | changes))
+
+
+def draw(simulator: object, condition: int, n: int = 20_000, seed: int = 0) -> np.ndarray:
+    keys = jax.random.split(jax.random.key(seed), n)
+    return np.asarray(jax.jit(jax.vmap(lambda key: simulator.sample(key, jnp.int32(condition))))(keys))  # type: ignore[attr-defined]
+
+
+def test_a_histogram_draws_a_bin_then_uniformly_inside_it() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.gamma(6.0, 5.0, (5, 200))
+    responses = responses_of(*values)
+    simulator = fit_histogram(responses, bins=20, range_hz=120.0)
+    edges = np.linspace(0, 120, 21)
+    for i, x in enumerate(values):
+        # scipy's own histogram distribution is the independent implementation.
+        known = stats.rv_histogram(np.histogram(x, edges), density=False)
+        q = np.linspace(0.001, 0.999, 500)
+        ours = jax.vmap(simulator.quantile, (None, 0))(jnp.int32(i), jnp.asarray(q))
+        np.testing.assert_allclose(known.cdf(np.asarray(ours)), q, atol=2e-5)
+        assert stats.kstest(draw(simulator, i), known.cdf).pvalue > 1e-4
+
+
+def test_the_range_is_the_largest_non_burst_response_rounded_up_to_ten() -> None:
+    assert histogram_range_hz(responses_of([3.0, 57.1], [12.0], bursts_hz=(300.0,))) == 60.0
+    assert histogram_range_hz(responses_of([3.0, 60.0])) == 60.0
+    assert histogram_range_hz(responses_of([0.0, 0.0])) == 10.0
+
+
+def test_percentiles_pool_the_non_burst_responses_of_all_conditions() -> None:
+    a, b = np.arange(0.0, 50.0), np.arange(50.0, 101.0)
+    simulator = fit_histogram(responses_of(a, b, bursts_hz=(500.0,)))
+    np.testing.assert_allclose(simulator.percentiles, np.arange(0.0, 101.0, 10.0), atol=1e-5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    values=st.lists(
+        st.lists(st.floats(0, 200, allow_nan=False, width=32), min_size=1, max_size=30), min_size=1, max_size=5
+    ),
+    uniform=st.floats(0, 1, exclude_max=True, width=32),
+    bins=st.integers(1, 40),
+)
+def test_every_draw_lies_in_a_bin_that_holds_a_response(values: list[list[float]], uniform: float, bins: int) -> None:
+    responses = responses_of(*values)
+    simulator = fit_histogram(responses, bins=bins)
+    edges = np.asarray(simulator.edges_hz, float)
+    for i, x in enumerate(values):
+        drawn = float(simulator.quantile(jnp.int32(i), jnp.float32(uniform)))
+        slack = 1e-4 * edges[-1]
+        filled = np.histogram(x, edges)[0] > 0
+        assert any(edges[b] - slack <= drawn <= edges[b + 1] + slack for b in np.flatnonzero(filled))
+        empirical = fit_empirical(responses)
+        assert float(empirical.quantile(jnp.int32(i), jnp.float32(uniform))) in np.asarray(x, np.float32)
+
+
+def test_the_empirical_simulator_draws_each_value_equally_often() -> None:
+    values = [1.0, 2.0, 2.0, 7.0]
+    simulator = fit_empirical(responses_of(values, [5.0]), room=9)
+    drawn = draw(simulator, 0)
+    counts = [np.count_nonzero(drawn == v) for v in (1.0, 2.0, 7.0)]
+    assert stats.chisquare(counts, [5_000, 10_000, 5_000]).pvalue > 1e-4
+    assert set(draw(simulator, 1, 100)) == {5.0}
+
+
+def test_the_largest_uniform_draws_the_last_value() -> None:
+    last = jnp.float32(np.nextafter(np.float32(1), np.float32(0)))
+    values = np.arange(1.0, 4097.0)
+    assert float(fit_empirical(responses_of(values)).quantile(jnp.int32(0), last)) == 4096.0
+    assert float(fit_histogram(responses_of(values), bins=7).quantile(jnp.int32(0), last)) <= 4100.0
+
+
+def test_responses_above_the_range_count_into_the_last_bin_and_are_reported() -> None:
+    responses = responses_of([10.0] * 90 + [130.0] * 10)
+    simulator = fit_histogram(responses, bins=20, range_hz=120.0)
+    assert np.mean(draw(simulator, 0) >= 114.0) == pytest.approx(0.10, abs=0.01)
+    kept = fidelity(responses, simulator)
+    assert kept.n_above_range == 10
+    found = {f.name: f for f in kept.findings()}
+    assert found["above-range"].value == 10
+
+
+def test_fidelity_is_what_binning_makes_of_the_share_above_the_median() -> None:
+    # All responses share one 6 Hz bin; condition 1 always passes the pooled median, condition 0 never.
+    responses = responses_of([30.5] * 50, [31.5] * 51)
+    simulator = fit_histogram(responses, bins=20, range_hz=120.0)
+    kept = fidelity(responses, simulator)
+    np.testing.assert_allclose(kept.in_data, [0.0, 1.0])
+    # Within the bin from 30 to 36, P(x >= 31.5) = 4.5 / 6 for both.
+    np.testing.assert_allclose(kept.in_simulator, [0.75, 0.75], atol=1e-3)
+    assert [f.name for f in kept.findings()] == ["binning"]
+    assert not fidelity(responses, fit_empirical(responses)).findings()
+
+
+def test_silence_answers_zero_and_keeps_the_percentiles() -> None:
+    simulator = fit_histogram(responses_of([10.0, 20.0], [30.0]))
+    silent = silenced(simulator)
+    assert silent.n_conditions == 2
+    assert not draw(silent, 1, 100).any()
+    np.testing.assert_array_equal(silent.percentiles, simulator.percentiles)
+
+
+def test_a_timeline_answers_with_the_newest_recording() -> None:
+    series = [responses_of([m + 1.0] * 9, [m + 2.0] * 9, start_min=m) for m in (20.0, 0.0, 10.0)]
+    timeline = fit_timeline(series, kind="empirical")
+    assert [timeline.row_at(m) for m in (-5.0, 0.0, 9.99, 10.0, 19.0, 20.0, 1000.0)] == [0, 0, 0, 1, 1, 2, 2]
+    assert float(timeline.at(15.0).quantile(jnp.int32(1), jnp.float32(0.5))) == 12.0
+    held = timeline.with_first_percentiles()
+    np.testing.assert_array_equal(held.at(25.0).percentiles, timeline.at(0.0).percentiles)
+    assert float(held.at(25.0).quantile(jnp.int32(0), jnp.float32(0.5))) == 21.0
+
+
+def test_a_timeline_keeps_the_first_recordings_range() -> None:
+    timeline = fit_timeline([responses_of([55.0] * 9, start_min=0.0), responses_of([155.0] * 9, start_min=10.0)])
+    assert float(timeline.at(10.0).edges_hz[-1]) == 60.0
+    above = [f.sentence for f in timeline.findings if f.name == "above-range"]
+    assert len(above) == 1
+    assert above[0].startswith("at 10 min: 9 responses")
+
+
+def test_a_refreshed_simulator_recompiles_nothing() -> None:
+    timeline = fit_timeline([responses_of([m + 1.0] * 9, start_min=m) for m in (0.0, 10.0)])
+    traced = []
+
+    @jax.jit
+    def answer(simulator: object) -> jax.Array:
+        traced.append(1)
+        return simulator.quantile(jnp.int32(0), jnp.float32(0.5))  # type: ignore[attr-defined, no-any-return]
+
+    assert float(answer(timeline.at(0.0))) != float(answer(timeline.at(10.0)))
+    assert len(traced) == 1
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: fit_histogram(responses_of([1.0], []), bins=3), UnusableData, "10 Hz"),
+        (lambda: fit_histogram(responses_of([1.0]), bins=0), InvalidArgument, "bins"),
+        (lambda: fit_histogram(responses_of([1.0]), range_hz=-1.0), InvalidArgument, "range_hz"),
+        (lambda: fit_histogram(responses_of([1.0]), range_hz=float("nan")), InvalidArgument, "range_hz"),
+        (lambda: fit_empirical(responses_of([1.0, 2.0]), room=1), InvalidArgument, "room"),
+        (lambda: fit_timeline([]), InvalidArgument, "series"),
+        (lambda: fit_timeline([responses_of([1.0])], kind="gamma"), InvalidArgument, "kind"),  # type: ignore[arg-type]
+        (lambda: fit_timeline([responses_of([1.0]), responses_of([1.0])]), Mismatch, "start_min"),
+        (
+            lambda: fit_timeline([responses_of([1.0]), responses_of([1.0], [2.0], start_min=10.0)]),
+            Mismatch,
+            "conditions",
+        ),
+        (
+            lambda: fit_timeline(
+                [responses_of([1.0]), responses_of([1.0], start_min=10.0, presentation=Presentation("mixed", 5))]
+            ),
+            Mismatch,
+            "presentation",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(call: object, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        call()  # type: ignore[operator]

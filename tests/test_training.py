@@ -1,0 +1,253 @@
+"""Training as a user meets it: the same bits whatever happens, shadowing, baselines, folders that are not mixed up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.mapping import Thresholds
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.robots import Cartpole, Navigation
+from animat.training.group import Group, split_groups, train_group
+from animat.training.policy import Policy
+from animat.training.sac import SAC
+from animat.training.specification import CHUNKS, Training
+from animat.training.trainer import describe, train
+from test_simulator import responses_of
+
+SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
+SHORT = Training(Cartpole(), Thresholds(1), policies=3, iterations=6_000, algorithm=SMALL)
+
+
+def timeline_of(minutes: tuple[float, ...] = (0.0, 10.0, 20.0), seed: int = 0) -> SimulatorTimeline:
+    rng = np.random.default_rng(seed)
+    return fit_timeline(
+        [responses_of(*(rng.gamma(6.0, m / 6.0, 60) for m in (30, 40, 55)), start_min=minute) for minute in minutes]
+    )
+
+
+def bits(folder: Path) -> dict[str, bytes]:
+    """The policies' files, byte for byte."""
+    return {file.name: file.read_bytes() for file in sorted(folder.glob("*.safetensors"))}
+
+
+class Kept:
+    """A progress that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[float, float]] = []
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        self.told.append((done, total))
+
+
+def test_the_same_seed_gives_the_same_bits_with_any_number_of_workers(tmp_path: Path) -> None:
+    seven = replace(SHORT, policies=7, iterations=2_000)
+    progress = Kept()
+    train(seven, timeline_of(), tmp_path / "one", workers=1, progress=progress)
+    train(seven, timeline_of(), tmp_path / "two", workers=2)
+    assert list(bits(tmp_path / "one")) == [f"p{i}.safetensors" for i in range(7)]
+    assert bits(tmp_path / "one") == bits(tmp_path / "two")
+    assert progress.told[-1] == (7 * CHUNKS, 7 * CHUNKS)
+    assert not (tmp_path / "one" / ".unfinished").exists()
+
+
+def test_policies_differ_from_each_other_and_from_those_of_another_seed(tmp_path: Path) -> None:
+    weights = [
+        policy.weights[0].tobytes()
+        for seed in (1, 2)
+        for policy in train(replace(SHORT, iterations=500, seed=seed), timeline_of(), tmp_path / str(seed)).values()
+    ]
+    assert len(set(weights)) == 6
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from test_training import SHORT, timeline_of
+from animat.training.trainer import train
+train(SHORT, timeline_of(), Path(sys.argv[1]))
+"""
+
+
+def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_path: Path) -> None:
+    train(SHORT, timeline_of(), tmp_path / "undisturbed")
+    folder = tmp_path / "killed"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    checkpoint = folder / ".unfinished" / "from-p0.npz"
+    seen = set()
+    for _ in range(2):
+        process = subprocess.Popen([sys.executable, "-c", KILLED, str(folder)], env=environment, start_new_session=True)
+        # Killed while chunks are being finished: once another one is on disk than at the last start.
+        while process.poll() is None:
+            if checkpoint.exists() and (stamp := checkpoint.stat().st_mtime_ns) not in seen:
+                seen.add(stamp)
+                break
+            time.sleep(0.005)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        time.sleep(0.2)
+    assert len(seen) == 2, "it was over before it could be killed twice"
+    assert not bits(folder)
+    train(SHORT, timeline_of(), folder)
+    assert bits(folder) == bits(tmp_path / "undisturbed")
+
+
+def test_a_finished_folder_is_read_and_not_trained_again(tmp_path: Path) -> None:
+    train(replace(SHORT, iterations=1_000), timeline_of(), tmp_path)
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
+    progress = Kept()
+    policies = train(replace(SHORT, iterations=1_000), timeline_of(), tmp_path, progress=progress)
+    assert list(policies) == ["p0", "p1", "p2"]
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.iterdir()} == before
+    assert not progress.told
+
+
+def test_a_folder_of_another_training_is_refused_and_left_alone(tmp_path: Path) -> None:
+    short = replace(SHORT, iterations=1_000, policies=1)
+    train(short, timeline_of(), tmp_path)
+    before = bits(tmp_path)
+    with pytest.raises(Mismatch, match=r"training.seed: 1 there, 9 now"):
+        train(replace(short, seed=9), timeline_of(), tmp_path)
+    with pytest.raises(Mismatch, match="other responses"):
+        train(short, timeline_of(seed=1), tmp_path)
+    assert bits(tmp_path) == before
+    (tmp_path / "training.json").unlink()
+    with pytest.raises(Mismatch, match=r"without a training\.json"):
+        train(short, timeline_of(), tmp_path)
+
+
+def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    timeline = timeline_of()
+    group = Group(SHORT, (0,), timeline, describe(SHORT, timeline)["fingerprint"], {})
+    checkpoint = tmp_path / "c.npz"
+
+    class Stop(Exception):
+        pass
+
+    def stop(done: int, mean_return: float) -> None:
+        raise Stop
+
+    with pytest.raises(Stop):
+        train_group(group, checkpoint, stop)
+    with pytest.raises(InvalidFile, match="of another"):
+        train_group(replace(group, fingerprint="other"), checkpoint, stop)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
+    with pytest.raises(InvalidFile, match="cannot be read"):
+        train_group(group, checkpoint, stop)
+
+
+def weights_after(training: Training, timeline: SimulatorTimeline, checkpoint: Path) -> bytes:
+    """The first layer of the first policy, trained in this process."""
+    group = Group(training, (0,), timeline, "any", {})
+    policy = train_group(group, checkpoint, lambda done, mean_return: None)[0]
+    checkpoint.unlink()
+    return policy.weights[0].tobytes()
+
+
+def test_shadowing_uses_the_newest_simulator_of_each_minute(tmp_path: Path) -> None:
+    """Recordings after the last minute that training stands for change nothing; earlier ones do, unless held off."""
+    short = replace(SHORT, iterations=1_000, duration_min=30.0)
+    weights = {
+        (minutes, shadowing): weights_after(
+            replace(short, shadowing=shadowing), timeline_of(minutes), tmp_path / "checkpoint"
+        )
+        for minutes in ((0.0,), (0.0, 10.0), (0.0, 10.0, 40.0))
+        for shadowing in (True, False)
+    }
+    shadowed, held = ({m: w for (m, shadowing), w in weights.items() if shadowing is s} for s in (True, False))
+    assert shadowed[0.0, 10.0] == shadowed[0.0, 10.0, 40.0] != shadowed[0.0,]
+    assert set(held.values()) == {shadowed[0.0,]}
+
+
+def test_held_percentiles_train_another_policy(tmp_path: Path) -> None:
+    moving = weights_after(SHORT, timeline_of(), tmp_path / "checkpoint")
+    assert weights_after(replace(SHORT, percentiles="first"), timeline_of(), tmp_path / "checkpoint") != moving
+
+
+@pytest.mark.parametrize(
+    ("robot", "commands", "better_than"), [(Cartpole(), (-1.0, 1.0), 100.0), (Navigation(), None, 20.0)]
+)
+def test_baselines_without_neurons_learn_their_task(
+    robot: Cartpole | Navigation, commands: tuple[float, ...] | None, better_than: float, tmp_path: Path
+) -> None:
+    # Perfect is 120 on the cartpole; a straight run in navigation gives about 25.
+    training = Training(robot, None, policies=2, iterations=60_000, commands=commands)
+    policies = train(training, None, tmp_path)
+    assert max(p.learning_curve[-5:, 2].mean() for p in policies.values()) > better_than
+    assert policies["p0"].n_actions == (None if commands is None else 2)
+    assert policies["p0"].mapping is None
+
+
+def test_a_learning_curve_counts_what_was_done(tmp_path: Path) -> None:
+    curve = train(SHORT, timeline_of(), tmp_path)["p1"].learning_curve
+    assert curve.shape == (CHUNKS, 3)
+    # 6,000 iterations in rounds of 8 are 750 rounds, hence exact.
+    assert curve[-1, 0] == 6_000
+    assert np.all(np.diff(curve[:, 0]) >= 0)
+    # No cartpole episode is longer than 120 iterations, and none that fails is shorter than 5.
+    assert 6_000 / 120 <= curve[:, 1].sum() <= 6_000 / 5
+
+
+def test_groups_are_even_and_depend_on_the_number_of_policies_only() -> None:
+    for n in range(1, 40):
+        groups = split_groups(n)
+        assert [i for group in groups for i in group] == list(range(n))
+        assert max(map(len, groups)) <= 5
+        assert max(map(len, groups)) - min(map(len, groups)) <= 1
+
+
+def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:
+    short = replace(SHORT, iterations=1_000, policies=1)
+    # A file where the folder of checkpoints should be.
+    (tmp_path / ".unfinished").write_text("in the way")
+    with pytest.raises(InvalidFile, match="cannot be written"):
+        train(short, timeline_of(), tmp_path)
+    assert not bits(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"policies": 0}, "policies"),
+        ({"iterations": 0}, "iterations"),
+        ({"seed": -1}, "seed"),
+        ({"duration_min": 0.0}, "duration_min"),
+        ({"duration_min": float("nan")}, "duration_min"),
+        ({"percentiles": "last"}, "percentiles"),
+        ({"delivery": "lost"}, "delivery"),
+    ],
+)
+def test_settings_without_meaning_are_refused_by_name(change: dict[str, object], words: str) -> None:
+    with pytest.raises(InvalidArgument, match=words):
+        replace(SHORT, **change)
+
+
+def test_neurons_and_mapping_come_together(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match="timeline"):
+        train(SHORT, None, tmp_path)
+    with pytest.raises(InvalidArgument, match="timeline"):
+        train(replace(SHORT, mapping=None), timeline_of(), tmp_path)
+    with pytest.raises(InvalidArgument, match="workers"):
+        train(SHORT, timeline_of(), tmp_path, workers=0)
+
+
+def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
+    timeline = timeline_of()
+    train(replace(SHORT, iterations=1_000, policies=1), timeline, tmp_path, sources=["mine.nwb"])
+    policy = Policy.load(tmp_path / "p0.safetensors")
+    assert policy.conditions == timeline.conditions
+    assert policy.presentation == timeline.presentation
+    assert policy.robot == Cartpole()
+    assert policy.provenance["training"]["seed"] == 1
+    assert policy.provenance["versions"]["jax"] == jax.__version__
