@@ -1,0 +1,198 @@
+"""Episodes and controls against closed forms and a plain loop."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.animat import Animat, WithoutNeurons
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
+from animat.evaluation.table import evaluate
+from animat.mapping import Linear, Thresholds
+from animat.neurons.made_up import made_up_simulator
+from animat.neurons.simulator import silenced
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.robots import Cartpole, Navigation
+from animat.robots.base import Robot
+from animat.training.policy import Policy
+from test_simulator import responses_of
+from test_training import timeline_of
+
+
+def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int = 0) -> Policy:  # type: ignore[type-arg]  # noqa: B008
+    """A policy with random weights."""
+    rng = np.random.default_rng(seed)
+    sizes = (len(robot.quantities), 16, 16, len(timeline.conditions))
+    return Policy(
+        weights=tuple(rng.normal(0, 1, size).astype(np.float32) for size in itertools.pairwise(sizes)),
+        biases=tuple(rng.normal(0, 1, size).astype(np.float32) for size in sizes[1:]),
+        scales=np.array([quantity.scale for quantity in robot.quantities], np.float32),
+        robot=robot,
+        mapping=Thresholds(1),
+        conditions=timeline.conditions,
+        window_ms=timeline.window_ms,
+        presentation=timeline.presentation,
+    )
+
+
+def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
+    simulator = silenced(made_up_simulator())
+    episodes = roll_out(
+        Animat(Cartpole(force_noise=0.0), Thresholds(1), 5), simulator, Uniform(), 1, episodes=5, seed=0
+    )
+    # By hand: u = -1 always. The same equations stepped in numpy until 12 degrees.
+    x = np.zeros(4)
+    n = 0
+    while abs(x[2]) <= np.radians(12):
+        m, mass, half = 0.055, 0.365, 0.2
+        tmp = (-1.0 + m * half * x[3] ** 2 * np.sin(x[2])) / mass
+        angular = (9.8 * np.sin(x[2]) - np.cos(x[2]) * tmp) / (half * (4 / 3 - m * np.cos(x[2]) ** 2 / mass))
+        x = x + 0.02 * np.array([x[1], tmp - m * half * angular * np.cos(x[2]) / mass, x[3], angular])
+        n += 1
+    assert np.all(episodes.lengths == n)
+    assert np.all(episodes.returns == n - 1 - 100)
+    assert np.all(episodes.terminated)
+
+
+def test_truncated_episodes_count_to_the_limit_and_are_not_terminated() -> None:
+    episodes = roll_out(
+        Animat(Navigation(episode_limit=20), Linear(), 5), made_up_simulator(), Uniform(), 3, episodes=7, seed=0
+    )
+    assert np.all(episodes.lengths == 20)
+    assert not episodes.terminated.any()
+    assert episodes.returns.shape == (3, 7)
+
+
+def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
+    """In distribution: the mean return of a thousand episodes, stepped one by one with other random numbers."""
+    timeline = timeline_of()
+    policy = policy_of(timeline)
+    simulator = timeline.at(0.0)
+    environment = Animat(policy.robot, policy.mapping, 3)
+    many = roll_out(environment, simulator, networks_of([policy]), 1, episodes=2_000, seed=0).returns[0]
+
+    step = jax.jit(environment.step)
+    rng = np.random.default_rng(0)
+    returns = []
+    for episode in range(100):
+        state, total, key = environment.reset(jax.random.key(0)), 0.0, jax.random.key(1000 + episode)
+        while True:
+            key, use = jax.random.split(key)
+            action = policy.act(np.asarray(environment.observe(state)), rng)
+            outcome = step(use, state, jnp.int32(action), simulator)
+            state, total = outcome.state, total + float(outcome.reward)
+            if outcome.terminated or outcome.truncated:
+                break
+        returns.append(total)
+    error = np.hypot(many.std() / np.sqrt(len(many)), np.std(returns, ddof=1) / np.sqrt(len(returns)))
+    assert abs(many.mean() - np.mean(returns)) < 4 * error
+
+
+def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> None:
+    timeline = timeline_of()
+    policy = policy_of(timeline)
+    environment = Animat(policy.robot, policy.mapping, 3)
+
+    def run(seed: int) -> np.ndarray:
+        return roll_out(environment, timeline.at(0.0), networks_of([policy] * 2), 2, episodes=50, seed=seed).returns
+
+    assert np.array_equal(run(3), run(3))
+    assert not np.array_equal(run(3), run(4))
+    assert not np.array_equal(run(3)[0], run(3)[1])
+
+
+def test_a_constant_actor_is_the_condition_itself() -> None:
+    # Condition 0 always answers low, condition 1 always high: u = -1 or +1 throughout, the mirror of each other.
+    timeline = fit_timeline([responses_of([10.0] * 9, [50.0] * 9)], kind="empirical")
+    environment = Animat(Cartpole(force_noise=0.0), Thresholds(1), 2)
+    both = roll_out(environment, timeline.at(0.0), Constant(jnp.array([0, 1])), 2, episodes=3, seed=0)
+    assert np.array_equal(both.returns[0], both.returns[1])
+    assert len(np.unique(both.returns)) == 1
+
+
+def test_greedy_takes_the_most_probable_action() -> None:
+    timeline = timeline_of()
+    policy = policy_of(timeline)
+    network = networks_of([policy], greedy=True)
+    observations = np.random.default_rng(0).normal(0, 0.3, (64, 4)).astype(np.float32)
+    environment = Animat(policy.robot, policy.mapping, 3)
+    single = jax.tree.map(lambda leaf: leaf[0], network)
+    actions = single.act(environment, observations / environment.scales, jnp.zeros(64))
+    assert actions.tolist() == [policy.act_greedily(o) for o in observations]
+
+
+def test_the_table_has_every_control_beside_the_policies() -> None:
+    timeline = timeline_of()
+    policies = {"a": policy_of(timeline, seed=1), "b": policy_of(timeline, seed=2)}
+    evaluation = evaluate(policies, timeline, at_min=14.0, episodes=20)
+    assert [row.name for row in evaluation.rows] == [
+        "policies",
+        "random",
+        "constant 5 Hz",
+        "constant 10 Hz",
+        "constant 20 Hz",
+        "silent",
+        "shuffled",
+    ]
+    assert evaluation.recorded_at_min == 10.0
+    told = evaluation.to_dict()
+    assert told["policies"] == {"a": told["rows"][0]["mean_returns"][0], "b": told["rows"][0]["mean_returns"][1]}
+    for row in evaluation.rows:
+        assert row.name in evaluation.to_text()
+
+
+def test_shuffling_makes_every_policy_a_random_one() -> None:
+    timeline = timeline_of()
+    evaluation = evaluate({"a": policy_of(timeline)}, timeline, episodes=3_000)
+    rows = {row.name: row.episodes.returns[0] for row in evaluation.rows}
+    error = np.hypot(*(rows[name].std() / np.sqrt(3_000) for name in ("random", "shuffled")))
+    assert abs(rows["random"].mean() - rows["shuffled"].mean()) < 4 * error
+
+
+def test_without_neurons_there_is_nothing_to_silence() -> None:
+    policy = Policy(
+        weights=(np.zeros((4, 8), np.float32), np.zeros((8, 8), np.float32), np.zeros((8, 2), np.float32)),
+        biases=(np.zeros(8, np.float32), np.zeros(8, np.float32), np.zeros(2, np.float32)),
+        scales=np.ones(4, np.float32),
+        robot=Cartpole(),
+        mapping=None,
+        commands=(-1.0, 1.0),
+    )
+    evaluation = evaluate({"p0": policy}, None, episodes=4)
+    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1"]
+    assert isinstance(WithoutNeurons(Cartpole(), (-1.0, 1.0)).n_actions, int)
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    timeline = timeline_of()
+    policy = policy_of(timeline)
+    with pytest.raises(InvalidArgument, match="policies"):
+        evaluate({}, timeline)
+    with pytest.raises(InvalidArgument, match="episodes"):
+        evaluate({"a": policy}, timeline, episodes=0)
+    with pytest.raises(InvalidArgument, match="timeline"):
+        evaluate({"a": policy}, None)
+    with pytest.raises(Mismatch, match="robot: expected cartpole"):
+        evaluate({"a": policy}, timeline, robot=Navigation())
+    with pytest.raises(Mismatch, match="b: expected the same robot as a"):
+        evaluate({"a": policy, "b": policy_of(timeline, Cartpole(pole_mass_kg=0.55))}, timeline)
+    with pytest.raises(Mismatch, match="conditions: expected 5 Hz, 10 Hz, 20 Hz"):
+        evaluate({"a": policy}, fit_timeline([responses_of([1.0, 2.0], [3.0, 4.0])]))
+
+
+def test_another_presentation_or_window_is_said() -> None:
+    timeline = timeline_of()
+    other = fit_timeline(
+        [
+            responses_of(
+                *([m, m + 1.0, m + 2.0] for m in (10.0, 20.0, 30.0)), presentation=None, window_ms=(2.0, 20.0)
+            ),
+        ]
+    )
+    evaluation = evaluate({"a": policy_of(timeline)}, other, episodes=2)
+    assert [finding.name for finding in evaluation.findings] == ["other-window", "other-presentation"]

@@ -1,0 +1,80 @@
+"""Imports follow the story and never run back; what is heavy is imported late."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "src" / "animat"
+
+EVERYWHERE = {"errors", "writing", "progress", "compilation"}
+"""What stands under the story and may be used by all of it."""
+
+MAY_IMPORT = {
+    "errors": set(),
+    "writing": {"errors"},
+    "progress": set(),
+    "compilation": set(),
+    "recordings": set(),
+    "neurons": {"recordings"},
+    "robots": set(),
+    "mapping": set(),
+    "animat": {"neurons", "mapping", "robots"},
+    "training": {"animat", "neurons", "mapping", "robots", "recordings"},
+    "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
+    "cultures": {"recordings"},
+    "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
+    "gym": {"animat", "neurons", "mapping", "robots", "recordings", "report"},
+    "__init__": {"gym"},
+}
+"""Each room, and the rooms before it in the story that it may look into; `cli` may look into all."""
+
+
+def imports_of(file: Path) -> set[str]:
+    """Rooms of animat that a file imports, at its top or late."""
+    rooms = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            parts = [node.module]
+        elif isinstance(node, ast.Import):
+            parts = [alias.name for alias in node.names]
+        else:
+            continue
+        rooms |= {name.split(".")[1] for name in parts if name.startswith("animat.")}
+    return rooms
+
+
+@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_no_import_runs_back_up_the_story(file: Path) -> None:
+    room = file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    if room in ("cli", "__main__"):
+        return
+    assert imports_of(file) <= MAY_IMPORT[room] | EVERYWHERE | {room}
+
+
+def modules_after(statement: str) -> set[str]:
+    code = f"import sys; {statement}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(ran.stdout.splitlines()[-1].split())
+
+
+HEAVY = {"jax", "jaxlib", "scipy", "matplotlib", "pynwb", "hdmf", "h5py", "numba", "pandas", "optax"}
+
+
+def test_importing_animat_imports_nothing_heavy() -> None:
+    assert not modules_after("import animat") & HEAVY
+
+
+def test_reading_the_command_line_imports_nothing_heavy() -> None:
+    help_ = "import contextlib, io, animat.cli as c\nwith contextlib.suppress(SystemExit), "
+    help_ += "contextlib.redirect_stdout(io.StringIO()): c.main(['train', '--help'])\n"
+    code = f"exec({help_!r})"
+    assert not modules_after(code) & HEAVY
+
+
+def test_loading_a_policy_needs_no_jax() -> None:
+    assert "jax" not in modules_after("import animat.training.policy")
