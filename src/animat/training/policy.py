@@ -70,6 +70,14 @@ class Policy:
             raise InvalidArgument(f"scales: expected one for each of {widths[0]} observations, got {self.scales.shape}")
         if not all(np.all(np.isfinite(array)) for array in (*self.weights, *self.biases, self.scales)):
             raise InvalidArgument("weights: expected finite numbers, got NaN or infinite ones")
+        if not np.all(self.scales > 0):
+            raise InvalidArgument(f"scales: expected positive numbers, got {self.scales.tolist()}")
+        if self.window_ms is not None and not (len(self.window_ms) == 2 and self.window_ms[0] < self.window_ms[1]):
+            raise InvalidArgument(f"window_ms: expected a start and a later end, got {self.window_ms}")
+        if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3:
+            raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
+        if not isinstance(self.provenance, Dict):
+            raise InvalidArgument(f"provenance: expected named data, got {self.provenance!r}")
 
     @property
     def n_actions(self) -> int | None:
