@@ -30,6 +30,8 @@ class Responding:
     """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, all; default: by frequency"""
     window_ms: tuple[float, float] = (2.0, 10.0)
     """Start and end of the response window after a stimulus, in ms"""
+    burst_threshold: float | None = None
+    """Share of active channels above which a response is a burst; 1 keeps all; default: by Otsu's method"""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,13 @@ class Fitting(Responding):
         if not recordings:
             raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
         by = None if self.conditions is None else conditions_named(self.conditions)
-        series = extract_series(read_recordings(recordings), by, self.window_ms, despite=self.despite)
+        series = extract_series(
+            read_recordings(recordings),
+            by,
+            self.window_ms,
+            burst_threshold=self.burst_threshold,
+            despite=self.despite,
+        )
         timeline = fit_timeline(series, kind=self.simulator, bins=self.bins, range_hz=self.range_hz)
         _say_findings(timeline.findings)
         return timeline
@@ -141,10 +149,13 @@ class Inspect(Responding):
         from animat.report.inspection import draw_inspection, inspection_text
 
         by = None if self.conditions is None else conditions_named(self.conditions)
+        files = list_recordings(self.recordings)
+        if self.out is not None and len({file.name for file in files}) < len(files):
+            raise InvalidArgument("--out: expected recordings of different names, got two alike; inspect them apart")
         inspected = []
-        for file in list_recordings(self.recordings):
+        for file in files:
             recording = read_recording(file)
-            inspection = inspect_recording(recording, by, self.window_ms, name=file.name)
+            inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.out is not None:
@@ -214,7 +225,7 @@ class Train(Fitting):
             commands=(-1.0, 1.0) if self.mapping == "none" and self.robot == "cartpole" else None,
         )
         if timeline is not None:
-            print(_controllability(timeline))
+            print(_control(timeline))
         with Bar("training") as progress:
             trained = train(
                 training,
@@ -348,8 +359,9 @@ def _say_findings(findings: Sequence[Finding]) -> None:
             print(f"warning: {finding.sentence}", file=sys.stderr)
 
 
-def _controllability(timeline: SimulatorTimeline) -> str:
+def _control(timeline: SimulatorTimeline) -> str:
     """How much the conditions differ, which bounds what any controller can do."""
     shares = timeline.fidelities[0].in_simulator
     told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
-    return f"P(x >= P50) at {timeline.start_min[0]:g} min: {told}"
+    said = next((f.sentence for f in timeline.findings if f.name == "difference"), None)
+    return f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}" + (f"\n{said}" if said else "")

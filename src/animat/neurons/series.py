@@ -16,6 +16,7 @@ def extract_series(
     by: Conditions | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     *,
+    burst_threshold: float | None = None,
     despite: Sequence[str] = (),
 ) -> list[Responses]:
     """Extract the responses of recordings that are to be learned from.
@@ -24,6 +25,7 @@ def extract_series(
         recordings: of one culture.
         by: what makes a condition; None: by frequency where it is known, else all in one.
         window_ms: start and end of the window after the pulse.
+        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         despite: names of findings (`"dead-window"`) to go on in spite of.
 
     Raises:
@@ -31,12 +33,12 @@ def extract_series(
     """
     series = []
     for recording in recordings:
-        responses = extract_responses(recording, by, window_ms)
+        responses = extract_responses(recording, by, window_ms, burst_threshold)
         for finding in responses.findings:
             if finding.severity == "refuse" and finding.name not in despite:
                 raise UnusableData(
-                    f"the recording at {recording.start_min:g} min: {finding.sentence} [to go on in spite of it: "
-                    f"despite {finding.name}]"
+                    f"the recording at {recording.start_min:g} min: {finding.sentence} (to go on in spite of it: "
+                    f"--despite {finding.name})"
                 )
         series.append(responses)
     return series

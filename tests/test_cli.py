@@ -1,0 +1,231 @@
+"""The commands as a user runs them, on good input and on bad: one line, an exit status, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.recordings.made_up import write_made_up_series
+
+QUICK = ["--policies", "2", "--iterations", "2000"]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("series") / "recordings"
+    write_made_up_series(1, folder, sessions=2, patterns=40, channels=64)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def policies(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trained") / "policies"
+    assert main(["train", "cartpole", "--recordings", str(recordings), *QUICK, "--out", str(folder)]) == 0
+    return folder
+
+
+def last_json(printed: str) -> dict[str, object]:
+    return json.loads(printed.splitlines()[-1])  # type: ignore[no-any-return]
+
+
+def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
+    record = ["record", "--culture", "made-up", "--sessions", "2", "--out", str(series)]
+    assert main([*record, "--json"]) == 0
+    assert len(last_json(capsys.readouterr().out)["recordings"]) == 2  # type: ignore[arg-type]
+
+    assert main(["inspect", str(series), "--out", str(figures), "--json"]) == 0
+    told = last_json(capsys.readouterr().out)["recordings"]
+    assert [r["stimuli"] for r in told] == [500, 500]  # type: ignore[attr-defined, index]
+    assert all(Path(figure).is_file() for r in told for figure in r["figures"])  # type: ignore[attr-defined, index]
+
+    train = ["train", "cartpole", "--recordings", str(series), *QUICK, "--out", str(trained)]
+    assert main([*train, "--json"]) == 0
+    assert set(last_json(capsys.readouterr().out)["last_returns"]) == {"p0", "p1"}  # type: ignore[call-overload]
+
+    evaluate = ["evaluate", str(trained), "--recordings", str(series), "--at-min", "0", "--episodes", "10"]
+    assert main([*evaluate, "--json"]) == 0
+    told = last_json(capsys.readouterr().out)
+    assert told["recorded_at_min"] == 0.0
+    assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
+
+
+def nothing(folder: Path, recordings: Path, policies: Path) -> None:
+    """No preparation."""
+
+
+def truncated(folder: Path, recordings: Path, policies: Path) -> None:
+    whole = next(recordings.glob("*.nwb")).read_bytes()
+    (folder / "bad.nwb").write_bytes(whole[: len(whole) // 2])
+
+
+def arrays(**changed: object) -> Callable[[Path, Path, Path], None]:
+    """A small NPZ recording with some of its arrays changed (None: left out)."""
+
+    def prepare(folder: Path, recordings: Path, policies: Path) -> None:
+        good: dict[str, object] = {
+            "spike_time_s": [0.1, 0.2, 0.3],
+            "spike_channel": ["a", "b", "a"],
+            "channel_label": ["a", "b"],
+            "stimulus_time_s": [0.05, 0.15],
+            "stimulus_frequency_hz": [5.0, 10.0],
+        }
+        kept = {name: np.array(value) for name, value in (good | changed).items() if value is not None}
+        np.savez(folder / "bad.npz", **kept)
+
+    return prepare
+
+
+def other_robot(folder: Path, recordings: Path, policies: Path) -> None:
+    shutil.copytree(policies, folder / "policies")
+
+
+TRAIN = ["train", "cartpole", *QUICK, "--out", "{folder}/out", "--recordings"]
+
+BAD = {
+    "missing file": (nothing, [*TRAIN, "{folder}/none.nwb"], ["none.nwb"]),
+    "empty folder": (nothing, [*TRAIN, "{folder}"], ["{folder}"]),
+    "no recordings given": (nothing, TRAIN[:-1], ["--recordings"]),
+    "truncated NWB": (truncated, [*TRAIN, "{folder}/bad.nwb"], ["bad.nwb"]),
+    "wrong keys": (arrays(spike_time_s=None, times=[0.1]), [*TRAIN, "{folder}/bad.npz"], ["bad.npz", "spike_time_s"]),
+    "NaN times": (arrays(spike_time_s=[0.1, np.nan, 0.3]), [*TRAIN, "{folder}/bad.npz"], ["bad.npz", "1 of 3", "NaN"]),
+    "spikes without stimuli": (
+        arrays(stimulus_time_s=np.zeros(0), stimulus_frequency_hz=None),
+        [*TRAIN, "{folder}/bad.npz"],
+        ["stimuli"],
+    ),
+    "channels that no table names": (
+        arrays(spike_channel=["a", "b", "z"]),
+        [*TRAIN, "{folder}/bad.npz"],
+        ["bad.npz", "'z'"],
+    ),
+    "negative frequency": (
+        arrays(stimulus_frequency_hz=[5.0, -10.0]),
+        [*TRAIN, "{folder}/bad.npz"],
+        ["bad.npz", "frequency", "-10"],
+    ),
+    "unknown conditions": (nothing, [*TRAIN, "{recordings}", "--conditions", "colour"], ["conditions", "colour"]),
+    "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["window_ms"]),
+    "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
+    "unknown parameter": (nothing, [*TRAIN, "{recordings}", "--parameters", "wheels=3"], ["cartpole", "wheels"]),
+    "parameter without a number": (nothing, [*TRAIN, "{recordings}", "--parameters", "force_n"], ["--parameters"]),
+    "zero episodes": (
+        nothing,
+        ["evaluate", "{policies}", "--recordings", "{recordings}", "--episodes", "0"],
+        ["episodes"],
+    ),
+    "a policy for another robot": (
+        nothing,
+        ["evaluate", "{policies}", "--recordings", "{recordings}", "--robot", "navigation"],
+        ["navigation", "cartpole"],
+    ),
+    "no policies": (nothing, ["evaluate", "{folder}", "--recordings", "{recordings}"], ["{folder}", "policies"]),
+    "another training's folder": (
+        other_robot,
+        ["train", "navigation", *QUICK, "--recordings", "{recordings}", "--out", "{folder}/policies"],
+        ["{folder}/policies", "another"],
+    ),
+    "zero sessions": (
+        nothing,
+        ["record", "--culture", "made-up", "--sessions", "0", "--out", "{folder}/r"],
+        ["sessions"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gets_one_line_and_leaves_nothing_behind(
+    case: str, tmp_path: Path, recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prepare, arguments, words = BAD[case]
+    prepare(tmp_path, recordings, policies)
+    places = {"folder": str(tmp_path), "recordings": str(recordings), "policies": str(policies)}
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
+    assert main([argument.format(**places) for argument in arguments]) != 0
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1
+    assert lines[0].startswith("animat: ")
+    for word in words:
+        assert word.format(**places) in lines[0]
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["train", "cartpole", "--policies", "many"], ["--policies", "many", "animat train --help"]),
+        (["train", "unicycle"], ["unicycle"]),
+        (["train", "cartpole", "--polices", "3"], ["--polices"]),
+        (["trian"], ["trian"]),
+        ([], ["animat"]),
+    ],
+)
+def test_usage_errors_come_in_one_line(
+    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert all(word in lines[0] for word in words)
+
+
+def test_a_dead_window_is_refused_unless_told_otherwise(
+    real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spikes = str(real_data / "brainoware_spikes.csv.gz")
+    assert main(["inspect", spikes]) == 0
+    assert "the window from 2 to 10 ms is dead" in capsys.readouterr().out
+    train = ["train", "cartpole", "--recordings", spikes, *QUICK, "--out", str(tmp_path / "policies")]
+    assert main(train) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert "--despite dead-window" in lines[0]
+    assert not (tmp_path / "policies").exists()
+    assert main([*train, "--despite", "dead-window"]) == 0
+
+
+def test_a_real_culture_trains_a_controller_of_two_conditions(
+    real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    organoid = str(real_data / "organoid_cartpole_maxone.npz")
+    choice = ["--recordings", organoid, "--conditions", "interval:5,10+-25%"]
+    assert main(["train", "cartpole", *choice, *QUICK, "--out", str(tmp_path)]) == 0
+    assert "the conditions differ by 0.28 at most" in capsys.readouterr().out
+    assert main(["evaluate", str(tmp_path), *choice, "--episodes", "10", "--json"]) == 0
+    rows = last_json(capsys.readouterr().out)["rows"]
+    assert [row["name"] for row in rows][2:4] == ["constant 5 Hz", "constant 10 Hz"]  # type: ignore[attr-defined, index]
+
+
+LITTLE_ROOM = """
+import resource, signal, sys
+from animat.cli import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (8_192, 8_192))
+sys.exit(main())
+"""
+
+
+def test_a_full_disk_while_training_leaves_what_was_there_whole(recordings: Path, tmp_path: Path) -> None:
+    """For real: the process may write files of 8 kB and no more."""
+
+    ran = subprocess.run(
+        [sys.executable, "-c", LITTLE_ROOM, *(part.format(folder=tmp_path) for part in TRAIN), str(recordings)],
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 1
+    lines = [line for line in ran.stderr.splitlines() if line.startswith("animat: ")]
+    assert len(lines) == 1
+    assert "cannot be written" in lines[0]
+    assert "Traceback" not in ran.stderr
+    assert not list((tmp_path / "out").rglob("*.partial*"))
+    assert not list((tmp_path / "out").glob("*.safetensors"))
