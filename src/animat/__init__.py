@@ -1,6 +1,112 @@
-"""animat."""
+"""Drive a robot with a living neuronal culture: record, simulate, train, evaluate, close the loop.
+
+The public names stand here in the order of the story. Nothing heavy is imported before a name is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
 
 from animat.gym import register_environments
 
+if TYPE_CHECKING:
+    from animat.animat import Animat, WithoutNeurons
+    from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
+    from animat.evaluation.table import Evaluation, evaluate
+    from animat.mapping import Linear, Mapping, Thresholds, mapping_named
+    from animat.neurons.conditions import Condition, conditions_named
+    from animat.neurons.inspection import Inspection, inspect_recording
+    from animat.neurons.responses import Responses, extract_responses
+    from animat.neurons.series import extract_series
+    from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
+    from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+    from animat.recordings.findings import Finding
+    from animat.recordings.protocol import Presentation
+    from animat.recordings.reading import read_recording, read_recordings
+    from animat.recordings.recording import Channels, Recording, Stimuli
+    from animat.robots import Cartpole, Navigation, Robot, robot_named
+    from animat.training.policy import Policy, load_policies
+    from animat.training.sac import SAC
+    from animat.training.specification import Training
+    from animat.training.trainer import train
+
+_WHERE = {
+    "recordings.recording": ("Recording", "Channels", "Stimuli"),
+    "recordings.protocol": ("Presentation",),
+    "recordings.findings": ("Finding",),
+    "recordings.reading": ("read_recording", "read_recordings"),
+    "neurons.conditions": ("Condition", "conditions_named"),
+    "neurons.responses": ("Responses", "extract_responses"),
+    "neurons.series": ("extract_series",),
+    "neurons.inspection": ("Inspection", "inspect_recording"),
+    "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
+    "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
+    "mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
+    "robots": ("Robot", "Cartpole", "Navigation", "robot_named"),
+    "animat": ("Animat", "WithoutNeurons"),
+    "training.sac": ("SAC",),
+    "training.specification": ("Training",),
+    "training.trainer": ("train",),
+    "training.policy": ("Policy", "load_policies"),
+    "evaluation.table": ("Evaluation", "evaluate"),
+    "errors": ("AnimatError", "InvalidArgument", "InvalidFile", "UnusableData", "Mismatch"),
+}
+_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
+
+__all__ = [  # noqa: RUF022  (the order of the story)
+    "Recording",
+    "Channels",
+    "Stimuli",
+    "Presentation",
+    "Finding",
+    "read_recording",
+    "read_recordings",
+    "Condition",
+    "conditions_named",
+    "Responses",
+    "extract_responses",
+    "extract_series",
+    "Inspection",
+    "inspect_recording",
+    "NeuronSimulator",
+    "fit_histogram",
+    "fit_empirical",
+    "SimulatorTimeline",
+    "fit_timeline",
+    "Mapping",
+    "Thresholds",
+    "Linear",
+    "mapping_named",
+    "Robot",
+    "Cartpole",
+    "Navigation",
+    "robot_named",
+    "Animat",
+    "WithoutNeurons",
+    "SAC",
+    "Training",
+    "train",
+    "Policy",
+    "load_policies",
+    "Evaluation",
+    "evaluate",
+    "AnimatError",
+    "InvalidArgument",
+    "InvalidFile",
+    "UnusableData",
+    "Mismatch",
+]
+
 # Gymnasium has known plugins only by their import since 1.0. Nothing of an environment is loaded by this.
 register_environments()
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'animat' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"animat.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
