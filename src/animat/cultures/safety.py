@@ -86,6 +86,21 @@ class Limits:
 _NUMBERS = tuple(each.name for each in fields(Limits) if each.name not in ("kind", "phase_us"))
 
 
+SIMULATED_LIMITS = Limits(
+    kind="voltage",
+    amplitude=400.0,
+    phase_us=(50.0, 1000.0),
+    charge_per_phase=200.0,
+    net_charge=25.0,
+    electrodes_at_once=32,
+    stimuli_per_electrode_s=100,
+    stimuli_per_s=200,
+    stimuli_per_session=10_000_000,
+)
+"""A simulation comes to no harm, so these are wide. `net_charge` lets even the paper's pulse pass, which as printed
+leaves 20 mV ms over; the limits of a living culture must not."""
+
+
 class Admitted:
     """Stimuli that passed a guard: the only thing a backend is given to deliver, and only a guard makes them.
 

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 
 from animat.cultures.base import Culture
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.safety import Admitted, Limits
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
@@ -28,20 +28,6 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 WARM_UP_S = 5.0
 """Passes before anything is measured: a fresh tissue is not in its stride."""
-
-VIRTUAL_LIMITS = Limits(
-    kind="voltage",
-    amplitude=400.0,
-    phase_us=(50.0, 1000.0),
-    charge_per_phase=200.0,
-    net_charge=25.0,
-    electrodes_at_once=32,
-    stimuli_per_electrode_s=100,
-    stimuli_per_s=200,
-    stimuli_per_session=10_000_000,
-)
-"""A simulation comes to no harm, so these are wide. `net_charge` lets even the paper's pulse pass, which as printed
-leaves 20 mV ms over; the limits of a living culture must not."""
 
 
 class VirtualCulture(Culture):
@@ -59,7 +45,7 @@ class VirtualCulture(Culture):
         rule: by which they are chosen.
         scan_s: how long each block of 1,024 electrodes is scanned; 20 s (the paper) find 1,024 electrodes on most
             seeds, 5 s, in a quarter of the time, about 930, as neurons that are silent meanwhile stay unseen.
-        limits: tighter limits than `VIRTUAL_LIMITS`.
+        limits: tighter limits than `SIMULATED_LIMITS`.
         progress: told about the scan.
 
     Raises:
@@ -142,8 +128,8 @@ class VirtualCulture(Culture):
 
     @property
     def device_limits(self) -> Limits:
-        """`VIRTUAL_LIMITS`."""
-        return VIRTUAL_LIMITS
+        """`SIMULATED_LIMITS`."""
+        return SIMULATED_LIMITS
 
     @property
     def now_s(self) -> float:

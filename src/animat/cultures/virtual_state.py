@@ -58,8 +58,8 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
     for name, value in culture.settings.items():
         if head["culture"].get(name) != value:
             raise Mismatch(
-                f"{path}: expected the state of this culture, got another's, which differs in {name}: remove it to begin "
-                "anew, or use the same settings"
+                f"{path}: expected the state of this culture, got another's, which differs in {name}: remove it to "
+                "begin anew, or use the same settings"
             )
     try:
         fresh = tissue.snapshot()

@@ -1,0 +1,202 @@
+"""The contract of a culture as tests, for whoever implements one.
+
+    class TestMine(CultureContract):
+        def make_culture(self) -> Culture:
+            return MyCulture(...)
+
+makes pytest run them all. `make_culture` gives a new, closed culture each time; simulated ones with the same seed.
+They take some seconds of the culture's time and deliver a few dozen stimuli, all within its limits.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from animat.cultures.base import Culture
+from animat.errors import AnimatError, InvalidArgument, UnsafeStimulus
+from animat.recordings.protocol import Protocol
+from animat.recordings.recording import UNKNOWN
+from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
+
+
+class CultureContract(abc.ABC):
+    """What every culture must do. Override `pulse`, `frequencies_hz` and `is_repeatable` where they do not fit."""
+
+    pulse: Pulse = PUBLISHED_PULSE
+    """One that the culture's limits allow."""
+    frequencies_hz: tuple[float, ...] = (10.0, 40.0)
+    """That it can be stimulated at."""
+    is_repeatable: bool = True
+    """Whether two new cultures answer the same requests with the same spikes."""
+
+    @abc.abstractmethod
+    def make_culture(self) -> Culture:
+        """A new culture, closed."""
+
+    @property
+    def protocol(self) -> Protocol:
+        """A short protocol."""
+        return Protocol(
+            frequencies_hz=self.frequencies_hz, patterns=1, presentations=4, setup_s=0.1, pause_s=0.1, pulse=self.pulse
+        )
+
+    def stimulus(self, culture: Culture, time_s: float = 0.0) -> Stimulus:
+        """One that is allowed."""
+        electrodes = tuple(int(e) for e in culture.patterns[0] if e != UNKNOWN)
+        return Stimulus(time_s, electrodes, self.pulse, self.frequencies_hz[0], 0)
+
+    def test_what_it_says_of_itself_fits_together(self) -> None:
+        with self.make_culture() as culture:
+            assert len(culture.channels) >= 1
+            sites = set(culture.stimulation_electrodes)
+            assert sites
+            assert len(sites) == len(culture.stimulation_electrodes)
+            for pattern in culture.patterns:
+                used = [electrode for electrode in pattern.tolist() if electrode != UNKNOWN]
+                assert used
+                assert len(set(used)) == len(used)
+                assert sites >= set(used)
+            culture.limits.check_within(culture.device_limits)
+            assert culture.sampling_rate_hz > 0
+            assert all(isinstance(k, str) and isinstance(v, str) for k, v in culture.provenance.items())
+
+    def test_nothing_is_done_while_it_is_closed(self) -> None:
+        culture = self.make_culture()
+        _expect(InvalidArgument, lambda: culture.advance(0.1))
+        _expect(InvalidArgument, lambda: culture.rest(0.1))
+        with culture:
+            stimulus = self.stimulus(culture)
+            _expect(InvalidArgument, culture.open)
+        _expect(InvalidArgument, lambda: culture.deliver([stimulus], 0.1))
+        culture.close()
+
+    def test_its_clock_runs_forward_by_at_least_what_was_asked(self) -> None:
+        with self.make_culture() as culture:
+            for duration_s in (0.05, 0.0125, 0.0, 0.0003):
+                before_s = culture.now_s
+                observed = culture.deliver((), duration_s)
+                assert observed.duration_s >= duration_s - 1e-9
+                assert culture.now_s >= before_s + duration_s - 1e-9
+                spikes = observed.spikes
+                assert len(spikes.time_s) == len(spikes.channel)
+                assert np.all(np.diff(spikes.time_s) >= 0)
+                assert np.all((spikes.time_s >= 0) & (spikes.time_s <= observed.duration_s))
+                assert np.all((spikes.channel >= 0) & (spikes.channel < len(culture.channels)))
+            before_s = culture.now_s
+            culture.rest(1.0)
+            assert culture.now_s >= before_s + 1.0 - 1e-9
+            _expect(InvalidArgument, lambda: culture.advance(-1.0))
+            _expect(InvalidArgument, lambda: culture.advance(float("nan")))
+
+    def test_a_stimulus_is_delivered_when_it_was_asked_for(self) -> None:
+        with self.make_culture() as culture:
+            stimuli = [self.stimulus(culture, 0.01), self.stimulus(culture, 0.11)]
+            observed = culture.deliver(stimuli, 0.2)
+            assert observed.stimulus_time_s.shape == (2,)
+            assert np.all(observed.stimulus_time_s >= np.array([0.01, 0.11]) - 1e-9)
+            assert observed.stimulus_time_s[1] <= observed.duration_s
+            assert culture.delivered == 2
+            recording = culture.present([self.stimulus(culture)], until_ms=12.0)
+            assert recording.duration_s >= recording.stimuli.time_s[-1] + 0.012 - 1e-9
+            if not np.isnan(self.frequencies_hz[0]):
+                assert recording.stimuli.frequency_hz.tolist() == [self.frequencies_hz[0]]
+
+    def test_outside_its_limits_nothing_is_delivered_and_no_time_passes(self) -> None:
+        with self.make_culture() as culture:
+            good = self.stimulus(culture)
+            limits = culture.limits
+            unit = "amplitude_mv" if limits.kind == "voltage" else "amplitude_ua"
+            too_high = Pulse((Phase(limits.phase_us[0], **{unit: 2 * limits.amplitude + 1}),))
+            stranger = max(culture.stimulation_electrodes) + 1
+            for limit, bad in (
+                ("amplitude", replace(good, pulse=too_high, time_s=0.05)),
+                ("sites", replace(good, electrodes=(stranger,), time_s=0.05)),
+                ("electrodes_at_once", replace(good, electrodes=(), time_s=0.05)),
+                ("overlap", replace(good, time_s=1e-9)),
+            ):
+                before_s = culture.now_s
+                error = _expect(UnsafeStimulus, lambda bad=bad: culture.deliver([good, bad], 0.1))  # type: ignore[misc]
+                assert isinstance(error, UnsafeStimulus)
+                assert error.limit == limit
+                assert culture.delivered == 0
+                # A simulated culture's time stands still; a living one's goes on whatever is refused.
+                assert culture.now_s == before_s or not self.is_repeatable
+            _expect(InvalidArgument, lambda: culture.deliver([replace(good, time_s=0.2)], 0.1))
+            assert culture.delivered == 0
+
+    def test_an_emergency_stop_holds_until_it_is_opened_again(self) -> None:
+        culture = self.make_culture()
+        with culture:
+            stimulus = self.stimulus(culture)
+            culture.stop("the test says so")
+            assert culture.is_stopped
+            error = _expect(UnsafeStimulus, lambda: culture.deliver([stimulus], 0.1))
+            assert "the test says so" in str(error)
+            _expect(UnsafeStimulus, lambda: culture.record(self.protocol))
+            culture.advance(0.01)
+            assert culture.delivered == 0
+
+    def test_limits_can_be_tightened_and_never_loosened(self) -> None:
+        culture = self.make_culture()
+        with culture:
+            device = culture.device_limits
+        culture._asked_limits = replace(device, stimuli_per_session=1)
+        with culture:
+            culture.deliver([self.stimulus(culture)], 0.1)
+            error = _expect(UnsafeStimulus, lambda: culture.deliver([self.stimulus(culture)], 0.1))
+            assert isinstance(error, UnsafeStimulus)
+            assert error.limit == "stimuli_per_session"
+        culture._asked_limits = replace(device, amplitude=2 * device.amplitude + 1)
+        _expect(InvalidArgument, culture.open)
+
+    def test_a_recording_is_what_the_protocol_says(self) -> None:
+        protocol = self.protocol
+        with self.make_culture() as culture:
+            schedule = culture.schedule(protocol, seed=3)
+            before_min = culture.now_s / 60
+            recording = culture.record(protocol, seed=3)
+            assert recording.start_min >= before_min - 1e-9
+            assert culture.now_s / 60 >= before_min + schedule.duration_s / 60 - 1e-6
+            expected = [block.stimuli for block in schedule.blocks]
+            for name in ("frequency_hz", "pattern", "presentation", "electrodes"):
+                asked = np.concatenate([getattr(table, name) for table in expected])
+                np.testing.assert_array_equal(getattr(recording.stimuli, name), asked)
+            assert recording.duration_s >= schedule.recorded_s - 1e-6
+            assert recording.presentation == protocol.presentation
+            assert Protocol.from_json(recording.provenance["protocol"]) == protocol
+            assert culture.delivered == len(schedule)
+            _expect(AnimatError, lambda: culture.record(replace(protocol, patterns=len(culture.patterns) + 1)))
+
+    def test_a_response_is_a_window_after_the_pulse(self) -> None:
+        with self.make_culture() as culture:
+            stimulus = self.stimulus(culture)
+            spikes = culture.stimulate(stimulus.electrodes, self.pulse, (2.0, 10.0))
+            assert np.all((spikes.time_s >= 0.002 - 1e-9) & (spikes.time_s < 0.010))
+            _expect(InvalidArgument, lambda: culture.stimulate(stimulus.electrodes, self.pulse, (5.0, 5.0)))
+
+    def test_the_same_requests_give_the_same_spikes(self) -> None:
+        if not self.is_repeatable:
+            return
+        recordings = []
+        for _ in range(2):
+            with self.make_culture() as culture:
+                recordings.append(culture.record(self.protocol, seed=1))
+        assert recordings[0].equals(recordings[1])
+
+    def test_what_is_final_cannot_be_overridden(self) -> None:
+        kind = type(self.make_culture())
+        _expect(TypeError, lambda: type("Around", (kind,), {"deliver": lambda *_: None}))
+        _expect(TypeError, lambda: type("Around", (kind,), {"limits": None}))
+
+
+def _expect(kind: type[Exception], act: Callable[[], object]) -> Exception:
+    """The error of this kind that an act raises."""
+    try:
+        act()
+    except kind as error:
+        return error
+    raise AssertionError(f"expected {kind.__name__}, but nothing was raised")

@@ -1,0 +1,212 @@
+"""A culture that answers from recordings: each stimulus with what was measured after one like it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from animat.cultures.base import Culture
+from animat.cultures.observed import Observed, Spikes
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
+from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.recordings.recording import UNKNOWN, Channels, Recording
+from animat.recordings.stimulus import Stimulus
+
+NS = 1_000_000_000
+REACH_S = 0.05
+"""How much of what followed a stimulus is kept as its response, unless another stimulus came sooner."""
+
+
+class ReplayCulture(Culture):
+    """A culture made of recordings: a stimulus at f is answered by the spikes that followed a recorded one at f.
+
+    The last pulse of a presentation is answered by one that was the last of a recorded presentation, the others by
+    ones that were not, where there are any; a stimulus without a frequency by any. The newest recording at the
+    culture's clock answers; the clock starts where the first recording did. There is no memory beyond that and no
+    activity between responses: what a closed loop does has no effect on what comes next, which is just what a loop on
+    living matter is there to test.
+
+    Args:
+        recordings: of one culture, at least one, with stimuli of known frequencies and electrodes.
+        how: `"draw"`, a response is drawn at random; `"in order"`, they come as they were recorded, then over again.
+        seed: decides the draws.
+        limits: tighter limits than `SIMULATED_LIMITS`.
+
+    Raises:
+        InvalidArgument: for no recordings, or another `how`.
+        Mismatch: for recordings with different channels.
+        UnusableData: for a recording without stimuli of known frequency and electrodes.
+    """
+
+    name: ClassVar[str] = "replay"
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        how: Literal["draw", "in order"] = "draw",
+        seed: int = 0,
+        limits: Limits | None = None,
+    ) -> None:
+        super().__init__(limits)
+        if not recordings:
+            raise InvalidArgument("recordings: expected at least one to answer from, got none")
+        if how not in ("draw", "in order"):
+            raise InvalidArgument(f"how: expected 'draw' or 'in order', got {how!r}")
+        self._recordings = sorted(recordings, key=lambda recording: recording.start_min)
+        first = self._recordings[0]
+        for recording in self._recordings:
+            if recording.channels.label.tolist() != first.channels.label.tolist():
+                raise Mismatch(
+                    f"recordings: expected the same channels in all, but the one at {recording.start_min:g} min has "
+                    f"others than the one at {first.start_min:g} min"
+                )
+            stimuli = recording.stimuli
+            if not np.any(np.isfinite(stimuli.frequency_hz)) or not np.any(stimuli.electrodes != UNKNOWN):
+                raise UnusableData(
+                    f"the recording at {recording.start_min:g} min: expected stimuli of known frequency and "
+                    "electrodes, got none: a replay answers by frequency, and is stimulated on electrodes"
+                )
+        self._how, self._seed = how, seed
+        self._patterns = _patterns(first)
+        self._zero_s = 60.0 * first.start_min
+        self._now_ns = 0
+        self._answered = 0
+        self._turn: dict[tuple[int, float, bool], int] = {}
+        self._pending_ns, self._pending_channel = np.empty(0, np.int64), np.empty(0, np.int64)
+
+    @property
+    def channels(self) -> Channels:
+        """Those of the recordings."""
+        return self._recordings[0].channels
+
+    @property
+    def stimulation_electrodes(self) -> tuple[int, ...]:
+        """Those of the patterns."""
+        return tuple(int(electrode) for electrode in np.unique(self._patterns[self._patterns != UNKNOWN]))
+
+    @property
+    def patterns(self) -> Int64[np.ndarray, "patterns size"]:
+        """The patterns of the first recording, in the order of their numbers."""
+        return self._patterns
+
+    @property
+    def device_limits(self) -> Limits:
+        """`SIMULATED_LIMITS`."""
+        return SIMULATED_LIMITS
+
+    @property
+    def now_s(self) -> float:
+        """The culture's clock: begins at the start of the first recording."""
+        return self._zero_s + self._now_ns / NS
+
+    @property
+    def sampling_rate_hz(self) -> float:
+        """That of the recordings; 20 kHz where it is not known."""
+        rate_hz = self._recordings[0].sampling_rate_hz
+        return rate_hz if np.isfinite(rate_hz) else 20_000.0
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """That it is a replay, of what."""
+        first = self._recordings[0]
+        of = {f"replayed {name}": words for name, words in first.provenance.items()}
+        minutes = ", ".join(f"{recording.start_min:g}" for recording in self._recordings)
+        how = {"source": "replay of recordings by animat.cultures.replay", "replayed minutes": minutes}
+        return {**how, "how": self._how, "seed": str(self._seed), **of}
+
+    def _open(self) -> None:
+        pass
+
+    def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        start_ns = self._now_ns
+        end_ns = start_ns + round(duration_s * NS)
+        # All answers are found before anything changes: a condition that was never recorded must leave no trace.
+        answers = [
+            (start_ns + round(stimulus.time_s * NS), self._pool(stimulus, is_last))
+            for stimulus, is_last in zip(admitted.stimuli, _is_last(admitted.stimuli), strict=True)
+        ]
+        for time_ns, (recording, key, pool) in answers:
+            self._answer(time_ns, recording, self._choose(key, pool))
+        known = int(np.searchsorted(self._pending_ns, end_ns))
+        spikes = Spikes((self._pending_ns[:known] - start_ns) / NS, self._pending_channel[:known])
+        self._pending_ns, self._pending_channel = self._pending_ns[known:], self._pending_channel[known:]
+        self._now_ns = end_ns
+        return Observed(
+            start_s=self._zero_s + start_ns / NS,
+            duration_s=(end_ns - start_ns) / NS,
+            spikes=spikes,
+            stimulus_time_s=np.array([time_ns - start_ns for time_ns, _ in answers], dtype=np.float64) / NS,
+        )
+
+    def _pool(
+        self, stimulus: Stimulus, is_last: bool
+    ) -> tuple[Recording, tuple[int, float, bool], Int64[np.ndarray, " pulses"]]:
+        """The recorded pulses that may answer, and the recording they are in."""
+        minute = (self.now_s + stimulus.time_s) / 60
+        row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
+        recording = self._recordings[row]
+        frequency_hz = recording.stimuli.frequency_hz
+        same = (frequency_hz == stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
+        alike = same & (recording.stimuli.is_last_of_presentation == is_last)
+        pool = np.flatnonzero(alike if np.any(alike) else same)
+        if not len(pool):
+            known = ", ".join(f"{f:g}" for f in np.unique(frequency_hz[~np.isnan(frequency_hz)]))
+            raise InvalidArgument(
+                f"frequency_hz: expected one that was recorded ({known} Hz), got {stimulus.frequency_hz:g}: a replay "
+                "has answers to nothing else"
+            )
+        return recording, (row, stimulus.frequency_hz, is_last), pool
+
+    def _choose(self, key: tuple[int, float, bool], pool: Int64[np.ndarray, " pulses"]) -> int:
+        if self._how == "draw":
+            chosen = int(np.random.default_rng([self._seed, 13, self._answered]).integers(len(pool)))
+        else:
+            chosen = self._turn.get(key, 0) % len(pool)
+            self._turn[key] = chosen + 1
+        self._answered += 1
+        return int(pool[chosen])
+
+    def _answer(self, time_ns: int, recording: Recording, pulse: int) -> None:
+        """Put the spikes that followed a recorded pulse after this one, in place of what was still to come."""
+        times_s = recording.stimuli.time_s
+        until_s = times_s[pulse] + REACH_S
+        if pulse + 1 < len(times_s):
+            until_s = min(until_s, times_s[pulse + 1])
+        first, last = np.searchsorted(recording.spike_times_s, [times_s[pulse], until_s])
+        since_ns = np.rint((recording.spike_times_s[first:last] - times_s[pulse]) * NS).astype(np.int64)
+        kept = int(np.searchsorted(self._pending_ns, time_ns))
+        self._pending_ns = np.concatenate([self._pending_ns[:kept], time_ns + since_ns])
+        self._pending_channel = np.concatenate([self._pending_channel[:kept], recording.spike_channels[first:last]])
+
+    def _rest(self, duration_s: float) -> None:
+        self._now_ns += round(duration_s * NS)
+        kept = self._pending_ns >= self._now_ns
+        self._pending_ns, self._pending_channel = self._pending_ns[kept], self._pending_channel[kept]
+
+    def _halt(self) -> None:
+        # Delivery happens within a call, and the guard refuses the next one.
+        pass
+
+    def _close(self) -> None:
+        pass
+
+
+def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:
+    """Electrodes of each pattern, by its number; where patterns have no numbers, every different set is one."""
+    stimuli = recording.stimuli
+    has_electrodes = np.any(stimuli.electrodes != UNKNOWN, axis=1)
+    numbered = has_electrodes & (stimuli.pattern != UNKNOWN)
+    if np.any(numbered):
+        _, first = np.unique(stimuli.pattern[numbered], return_index=True)
+        return np.asarray(stimuli.electrodes[numbered][first])
+    return np.asarray(np.unique(stimuli.electrodes[has_electrodes], axis=0))
+
+
+def _is_last(stimuli: Sequence[Stimulus]) -> Bool[np.ndarray, " stimuli"]:
+    """Whether each is the last of its presentation."""
+    number = np.array([stimulus.presentation for stimulus in stimuli])
+    return np.append(number[1:] != number[:-1], True)[: len(stimuli)]
