@@ -1,0 +1,425 @@
+"""How fast policies are trained and answer, beside what others need for the same: see README.md in this folder.
+
+    python benchmarks/training.py [--quick] [--json results.json]
+
+Every measurement runs in a process of its own, pinned to one core before anything is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import peers
+
+MIB = 2**20
+
+
+def main() -> int:
+    """Run all parts, or in a child one of them, and print the table."""
+    parser = argparse.ArgumentParser(description="How fast policies are trained and answer, beside others.")
+    parser.add_argument("--quick", action="store_true", help="about two minutes: fewer repeats, peers cut off sooner")
+    parser.add_argument("--json", metavar="FILE", help="write everything that was measured to a file")
+    parser.add_argument("--return", type=float, default=40.0, dest="wanted", help="mean return to reach (default: 40)")
+    parser.add_argument("--cap-s", type=float, help="seconds of training after which a peer is cut off")
+    parser.add_argument("--part", choices=sorted(PARTS), help=argparse.SUPPRESS)
+    parser.add_argument("--core", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--given", default="{}", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.part:
+        if options.core is not None:
+            os.sched_setaffinity(0, {options.core})
+        print(json.dumps(PARTS[options.part](**json.loads(options.given))))
+        return 0
+
+    cap_s = options.cap_s or (20.0 if options.quick else 150.0)
+    with tempfile.TemporaryDirectory() as folder:
+        measured = measure(Path(folder), quick=options.quick, wanted=options.wanted, cap_s=cap_s)
+    print_table(measured)
+    if options.json:
+        Path(options.json).write_text(json.dumps(measured, indent=2) + "\n")
+    return 0
+
+
+# --- one process a part ---------------------------------------------------------------------------------------------
+
+
+def start(part: str, cache: Path, core: int | None, **given: Any) -> subprocess.Popen[str]:
+    """A part in a process of its own, with its own folder of compiled programs."""
+    command = [sys.executable, __file__, "--part", part, "--given", json.dumps(given)]
+    command += [] if core is None else ["--core", str(core)]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PLATFORMS": "cpu"}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> dict[str, Any]:
+    """What a part measured."""
+    output, _ = process.communicate()
+    if process.returncode != 0:
+        raise SystemExit(f"a part of the benchmark ended with status {process.returncode}: {process.args!r}")
+    result: dict[str, Any] = json.loads(output.splitlines()[-1])
+    return result
+
+
+def measure(folder: Path, *, quick: bool, wanted: float, cap_s: float) -> dict[str, Any]:
+    """All of it, in one go."""
+    cores = sorted(os.sched_getaffinity(0))
+    first = cores[0]
+    cache = folder / "cache"
+
+    def alone(part: str, **given: Any) -> dict[str, Any]:
+        say(f"{part} {given or ''}")
+        return finish(start(part, cache, first, **given))
+
+    measured: dict[str, Any] = {"machine": machine(len(cores)), "wanted_return": wanted, "quick": quick}
+    measured["compile_cold"] = alone("compilation", policies=5)
+    measured["compile_cached"] = alone("compilation", policies=5)
+    repeats = 3 if quick else 10
+    measured["one_policy"] = alone("rate", policies=1, repeats=repeats)
+    measured["five_policies"] = alone("rate", policies=5, repeats=repeats)
+    measured["memory"] = alone("memory", folder=str(folder / "five"))
+    measured["forward"] = alone("forward", calls=5_000 if quick else 50_000)
+
+    say("time to the same return: ours")
+    ladder = [12_500, 25_000, 50_000, 100_000, 200_000, 400_000, 800_000]
+    measured["ours"] = finish(start("ours", cache, None, folder=str(folder / "ten"), ladder=ladder, wanted=wanted))
+    for peer in peers.PEERS:
+        if importlib.util.find_spec(peer.split(",")[0]) is None:
+            measured[peer] = None
+            continue
+        say(f"time to the same return: {peer}, for {cap_s:g} s of training at most")
+        # Two at once, one on each core, as ours has both too.
+        running = [
+            start("peer", cache, core, name=peer, seed=seed, wanted=wanted, cap_s=cap_s)
+            for seed, core in enumerate(cores[:2])
+        ]
+        measured[peer] = of_ten([finish(process) for process in running], cap_s, measured["ours"]["wall_s"])
+    return measured
+
+
+def of_ten(seeds: list[dict[str, Any]], cap_s: float, ours_s: float) -> dict[str, Any]:
+    """From one policy a core to ten policies on as many cores; where one was cut off, these are lower bounds."""
+    scale = 10 / len(seeds)
+    first_s = scale * statistics.mean(seed["first_s"] or cap_s for seed in seeds)
+    held_s = scale * statistics.mean(seed["training_s"] for seed in seeds)
+    return {
+        "seeds": seeds,
+        "first": {"ten_s": first_s, "ratio": first_s / ours_s, "all": all(seed["first_s"] for seed in seeds)},
+        "held": {"ten_s": held_s, "ratio": held_s / ours_s, "all": all(seed["held"] for seed in seeds)},
+    }
+
+
+def machine(n_cores: int) -> dict[str, Any]:
+    """What it was measured on."""
+    names = ("animat", "jax", "numpy", "stable_baselines3", "sbx-rl", "torch")
+    versions = {}
+    for name in names:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {"cores": n_cores, "load": os.getloadavg()[0], "python": platform.python_version(), "versions": versions}
+
+
+def say(what: str) -> None:
+    """Where it is, on standard error."""
+    print(f"[{time.strftime('%H:%M:%S')}] {what}", file=sys.stderr, flush=True)
+
+
+# --- the parts ------------------------------------------------------------------------------------------------------
+
+
+def algorithm() -> Any:
+    """Our default settings, at eight iterations an update whatever the default is."""
+    from dataclasses import replace
+
+    from animat.training.sac import SAC
+
+    default = SAC()
+    return replace(default, updates=max(1, default.environments // 8))
+
+
+def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
+    """(environment, settings, simulator, compiled-to-be chunk, learners-to-be), as a worker makes them."""
+    from functools import partial
+
+    import jax
+
+    from animat.animat import Animat
+    from animat.compilation import keep_compilations
+    from animat.mapping import mapping_named
+    from animat.neurons.made_up import made_up_simulator
+    from animat.robots.cartpole import Cartpole
+    from animat.training.sac import begin, train_chunk
+
+    keep_compilations()
+    simulator, settings = made_up_simulator(), algorithm()
+    environment = Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions)
+    chunk = jax.jit(
+        jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)), donate_argnums=0
+    )
+    beginning = jax.jit(jax.vmap(partial(begin, environment, settings)))
+    return environment, settings, simulator, chunk, beginning
+
+
+def compilation(policies: int) -> dict[str, Any]:
+    """Seconds from Python functions to compiled ones; cached where the folder of compiled programs has them."""
+    import jax
+    import jax.numpy as jnp
+
+    _, _, simulator, chunk, beginning = program(policies)
+    keys = jax.random.split(jax.random.key(0), policies)
+    jax.block_until_ready((keys, jnp.int32(0) + 1, simulator))
+    took: dict[str, Any] = {}
+    began = time.perf_counter()
+    learners = jax.block_until_ready(beginning(keys))
+    took["begin_s"] = time.perf_counter() - began
+    lowered = chunk.lower(learners, simulator, jnp.int32(0), jnp.int32(1))
+    took["trace_s"] = time.perf_counter() - began - took["begin_s"]
+    lowered.compile()
+    took["all_s"] = time.perf_counter() - began
+    took["compile_s"] = took["all_s"] - took["begin_s"] - took["trace_s"]
+    return took
+
+
+def rate(policies: int, repeats: int) -> dict[str, Any]:
+    """Iterations a second with learning, all policies together: best and median of some chunks."""
+    import jax
+    import jax.numpy as jnp
+
+    _, settings, simulator, chunk, beginning = program(policies)
+    learners = beginning(jax.random.split(jax.random.key(0), policies))
+    rounds, done, seconds = max(1, 40_000 // (settings.environments * policies)), 0, []
+    for _ in range(repeats + 1):
+        began = time.perf_counter()
+        learners, _ = jax.block_until_ready(chunk(learners, simulator, jnp.int32(done), jnp.int32(done + rounds)))
+        seconds.append(time.perf_counter() - began)
+        done += rounds
+    seconds = seconds[1:]  # the first one compiles
+    iterations = rounds * settings.environments * policies
+    return {
+        "environments": settings.environments,
+        "updates": settings.updates,
+        "batch": settings.batch,
+        "hidden": settings.hidden,
+        "best_per_s": iterations / min(seconds),
+        "median_per_s": iterations / statistics.median(seconds),
+        "update_us": 1e6 * min(seconds) / (rounds * settings.updates * policies),
+    }
+
+
+def timeline() -> Any:
+    """The made-up culture as a timeline of one recording."""
+    import jax
+    import numpy as np
+
+    from animat.neurons.conditions import Condition
+    from animat.neurons.made_up import LABELS, made_up_simulator
+    from animat.neurons.timeline import SimulatorTimeline
+
+    return SimulatorTimeline(
+        simulators=jax.tree.map(lambda leaf: leaf[None], made_up_simulator()),
+        start_min=np.zeros(1),
+        conditions=tuple(Condition(label, float(label.split()[0]), "Hz") for label in LABELS),
+        window_ms=(2.0, 10.0),
+        presentation=None,
+        fidelities=(),
+        findings=(),
+    )
+
+
+def training(policies: int, iterations: int, seed: int = 1) -> Any:
+    """What `animat train cartpole --mapping 9-thresholds` trains, at eight iterations an update."""
+    from animat.mapping import mapping_named
+    from animat.robots.cartpole import Cartpole
+    from animat.training.specification import Training
+
+    return Training(
+        robot=Cartpole(),
+        mapping=mapping_named("9-thresholds"),
+        policies=policies,
+        iterations=iterations,
+        seed=seed,
+        shadowing=False,
+        algorithm=algorithm(),
+    )
+
+
+def memory(folder: str) -> dict[str, Any]:
+    """Peak resident memory of a worker that trains five policies, by the kernel's account of ended children."""
+    import resource
+
+    from animat.training.trainer import train
+
+    train(training(5, 50_000), timeline(), folder, workers=1)
+    of_worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    # A child starts from its parent's figure, so it says something only where it passed that.
+    of_parent = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return {"worker_mib": of_worker / MIB, "parent_mib": of_parent / MIB}
+
+
+def forward(calls: int) -> dict[str, Any]:
+    """Microseconds to answer one observation: our numpy policy, and the same network under jax.jit."""
+    import jax
+    import numpy as np
+
+    from animat.mapping import mapping_named
+    from animat.neurons.conditions import Condition
+    from animat.robots.cartpole import Cartpole
+    from animat.training.policy import Policy
+    from animat.training.sac import Layer
+    from animat.training.sac import forward as jax_forward
+
+    rng = np.random.default_rng(0)
+    sizes = ((4, 64), (64, 64), (64, 5))
+    policy = Policy(
+        weights=tuple(rng.normal(0, 0.3, size).astype(np.float32) for size in sizes),
+        biases=tuple(np.zeros(size[1], np.float32) for size in sizes),
+        scales=np.ones(4, np.float32),
+        robot=Cartpole(),
+        mapping=mapping_named("9-thresholds"),
+        conditions=tuple(Condition(str(i), float(i), "") for i in range(5)),
+    )
+    network = tuple(
+        Layer(jax.numpy.asarray(w), jax.numpy.asarray(b)[None])
+        for w, b in zip(policy.weights, policy.biases, strict=True)
+    )
+    compiled = jax.jit(lambda observation: jax_forward(network, observation[None])[0])
+    observations = rng.normal(0, 0.1, (calls, 4)).astype(np.float32)
+    answers: dict[str, Callable[[Any], Any]] = {
+        "numpy": policy.outputs,
+        "numpy, action drawn": lambda observation: policy.act(observation, rng),
+        "jax.jit": lambda observation: np.asarray(compiled(observation)),
+    }
+    took = {}
+    for name, answer in answers.items():
+        seconds = []
+        for observation in observations:
+            began = time.perf_counter()
+            answer(observation)
+            seconds.append(time.perf_counter() - began)
+        later = np.array(seconds[calls // 10 :]) * 1e6
+        took[name] = {"median_us": float(np.median(later)), "p99_us": float(np.percentile(later, 99))}
+    return took
+
+
+def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
+    """Wall-clock seconds of the shortest training of ten policies, of some lengths, that reaches the return.
+
+    It is all of `train`: starting processes, importing, loading compiled programs, training, checkpoints, saving.
+    """
+    from animat.animat import Animat
+    from animat.evaluation.rollouts import networks_of, roll_out
+    from animat.mapping import mapping_named
+    from animat.robots.cartpole import Cartpole
+    from animat.training.trainer import train
+
+    culture = timeline()
+    # Another seed, so that the first length is measured with programs compiled as all the others are.
+    train(training(10, 10_000, seed=2), culture, f"{folder}-first")
+    tried = []
+    for iterations in ladder:
+        began = time.perf_counter()
+        policies = train(training(10, iterations), culture, f"{folder}-{iterations}")
+        wall_s = time.perf_counter() - began
+        simulator = culture.at(0.0)
+        environment = Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions)
+        actors = networks_of(list(policies.values()))
+        returns = roll_out(environment, simulator, actors, 10, episodes=100, seed=7).returns.mean(axis=1)
+        tried.append(
+            {
+                "iterations": iterations,
+                "wall_s": wall_s,
+                "mean_return": float(returns.mean()),
+                "lowest_return": float(returns.min()),
+            }
+        )
+        if returns.mean() >= wanted:
+            break
+    return {**tried[-1], "reached": tried[-1]["mean_return"] >= wanted, "tried": tried}
+
+
+PARTS: dict[str, Callable[..., dict[str, Any]]] = {
+    "compilation": compilation,
+    "rate": rate,
+    "memory": memory,
+    "forward": forward,
+    "ours": ours,
+    "peer": peers.train_peer,
+}
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+
+def print_table(measured: dict[str, Any]) -> None:
+    """What was measured, in words, beside what was aimed at."""
+    one, five, memory_, forward_ = (measured[name] for name in ("one_policy", "five_policies", "memory", "forward"))
+    cold, cached, ours_ = (measured[name] for name in ("compile_cold", "compile_cached", "ours"))
+    wanted = measured["wanted_return"]
+    reached = f"mean {ours_['mean_return']:.0f}, lowest {ours_['lowest_return']:.0f}"
+    of_tracing = f"{cached['trace_s']:.2f} s of it tracing"
+    settings = f"{one['environments']} environments, {one['updates']} updates, batch {one['batch']}"
+    rows = [
+        ("training, one core, replay ratio 1/8", "", settings),
+        ("  one policy", f"{one['best_per_s']:,.0f} iterations/s", f"{one['update_us']:.0f} us an update; aim 60,000"),
+        (
+            "  five policies side by side",
+            f"{five['best_per_s']:,.0f} iterations/s",
+            f"{five['update_us']:.0f} us an update; {five['best_per_s'] / 5:,.0f} each",
+        ),
+        ("  compiling, five policies, cold", f"{cold['all_s']:.2f} s", "aim 3 s"),
+        (
+            "  compiling, five policies, cached",
+            f"{cached['all_s']:.2f} s",
+            f"{of_tracing}; aim 0.5 s",
+        ),
+        ("  peak memory of a worker, five policies", f"{memory_['worker_mib']:,.0f} MiB", "aim 1,024 MiB"),
+        ("one answer of a policy, 64x64", "", "median, 99th percentile"),
+    ]
+    for name, took in forward_.items():
+        slower = took["median_us"] / forward_["numpy"]["median_us"]
+        beside = "aim 20 us" if name == "numpy" else f"{slower:.1f} times numpy"
+        rows.append((f"  {name}", f"{took['median_us']:.1f}, {took['p99_us']:.1f} us", beside))
+    rows += [
+        (f"ten policies to a mean return of {wanted:g}", "", "Animat/Cartpole-v0, 9 thresholds"),
+        (
+            "  animat",
+            f"{ours_['wall_s']:.1f} s" if ours_["reached"] else f"not in {ours_['wall_s']:.1f} s",
+            f"{ours_['iterations']:,} iterations each; {reached}",
+        ),
+    ]
+    for peer, name in peers.PEERS.items():
+        found = measured[peer]
+        if found is None:
+            rows.append((f"  {name}", "not installed", ""))
+            continue
+        steps = statistics.mean(seed["steps"] for seed in found["seeds"])
+        best = max(seed["best_return"] for seed in found["seeds"])
+        for which, words in (("first", "first reached"), ("held", f"held for {peers.HELD} evaluations")):
+            took = found[which]
+            least = "" if took["all"] else "at least "
+            rows.append(
+                (f"  {name}, {words}", f"{least}{took['ten_s']:,.0f} s", f"{least}{took['ratio']:.1f} times ours")
+            )
+        rows[-1] = (*rows[-1][:2], f"{rows[-1][2]}; {steps:,.0f} steps each, best return {best:.0f}")
+    widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
+    print(f"{measured['machine']}")
+    for row in rows:
+        print(f"{row[0]:<{widths[0]}}  {row[1]:>{widths[1]}}  {row[2]}".rstrip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
