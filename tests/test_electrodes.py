@@ -1,0 +1,205 @@
+"""Array, scan, selection, patterns. Oracles: counting by hand and brute force over all sets."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.recordings.array import MAXONE, ElectrodeArray
+from animat.recordings.patterns import draw_patterns
+from animat.recordings.scan import ScannedActivity
+from animat.recordings.selection import Selection, SelectionRule, select_electrodes
+
+SMALL = ElectrodeArray("small", columns=20, rows=10, pitch_um=20.0, channels=60, stimulation_units=16)
+
+
+def test_the_maxone_is_as_large_as_the_paper_says() -> None:
+    assert len(MAXONE) == 26_400
+    x_um, y_um = MAXONE.position_um(np.array([0, 219, 220, 26_399]))
+    assert x_um.tolist() == [0.0, 219 * 17.5, 0.0, 219 * 17.5]
+    assert y_um.tolist() == [0.0, 0.0, 17.5, 119 * 17.5]
+    # From edge to edge of the grid's cells: 3.85 x 2.10 mm.
+    assert (MAXONE.columns * MAXONE.pitch_um, MAXONE.rows * MAXONE.pitch_um) == (3850.0, 2100.0)
+
+
+@given(st.integers(0, len(MAXONE) - 1), st.floats(-8.7, 8.7), st.floats(-8.7, 8.7))
+def test_a_position_is_its_nearest_electrode(electrode: int, dx_um: float, dy_um: float) -> None:
+    x_um, y_um = MAXONE.position_um(electrode)
+    assert MAXONE.electrode_at(x_um + dx_um, y_um + dy_um).tolist() == [electrode]
+
+
+def test_positions_off_the_array_are_refused() -> None:
+    with pytest.raises(InvalidArgument, match="expected numbers from 0 to 26399 on the MaxOne, got 26400"):
+        MAXONE.position_um(26_400)
+    with pytest.raises(InvalidArgument, match="expected positions on the MaxOne, got -100, 0 um"):
+        MAXONE.electrode_at(-100.0, 0.0)
+
+
+def test_scan_blocks_cover_every_electrode_once_in_26_blocks() -> None:
+    blocks = MAXONE.scan_blocks()
+    assert len(blocks) == math.ceil(26_400 / 1024) == 26
+    assert max(map(len, blocks)) <= 1024
+    assert np.array_equal(np.concatenate(blocks), np.arange(26_400))
+    with pytest.raises(InvalidArgument, match="expected 1 to 1024 electrodes a block, got 2000"):
+        MAXONE.scan_blocks(2000)
+
+
+def scanned(array: ElectrodeArray, seed: int = 0, **columns: Any) -> ScannedActivity:
+    rng = np.random.default_rng(seed)
+    n = len(array)
+    return ScannedActivity(
+        **(
+            {
+                "electrode": np.arange(n),
+                "rate_hz": rng.uniform(0.1, 5, n),
+                "amplitude_uv": rng.uniform(5, 100, n),
+                "noise_uv": np.full(n, 2.5),
+                "trough_to_peak_ms": rng.uniform(0.2, 0.6, n),
+                "recovery_ms": rng.uniform(0.2, 0.6, n),
+            }
+            | columns
+        )
+    )
+
+
+RULE = SelectionRule(recording_sites=40, stimulation_sites=12, patterns=10, pattern_size=3, pattern_spacing_um=60.0)
+
+
+def test_recording_sites_pass_the_threshold_and_have_the_highest_rates() -> None:
+    scan = scanned(SMALL)
+    rule = SelectionRule(**(vars(RULE) | {"spacing_um": 0.0, "signal_to_noise": 10.0}))
+    selection = select_electrodes(SMALL, scan, rule)
+    passing = [e for e in range(len(SMALL)) if scan.amplitude_uv[e] / 2.5 >= 10.0]
+    highest = sorted(passing, key=lambda e: -scan.rate_hz[e])[:40]
+    assert selection.recording.tolist() == sorted(highest)
+    assert (selection.scanned, selection.passed) == (200, len(passing))
+
+
+def test_with_a_spacing_the_best_of_the_neighbours_is_kept() -> None:
+    scan = scanned(SMALL)
+    rule = SelectionRule(**(vars(RULE) | {"spacing_um": 30.0, "signal_to_noise": 4.0}))
+    selection = select_electrodes(SMALL, scan, rule)
+    ratio = scan.signal_to_noise
+    distance_um = SMALL.distance_um(scan.electrode, scan.electrode)
+    best = [e for e in range(200) if ratio[e] >= 4 and ratio[e] == ratio[distance_um[e] <= 30.0].max()]
+    assert selection.passed == len(best)
+    assert set(selection.recording.tolist()) <= set(best)
+    tie = scanned(SMALL, amplitude_uv=np.full(200, 50.0))
+    few = SelectionRule(**(vars(rule) | {"stimulation_sites": 1, "patterns": 1, "pattern_size": 1}))
+    # All alike: the first number stays, its neighbours go.
+    assert select_electrodes(SMALL, tie, few).passed == 1
+
+
+def test_stimulation_sites_are_large_and_look_excitatory() -> None:
+    scan = scanned(SMALL)
+    selection = select_electrodes(SMALL, scan, SelectionRule(**(vars(RULE) | {"spacing_um": 0.0})))
+    worth = scan.amplitude_uv * scan.excitatory_score
+    best = sorted(selection.recording.tolist(), key=lambda e: -worth[e])[:12]
+    assert selection.stimulation.tolist() == sorted(best)
+
+
+def test_the_excitatory_score_is_soft() -> None:
+    n = len(SMALL)
+    times = np.linspace(0.1, 0.7, n)
+    score = scanned(SMALL, trough_to_peak_ms=times, recovery_ms=times).excitatory_score
+    assert np.all(np.diff(score) > 0)
+    assert score[0] < 0.03
+    assert score[-1] > 0.97
+    assert score[np.argmin(np.abs(times - 0.35))] == pytest.approx(0.5, abs=0.05)
+    silent = scanned(SMALL, amplitude_uv=np.full(n, np.nan), trough_to_peak_ms=np.full(n, np.nan))
+    assert not np.any(silent.excitatory_score)
+    assert not np.any(silent.signal_to_noise)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_patterns_are_different_sets_far_apart(seed: int) -> None:
+    electrodes = np.random.default_rng(seed).choice(len(MAXONE), 32, replace=False)
+    patterns = draw_patterns(MAXONE, electrodes, seed=seed)
+    assert patterns.shape == (100, 5)
+    assert len({tuple(pattern) for pattern in patterns.tolist()}) == 100
+    assert np.all(np.isin(patterns, electrodes))
+    for pattern in patterns:
+        for a, b in itertools.combinations(pattern.tolist(), 2):
+            (ax, ay), (bx, by) = MAXONE.position_um(a), MAXONE.position_um(b)
+            assert math.dist((ax[0], ay[0]), (bx[0], by[0])) > 100.0
+    assert np.array_equal(draw_patterns(MAXONE, electrodes, seed=seed), patterns)
+    assert not np.array_equal(draw_patterns(MAXONE, electrodes, seed=seed + 1), patterns)
+
+
+def test_every_possible_pattern_is_found_and_one_more_is_too_many() -> None:
+    electrodes = np.array([0, 3, 6, 9, 65, 68, 71])
+    position = np.column_stack(SMALL.position_um(electrodes))
+    possible = [
+        three
+        for three in itertools.combinations(range(7), 3)
+        if all(math.dist(position[a], position[b]) > 70 for a, b in itertools.combinations(three, 2))
+    ]
+    wanted = {"size": 3, "spacing_um": 70.0, "seed": 1}
+    drawn = draw_patterns(SMALL, electrodes, patterns=len(possible), **wanted)
+    assert {tuple(p) for p in drawn.tolist()} == {tuple(electrodes[list(three)].tolist()) for three in possible}
+    with pytest.raises(InvalidArgument, match=f"7 electrodes make only {len(possible)}: ask for fewer patterns"):
+        draw_patterns(SMALL, electrodes, patterns=len(possible) + 1, **wanted)
+    with pytest.raises(InvalidArgument, match="make only 0"):
+        draw_patterns(SMALL, electrodes, patterns=1, size=8, spacing_um=1.0, seed=0)
+
+
+def test_every_pattern_is_equally_likely() -> None:
+    electrodes = np.array([0, 4, 8, 12, 16])
+    counts = dict.fromkeys(itertools.combinations(electrodes.tolist(), 2), 0)
+    for seed in range(2000):
+        counts[tuple(draw_patterns(SMALL, electrodes, patterns=1, size=2, spacing_um=10.0, seed=seed)[0].tolist())] += 1
+    assert stats.chisquare(list(counts.values())).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("rule", "words"),
+    [
+        ({"recording_sites": 61}, "recording_sites: expected 1 to 60 on the small, got 61"),
+        ({"stimulation_sites": 17}, "stimulation_sites: expected 1 to 16 on the small, got 17"),
+        ({"signal_to_noise": 39.5}, "lower the ratio or the spacing, scan for longer, or ask for fewer"),
+        ({"recording_sites": 5}, r"expected at most as many as recording sites \(5\), got 12"),
+        ({"pattern_spacing_um": 500.0}, "ask for fewer patterns, fewer electrodes in each, a shorter distance"),
+    ],
+)
+def test_what_cannot_be_had_is_refused_with_what_to_relax(rule: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidArgument, match=words):
+        select_electrodes(SMALL, scanned(SMALL), SelectionRule(**(vars(RULE) | {"spacing_um": 0.0} | rule)))
+
+
+def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
+    selection = select_electrodes(SMALL, scanned(SMALL), SelectionRule(**(vars(RULE) | {"spacing_um": 0.0})), seed=3)
+    selection.save(tmp_path / "selection.json")
+    assert Selection.load(tmp_path / "selection.json") == selection
+    assert hash(Selection.load(tmp_path / "selection.json")) == hash(selection)
+    channels = selection.channels
+    assert channels.electrode.tolist() == selection.recording.tolist()
+    assert channels.has_positions
+    for content in ("", "[]", "{}", json.dumps({**selection.to_dict(), "format": "other"}), "\x00"):
+        (tmp_path / "bad.json").write_text(content)
+        with pytest.raises(InvalidFile, match=r"bad.json: expected an electrode selection"):
+            Selection.load(tmp_path / "bad.json")
+    for name, value in (("stimulation", [1, 1]), ("patterns", [[7, 900]]), ("recording", [-5]), ("rule", {"x": 1})):
+        (tmp_path / "bad.json").write_text(json.dumps({**selection.to_dict(), name: value}))
+        with pytest.raises(InvalidFile, match=r"bad.json: expected an electrode selection"):
+            Selection.load(tmp_path / "bad.json")
+    with pytest.raises(InvalidFile, match="no such file"):
+        Selection.load(tmp_path / "none.json")
+
+
+def test_a_scan_that_cannot_be_is_refused() -> None:
+    with pytest.raises(UnusableData, match=r"scan.rate_hz: expected one value an electrode"):
+        scanned(SMALL, rate_hz=np.zeros(3))
+    with pytest.raises(UnusableData, match="each electrode once"):
+        scanned(SMALL, electrode=np.zeros(200))
+    blocks = [scanned(SMALL, electrode=np.arange(200) + 200 * i) for i in range(2)]
+    assert len(ScannedActivity.of_blocks(blocks)) == 400

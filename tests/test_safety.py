@@ -1,0 +1,257 @@
+"""The guard. Oracle: each limit said once more, in exact arithmetic and by counting over all pairs of times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Guard, Limits
+from animat.errors import InvalidArgument, UnsafeStimulus
+from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+
+SITES = range(10, 16)
+LIMITS = Limits(
+    kind="voltage",
+    amplitude=200.0,
+    phase_us=(100.0, 500.0),
+    charge_per_phase=75.0,
+    net_charge=10.0,
+    electrodes_at_once=3,
+    stimuli_per_electrode_s=4,
+    stimuli_per_s=6,
+    stimuli_per_session=40,
+)
+
+
+def is_safe(limits: Limits, sites: Sequence[int], past: list[Stimulus], request: list[Stimulus]) -> bool:
+    """Whether every limit holds for all that was ever delivered and the request together, `time_s` on one clock."""
+    if len(past) + len(request) > limits.stimuli_per_session and request:
+        return False
+    for stimulus in request:
+        electrodes = list(stimulus.electrodes)
+        if len(electrodes) == 0 or len(electrodes) > limits.electrodes_at_once:
+            return False
+        if any(electrodes.count(e) != 1 or e not in sites for e in electrodes):
+            return False
+        net = Fraction(0)
+        for phase in stimulus.pulse.phases:
+            if phase.kind != limits.kind:
+                return False
+            amplitude, duration = Fraction(phase.amplitude), Fraction(phase.duration_us)
+            net += amplitude * duration / 1000
+            if max(amplitude, -amplitude) > Fraction(limits.amplitude):
+                return False
+            if duration < Fraction(limits.phase_us[0]) or duration > Fraction(limits.phase_us[1]):
+                return False
+            if max(amplitude * duration, -amplitude * duration) / 1000 > Fraction(limits.charge_per_phase):
+                return False
+        if max(net, -net) > Fraction(limits.net_charge):
+            return False
+    everything = [*past, *request]
+    us = [round(Fraction(s.time_s) * 1_000_000) for s in everything]
+    for i, stimulus in enumerate(everything):
+        if i and us[i] < us[i - 1] + sum(Fraction(p.duration_us) for p in everything[i - 1].pulse.phases):
+            return False
+        second = [j for j in range(len(everything)) if us[i] - 1_000_000 < us[j] <= us[i]]
+        if len(second) > limits.stimuli_per_s:
+            return False
+        for electrode in stimulus.electrodes:
+            if sum(electrode in everything[j].electrodes for j in second) > limits.stimuli_per_electrode_s:
+                return False
+    return True
+
+
+class Requests:
+    """Random requests about the edges of `LIMITS`; numbers are multiples of 1/8, so that products are exact."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+
+    def pick(self, *options: Any) -> Any:
+        return options[self.rng.integers(len(options))]
+
+    def pulse(self) -> Pulse:
+        if self.rng.random() < 0.6:
+            return self.pick(
+                Pulse((Phase(375, amplitude_mv=-200), Phase(375, amplitude_mv=200))),
+                Pulse((Phase(375, amplitude_mv=-200), Phase(325, amplitude_mv=200))),
+                Pulse((Phase(500, amplitude_mv=-150), Phase(500, amplitude_mv=150))),
+                Pulse((Phase(100, amplitude_mv=-100),)),
+            )
+        kind = "amplitude_ua" if self.rng.random() < 0.03 else "amplitude_mv"
+        edge = (0.0, 100.0, 150.0, 199.875, 200.0, 200.125)
+        times = (99.875, 100.0, 325.0, 375.0, 375.125, 500.0, 500.125)
+        phases, sign = [], self.pick(-1.0, 1.0)
+        for _ in range(self.rng.integers(1, 4)):
+            phases.append(Phase(self.pick(*times), **{kind: sign * self.pick(*edge)}))
+            sign = -sign if self.rng.random() < 0.9 else sign
+        return Pulse(tuple(phases))
+
+    def electrodes(self) -> tuple[int, ...]:
+        if self.rng.random() < 0.9:
+            return tuple(self.rng.choice(np.array(SITES), self.rng.integers(1, 4), replace=False).tolist())
+        return tuple(self.rng.integers(9, 17, self.rng.integers(0, 5)).tolist())
+
+    def stimuli(self) -> list[Stimulus]:
+        """Times lie on whole microseconds, often exactly on an edge."""
+        us, request = 0, []
+        for _ in range(self.rng.integers(0, 6)):
+            us += int(self.pick(0, 650, 750, 1000, 100_000, 200_000, 250_000, 333_333, 999_999, 1_000_000))
+            request.append(Stimulus(us / 1_000_000, self.electrodes(), self.pulse()))
+        if len(request) > 1 and self.rng.random() < 0.02:
+            request.reverse()
+        return request
+
+
+def try_requests(seed: int, number: int) -> tuple[int, int]:
+    """Put random requests before guards and the oracle; returns how many were safe and how many not."""
+    requests, safe, unsafe = Requests(seed), 0, 0
+    guard, past, now_us = Guard(LIMITS, SITES), [], 0
+    for _ in range(number):
+        if requests.rng.random() < 0.1:
+            guard.begin_session()
+            past, now_us = [], 0
+        request = requests.stimuli()
+        shifted = [replace(s, time_s=float(Fraction(now_us, 1_000_000) + Fraction(s.time_s))) for s in request]
+        before = guard.delivered
+        expected = is_safe(LIMITS, SITES, past, shifted)
+        try:
+            admitted = guard.admit(request, now_us / 1_000_000)
+        except UnsafeStimulus as error:
+            assert not expected, f"a safe request was refused: {error}\n{request}"
+            assert guard.delivered == before
+            unsafe += 1
+        else:
+            assert expected, f"an unsafe request passed: {request} after {past}"
+            assert list(admitted.stimuli) == request
+            assert guard.delivered == before + len(request)
+            past += shifted
+            safe += 1
+        last_us = round(request[-1].time_s * 1_000_000) if request else 0
+        now_us += last_us + int(requests.pick(750, 100_000, 500_000, 1_000_000))
+    return safe, unsafe
+
+
+def test_no_unsafe_request_passes_and_no_safe_one_is_refused() -> None:
+    safe, unsafe = try_requests(0, 5_000)
+    assert min(safe, unsafe) > 1_000
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("seed", range(1, 11))
+def test_among_100000_requests_none_unsafe_passes_and_none_safe_is_refused(seed: int) -> None:
+    safe, unsafe = try_requests(seed, 10_000)
+    assert safe + unsafe == 10_000
+    assert min(safe, unsafe) > 2_000
+
+
+def one(pulse: Pulse = BALANCED_PULSE, electrodes: tuple[int, ...] = (10,), time_s: float = 0.0) -> Stimulus:
+    return Stimulus(time_s, electrodes, pulse)
+
+
+WIDE = replace(SIMULATED_LIMITS, stimuli_per_s=10, stimuli_per_electrode_s=5, stimuli_per_session=20)
+
+
+@pytest.mark.parametrize(
+    ("limit", "stimuli", "words"),
+    [
+        ("amplitude", [one(Pulse((Phase(100, amplitude_mv=-401),)))], "at most 400 mV, got -401"),
+        ("phase_us", [one(Pulse((Phase(20, amplitude_mv=-1),)))], "phases of 50 to 1000 us, got 20"),
+        ("charge_per_phase", [one(Pulse((Phase(1000, amplitude_mv=-300),)))], "at most 200 mV ms a phase, got -300"),
+        ("net_charge", [one(Pulse((Phase(500, amplitude_mv=-60),)))], "balance to 25 mV ms, got -30"),
+        ("kind", [one(Pulse((Phase(500, amplitude_ua=-1),)))], "expected voltage pulses, got a current pulse"),
+        ("electrodes_at_once", [one(electrodes=())], "expected 1 to 32 electrodes, got 0"),
+        ("sites", [one(electrodes=(99,))], "got electrode 99"),
+        ("sites", [one(electrodes=(10, 10))], "each electrode once"),
+        ("overlap", [one(), one(time_s=0.0005)], "500 us too early"),
+        ("overlap", [one(time_s=math.nan)], "finite times"),
+        ("stimuli_per_s", [one(electrodes=(10 + i % 3,), time_s=i * 0.09) for i in range(11)], "at most 10 stimuli"),
+        ("stimuli_per_electrode_s", [one(time_s=i * 0.1) for i in range(6)], "at most 5 stimuli on an electrode"),
+        ("stimuli_per_session", [one(time_s=float(i)) for i in range(21)], "at most 20 stimuli in a session"),
+    ],
+)
+def test_a_refusal_names_the_limit_the_value_and_that_nothing_happened(
+    limit: str, stimuli: list[Stimulus], words: str
+) -> None:
+    guard = Guard(WIDE, SITES)
+    with pytest.raises(UnsafeStimulus, match=words) as refused:
+        guard.admit(stimuli, 0.0)
+    assert refused.value.limit == limit
+    assert "nothing was delivered" in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert guard.delivered == 0
+    # What was refused left no trace: as much as is allowed can still be delivered.
+    guard.admit([one(time_s=i * 0.2) for i in range(5)], 0.0)
+
+
+def test_the_papers_pulse_is_not_balanced_and_passes_only_where_limits_say_so() -> None:
+    assert PUBLISHED_PULSE.net_charge == -20.0
+    Guard(SIMULATED_LIMITS, SITES).admit([one(PUBLISHED_PULSE)], 0.0)
+    with pytest.raises(UnsafeStimulus, match="net_charge: expected phases that balance to 1 mV ms, got -20"):
+        Guard(replace(SIMULATED_LIMITS, net_charge=1.0), SITES).admit([one(PUBLISHED_PULSE)], 0.0)
+    assert BALANCED_PULSE.net_charge == 0.0
+
+
+def test_rates_hold_across_requests_and_a_second_later_all_is_forgotten() -> None:
+    guard = Guard(WIDE, SITES)
+    for i in range(5):
+        guard.admit([one()], 0.1 * i)
+    with pytest.raises(UnsafeStimulus, match="stimuli_per_electrode_s"):
+        guard.admit([one()], 0.999)
+    guard.admit([one()], 1.0)
+
+
+def test_an_emergency_stop_refuses_everything_until_a_new_session() -> None:
+    guard = Guard(WIDE, SITES)
+    guard.stop("smoke")
+    with pytest.raises(UnsafeStimulus, match="stopped: an emergency stop is in force \\(smoke\\)"):
+        guard.admit([one()], 0.0)
+    assert guard.admit([], 0.0).stimuli == ()
+    guard.begin_session()
+    guard.admit([one()], 0.0)
+
+
+def test_only_a_guard_admits() -> None:
+    with pytest.raises(InvalidArgument, match="expected to be made by a Guard"):
+        Admitted([one()], by=None)
+
+
+def test_limits_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InvalidArgument, match="phase_us: expected"):
+        replace(LIMITS, phase_us=(500.0, 100.0))
+    with pytest.raises(InvalidArgument, match="net_charge: expected a finite number from 0, got nan"):
+        replace(LIMITS, net_charge=math.nan)
+    with pytest.raises(InvalidArgument, match=r"limits.stimuli_per_s: expected no looser than the device's 6, got 7"):
+        replace(LIMITS, stimuli_per_s=7).check_within(LIMITS)
+    with pytest.raises(InvalidArgument, match=r"limits.phase_us"):
+        replace(LIMITS, phase_us=(50.0, 500.0)).check_within(LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Phase(100), "either amplitude_mv or amplitude_ua"),
+        (lambda: Phase(100, amplitude_mv=1, amplitude_ua=1), "either amplitude_mv or amplitude_ua"),
+        (lambda: Phase(0, amplitude_mv=1), "above 0 us, got 0"),
+        (lambda: Phase(100, amplitude_mv=math.inf), "finite number, got inf"),
+        (lambda: Pulse(()), "at least one, got none"),
+        (lambda: Pulse((Phase(1, amplitude_mv=1), Phase(1, amplitude_ua=1))), "got both in one pulse"),
+        (lambda: Pulse.from_list([{"duration_ms": 1}]), "expected phases with duration_us"),
+    ],
+)
+def test_pulses_that_cannot_be_are_refused(make: Any, words: str) -> None:
+    with pytest.raises(InvalidArgument, match=words):
+        make()
+
+
+def test_a_current_pulse_has_its_charge_in_nanocoulombs() -> None:
+    # 3 uA for 1000 us is 3 nC.
+    assert Phase(1000, amplitude_ua=-3).charge == -3.0
+    assert Pulse.from_list(PUBLISHED_PULSE.to_list()) == PUBLISHED_PULSE
+    assert str(PUBLISHED_PULSE) == "-200 mV 500 us, then +200 mV 400 us"
