@@ -181,7 +181,9 @@ class Brian2Tissue:
                 "drive = drive_mean + (drive - drive_mean) * keep + kick_sd * randn()", when="end", clock=clock
             )
         if kicks is not None:
-            parts.append(b2.NetworkOperation(self._kicker(group, kicks, b2), clock=clock, when="start"))
+            # Before Brian2 evaluates B, which it does in this slot at order 0.
+            kicker = self._kicker(group, kicks, b2)
+            parts.append(b2.NetworkOperation(kicker, clock=clock, when="before_start", order=-1))
         self._monitor = b2.SpikeMonitor(group)
         self._network = b2.Network(*parts, self._monitor)
         self._ms = ms

@@ -21,6 +21,7 @@ SEEN_UM, APART_UM = 25.0, 100.0
 WINDOW_S = (0.002, 0.010)
 RECORDINGS, INTERVAL_S = 15, 600.0
 SET_UP_S = 16.0
+REPEATED = 6
 
 Responses = dict[int, tuple[np.ndarray, np.ndarray]]
 """Of each frequency: firing rate per channel in Hz, and the ratio of active channels, of each stimulus."""
@@ -184,7 +185,7 @@ def measure(seed: int, parameters: TissueParameters | None = None) -> Figures:
 
     # Guards and other presentations start from a fresh culture each, not from one that is two hours old.
     rig = Rig(seed, parameters, spontaneous_s=10.0)
-    one = {f: [rig.block(f, np.full(100, pattern)) for pattern in (0, 1, 2)] for f in (5, 80)}
+    one = {f: [rig.block(f, np.full(100, pattern)) for pattern in range(REPEATED)] for f in (5, 80)}
     one_hz = {
         f: np.mean([np.median(rate_hz[active <= threshold]) for rate_hz, active in blocks]) for f, blocks in one.items()
     }

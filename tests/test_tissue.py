@@ -307,13 +307,14 @@ def test_release_tires_with_spikes_and_recovers() -> None:
     for _ in range(100):
         tissue._state.v_mv[0] = 0.0
         tissue.advance(0.01)
-    assert tissue._state.release[0] == pytest.approx((1 - 2e-4) ** 100, rel=1e-4)
+    lost = tissue.parameters.release_loss
+    assert tissue._state.release[0] == pytest.approx((1 - lost) ** 100, rel=1e-4)
     assert np.all(tissue._state.release[~tissue.is_excitatory] == 1.0)
     tired = tissue._state.release[0]
     tissue.rest(3600.0)
     tissue._state.v_mv[0] = 0.0
     tissue.advance(0.01)
-    assert tissue._state.release[0] == pytest.approx((1 - (1 - tired) * np.exp(-1)) * (1 - 2e-4), rel=1e-6)
+    assert tissue._state.release[0] == pytest.approx((1 - (1 - tired) * np.exp(-1)) * (1 - lost), rel=1e-6)
 
 
 # --- stimulation

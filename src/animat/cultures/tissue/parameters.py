@@ -61,11 +61,11 @@ class TissueParameters:
     refractory_e_ms: float = 3.0
     refractory_i_ms: float = 2.0
     """[L] Absolute refractory periods."""
-    hyperpolarisation: float = 0.003
+    hyperpolarisation: float = 0.0055
     """[C] Added to the potassium conductance by each spike."""
     hyperpolarisation_ms: float = 4000.0
     """[L] Its time constant."""
-    adaptation_mv: float = 0.6
+    adaptation_mv: float = 1.05
     """[C] Added to the threshold by each spike."""
     adaptation_ms: float = 100.0
     """[C] Its time constant."""
@@ -75,7 +75,7 @@ class TissueParameters:
     nmda_ms: float = 110.0
     gaba_ms: float = 10.0
     """[L] Decay of the synaptic conductances."""
-    nmda_ratio: float = 0.71
+    nmda_ratio: float = 0.81
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
     nmda_saturation: float = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
@@ -83,10 +83,10 @@ class TissueParameters:
     e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
     i_to_any: ShortTerm = ShortTerm(0.137, 750.0)
     """[C] within [L]: short-term plasticity."""
-    weight_ee: float = 0.65
-    weight_ei: float = 0.8
-    weight_ie: float = 0.48
-    weight_ii: float = 0.6
+    weight_ee: float = 0.62
+    weight_ei: float = 1.04
+    weight_ie: float = 0.40
+    weight_ii: float = 0.88
     """[C] Mean weights, from the first letter to the second."""
     weight_sigma: float = 0.5
     """[C] Sigma of the log-normal weights."""
@@ -105,10 +105,10 @@ class TissueParameters:
     """[L] Speed of axons."""
 
     # Drive.
-    drive_mv: float = 9.7
+    drive_mv: float = 10.3
     drive_spread_mv: float = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
-    noise_mv: float = 7.8
+    noise_mv: float = 7.5
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
     """[C] Its time constant."""
@@ -131,16 +131,16 @@ class TissueParameters:
     """[C] Latency: this, conduction, and a share of the spread that is each neuron's own."""
     axon_jitter_ms: float = 0.16
     """[L] Standard deviation of the latency from pulse to pulse."""
-    availability_loss: float = 0.01
+    availability_loss: float = 0.035
     """[C] Share of a neuron's availability lost with each spike."""
-    availability_s: float = 8.0
+    availability_s: float = 2.8
     """[C] Time constant of its recovery (Goldental et al. 2014: failures above a critical frequency)."""
     availability_needed_low: float = 0.30
     availability_needed_high: float = 0.55
     """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
 
     # Fatigue.
-    release_loss: float = 2e-4
+    release_loss: float = 2.5e-4
     """[C] Share of an excitatory neuron's release lost with each spike."""
     release_recovery_min: float = 60.0
     """[C] Time constant of its recovery."""
