@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -455,3 +456,14 @@ def test_requests_that_cannot_be_met_are_refused_and_change_nothing() -> None:
 def test_parameters_out_of_range_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(InvalidArgument, match=name):
         dataclasses.replace(TissueParameters(), **{name: value})  # type: ignore[arg-type]
+
+
+def test_the_example_of_the_docs_runs() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "virtual-culture.md").read_text(encoding="utf-8")
+    names: dict[str, object] = {}
+    exec(text.split("```python\n")[1].split("```")[0], names)
+    tissue, evoked = names["tissue"], names["evoked"]
+    assert isinstance(tissue, Tissue)
+    assert isinstance(evoked, Spikes)
+    assert tissue.now_s == 601.0125
+    assert evoked.time_s.size > 20
