@@ -68,10 +68,12 @@ def record_virtual_series(
     if there == sessions:
         progress.update(sessions, sessions, "all there already")
         return files
+    _remove_leftovers(folder)
     culture, recorded = _resume(make_culture, folder / STATE_FILE, there)
     with culture:
         _check_interval(culture, protocol, sessions, interval_min)
-        culture.selection.save(folder / SELECTION_FILE)
+        if not recorded or not (folder / SELECTION_FILE).exists():
+            culture.selection.save(folder / SELECTION_FILE)
         if not recorded:
             culture.save_state(folder / STATE_FILE, sessions=0)
         for session in range(recorded, sessions):
@@ -91,6 +93,13 @@ def record_virtual_series(
 def _seed(culture: VirtualCulture, session: int) -> int:
     """Of a session's schedule: other cultures and other sessions have other orders."""
     return culture.seed * 10_000 + session
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what a killed run was just writing; no reader takes such files for whole ones."""
+    for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
+        for leftover in folder.glob(f"{name}.*.partial*"):
+            leftover.unlink(missing_ok=True)
 
 
 def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int) -> tuple[VirtualCulture, int]:

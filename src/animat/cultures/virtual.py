@@ -80,6 +80,7 @@ class VirtualCulture(Culture):
         self._now_ns = 0
         # Spikes of the step that the clock is in the middle of, on the tissue's clock.
         self._held_ns, self._held_neuron = np.empty(0, np.int64), np.empty(0, np.int64)
+        self._fired = np.empty(0), np.empty(0, np.int64)
 
     @property
     def tissue(self) -> Tissue:
@@ -109,6 +110,11 @@ class VirtualCulture(Culture):
         """Which electrode sees which neuron, and how."""
         _ = self.tissue
         return self._visibility
+
+    @property
+    def fired(self) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+        """Time and neuron of every spike of the last delivery, seen by an electrode or not; times from its start."""
+        return self._fired
 
     @property
     def channels(self) -> Channels:
@@ -260,10 +266,11 @@ class VirtualCulture(Culture):
         known = int(np.searchsorted(time_ns_of, end_ns))
         self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
         self._now_ns = end_ns
+        self._fired = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
         return Observed(
             start_s=(start_ns - self._zero_ns) / NS,
             duration_s=(end_ns - start_ns) / NS,
-            spikes=self._on_channels((time_ns_of[:known] - start_ns) / NS, neuron[:known]),
+            spikes=self._on_channels(*self._fired),
             stimulus_time_s=np.array(stimulus_ns, dtype=np.float64) / NS,
         )
 

@@ -1,0 +1,178 @@
+"""Raw traces of a short stretch of a virtual culture, whose spikes are known: to test spike detection against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from animat.cultures.observed import Spikes
+from animat.cultures.virtual import VirtualCulture
+from animat.cultures.visibility import NOISE_UV
+from animat.errors import InvalidArgument
+from animat.recordings.stimulus import Stimulus
+
+BAND_HZ = (100.0, 3000.0)
+SHAPE_MS = (1.0, 2.5)
+"""A spike's waveform before and after its trough."""
+SATURATION_UV = 3200.0
+"""The amplifier's range: a stimulus artefact does not go beyond."""
+ARTEFACT_UV = 200_000.0
+ARTEFACT_REACH_UM = 40.0
+ARTEFACT_MS = 1.0
+"""The artefact at distance d from a site, t after its pulse, is 200 mV / (1 + (d / 40 um)^3) exp(-t / 1 ms), cut at the
+range: at the site it saturates for 4 ms, at 500 um it is down to 14 uV after 2 ms (assumed, after reports)."""
+LARGEST_SAMPLES = 2**28
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Voltage of some channels, and the spikes in it.
+
+    Attributes:
+        voltage_uv: shape (samples, channels).
+        channels: rows of the culture's channel table that the columns are.
+        sampling_rate_hz: of the samples.
+        spikes: the true spikes at their troughs, counted from the first sample; `channel` is a column of `voltage_uv`.
+        amplitude_uv: size of each spike on its channel, shape (spikes,).
+        stimulus_time_s: starts of the pulses.
+    """
+
+    voltage_uv: Float32[np.ndarray, "samples channels"]
+    channels: Int64[np.ndarray, " channels"]
+    sampling_rate_hz: float
+    spikes: Spikes
+    amplitude_uv: Float64[np.ndarray, " spikes"]
+    stimulus_time_s: Float64[np.ndarray, " stimuli"]
+
+
+def record_traces(
+    culture: VirtualCulture,
+    duration_s: float,
+    *,
+    channels: Sequence[int] | None = None,
+    stimuli: Sequence[Stimulus] = (),
+    noise_uv: float = NOISE_UV,
+    seed: int = 0,
+) -> Traces:
+    """Advance an open virtual culture and make the raw signal that its electrodes would have given.
+
+    Every neuron within reach of an electrode adds its waveform to it, scaled by distance (`Visibility`); on top come
+    Gaussian noise in 100-3000 Hz and, after a pulse, its artefact. Spikes closer together than their waveforms overlap.
+
+    Args:
+        culture: open; its clock moves on.
+        duration_s: of the stretch.
+        channels: rows of its channel table; None: all.
+        stimuli: to deliver meanwhile.
+        noise_uv: root mean square of the noise.
+        seed: of the noise.
+
+    Raises:
+        InvalidArgument: for a channel that is not there, or more than a gigabyte of samples.
+        UnsafeStimulus: as `Culture.deliver` does.
+    """
+    rows = np.arange(len(culture.channels)) if channels is None else np.asarray(channels, dtype=np.int64)
+    if rows.ndim != 1 or len(np.unique(rows)) != len(rows) or np.any((rows < 0) | (rows >= len(culture.channels))):
+        raise InvalidArgument(f"channels: expected different rows from 0 to {len(culture.channels) - 1}, got {rows}")
+    rate_hz = culture.sampling_rate_hz
+    samples = round(duration_s * rate_hz) if 0 < duration_s < 1e6 else 0
+    if not 0 < samples * len(rows) <= LARGEST_SAMPLES:
+        raise InvalidArgument(
+            f"duration_s, channels: expected up to {LARGEST_SAMPLES:,} samples, got {duration_s:g} s of {len(rows)} "
+            "channels: take a shorter stretch or fewer channels"
+        )
+    stimulus_time_s = culture.deliver(stimuli, duration_s).stimulus_time_s
+    fired_s, fired = culture.fired
+    rng = np.random.default_rng([seed, 14])
+    voltage_uv = _band_limited_noise(rng, samples, len(rows), rate_hz, noise_uv)
+    pairs = culture.visibility.pairs_of(culture.selection.recording[rows])
+    amplitude_uv = culture.visibility.amplitude_at(pairs.neuron, pairs.distance_um)
+    times, columns, sizes = [], [], []
+    for neuron in np.unique(pairs.neuron):
+        seen = pairs.neuron == neuron
+        at = np.rint(fired_s[fired == neuron] * rate_hz).astype(np.int64)
+        at = at[at < samples]
+        if not len(at):
+            continue
+        shape, trough = waveform(
+            culture.visibility.trough_to_peak_ms[neuron], culture.visibility.recovery_ms[neuron], rate_hz
+        )
+        for column, size_uv in zip(pairs.electrode[seen].tolist(), amplitude_uv[seen].tolist(), strict=True):
+            _add(voltage_uv[:, column], at - trough, size_uv * shape)
+            times.append(at / rate_hz)
+            columns.append(np.full(len(at), column))
+            sizes.append(np.full(len(at), size_uv))
+    _add_artefacts(voltage_uv, culture, rows, stimuli, stimulus_time_s, rate_hz)
+    np.clip(voltage_uv, -SATURATION_UV, SATURATION_UV, out=voltage_uv)
+    time_s = np.concatenate([*times, np.empty(0)])
+    column_of = np.concatenate([*columns, np.empty(0, np.int64)]).astype(np.int64)
+    order = np.lexsort((column_of, time_s))
+    return Traces(
+        voltage_uv=voltage_uv,
+        channels=rows,
+        sampling_rate_hz=rate_hz,
+        spikes=Spikes(time_s[order], column_of[order]),
+        amplitude_uv=np.concatenate([*sizes, np.empty(0)])[order],
+        stimulus_time_s=stimulus_time_s,
+    )
+
+
+def waveform(
+    trough_to_peak_ms: float, recovery_ms: float, rate_hz: float
+) -> tuple[Float64[np.ndarray, " samples"], int]:
+    """A spike of size 1: a trough of -1 and a smaller, slower peak after it; and the sample that the trough is at.
+
+        v(t) = -exp(-(t / w)^2 / 2) + 0.3 exp(-((t - p) / r)^2 / 2),   w = 0.09 ms, p trough to peak, r recovery / 1.18
+
+    scaled so that its lowest point is -1.
+    """
+    before, after = round(SHAPE_MS[0] * 1e-3 * rate_hz), round(SHAPE_MS[1] * 1e-3 * rate_hz)
+    t_ms = np.arange(-before, after + 1) / rate_hz * 1e3
+    # The peak begins at the trough: what lies before it is cut off smoothly.
+    peak = 0.3 * np.exp(-(((t_ms - trough_to_peak_ms) * 1.18 / recovery_ms) ** 2) / 2)
+    peak *= 1 / (1 + np.exp(-np.clip((t_ms - trough_to_peak_ms / 2) / 0.05, -50, 50)))
+    shape = -np.exp(-((t_ms / 0.09) ** 2) / 2) + peak
+    return shape / -shape[before], before
+
+
+def _band_limited_noise(
+    rng: np.random.Generator, samples: int, channels: int, rate_hz: float, noise_uv: float
+) -> Float32[np.ndarray, "samples channels"]:
+    """White noise cut to the band in the frequency domain, channel by channel to save memory."""
+    voltage_uv = np.empty((samples, channels), np.float32)
+    frequency_hz = np.fft.rfftfreq(samples, 1 / rate_hz)
+    inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
+    # The share of the power that passes, so that what is left has the power asked for.
+    passed = max(np.count_nonzero(inside) * 2 / samples, 1 / samples)
+    for column in range(channels):
+        spectrum = np.fft.rfft(rng.standard_normal(samples)) * inside
+        voltage_uv[:, column] = noise_uv / np.sqrt(passed) * np.fft.irfft(spectrum, samples)
+    return voltage_uv
+
+
+def _add(trace_uv: Float32[np.ndarray, " samples"], first: Int64[np.ndarray, " spikes"], shape: np.ndarray) -> None:
+    sample = (first[:, None] + np.arange(len(shape))[None, :]).ravel()
+    inside = (sample >= 0) & (sample < len(trace_uv))
+    np.add.at(trace_uv, sample[inside], np.tile(shape, len(first))[inside].astype(np.float32))
+
+
+def _add_artefacts(
+    voltage_uv: Float32[np.ndarray, "samples channels"],
+    culture: VirtualCulture,
+    rows: Int64[np.ndarray, " channels"],
+    stimuli: Sequence[Stimulus],
+    time_s: Float64[np.ndarray, " stimuli"],
+    rate_hz: float,
+) -> None:
+    array = culture.selection.array
+    length = round(0.02 * rate_hz)
+    decay = np.exp(-np.arange(length) / rate_hz * 1e3 / ARTEFACT_MS)
+    for stimulus, at_s in zip(stimuli, time_s.tolist(), strict=True):
+        distance_um = array.distance_um(np.array(stimulus.electrodes), culture.selection.recording[rows])
+        size_uv = np.sum(ARTEFACT_UV / (1 + (distance_um / ARTEFACT_REACH_UM) ** 3), axis=0)
+        first = round(at_s * rate_hz)
+        stretch = voltage_uv[first : first + length]
+        stretch -= (decay[: len(stretch), None] * size_uv[None, :]).astype(np.float32)

@@ -1,0 +1,239 @@
+"""The virtual culture as its electrodes see it. Oracles: distances by brute force, and the tissue asked directly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat.cultures.replay import ReplayCulture
+from animat.cultures.tissue import Pulse as TissuePulse
+from animat.cultures.tissue import Tissue
+from animat.cultures.virtual import WARM_UP_S, VirtualCulture
+from animat.cultures.visibility import NOISE_UV
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.recordings.array import MAXONE
+from animat.recordings.protocol import Protocol
+from animat.recordings.recording import Recording
+from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from cultures import FEW, small_culture
+
+SHORT = Protocol((10.0, 40.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
+
+
+@pytest.fixture(scope="module")
+def culture() -> VirtualCulture:
+    return small_culture().open()
+
+
+def stimulus(culture: VirtualCulture, time_s: float, pattern: int = 0) -> Stimulus:
+    return Stimulus(time_s, tuple(culture.patterns[pattern].tolist()), PUBLISHED_PULSE)
+
+
+def test_an_electrode_sees_every_neuron_within_25_um_and_no_other(culture: VirtualCulture) -> None:
+    tissue, pairs = culture.tissue, culture.visibility.pairs
+    electrodes = np.arange(len(MAXONE))
+    x_um, y_um = (position + MAXONE.pitch_um / 2 for position in MAXONE.position_um(electrodes))
+    for neuron in range(0, 300, 7):
+        distance_um = np.hypot(x_um - tissue.x_um[neuron], y_um - tissue.y_um[neuron])
+        seen_by = pairs.electrode[pairs.neuron == neuron]
+        assert seen_by.tolist() == electrodes[distance_um <= 25.0].tolist()
+        np.testing.assert_allclose(pairs.distance_um[pairs.neuron == neuron], distance_um[seen_by])
+
+
+def test_spikes_are_smaller_with_distance_and_never_lost_in_noise(culture: VirtualCulture) -> None:
+    seen = culture.visibility
+    every = np.arange(300)
+    at_soma, halfway, far = (seen.amplitude_at(every, np.full(300, d)) for d in (0.0, 15.0, 25.0))
+    assert np.all((at_soma >= 60) & (at_soma <= 300))
+    np.testing.assert_allclose(halfway, at_soma / 2)
+    assert far.min() > 5 * NOISE_UV
+
+
+def test_the_scan_measures_what_the_neurons_do() -> None:
+    culture = small_culture()
+    with culture:
+        scan = culture.scan
+        assert scan is not None
+        assert len(scan) == len(MAXONE)
+        # The same tissue, asked neuron by neuron: what it fires while each block is scanned.
+        tissue = Tissue(1, FEW)
+        tissue.advance(WARM_UP_S)
+        for block in MAXONE.scan_blocks()[:3]:
+            fired = np.bincount(tissue.advance(1.0).neuron, minlength=300)
+            for electrode in block[::50]:
+                seen = culture.visibility.pairs.neuron[culture.visibility.pairs.electrode == electrode]
+                assert scan.rate_hz[electrode] == fired[seen].sum()
+        silent = scan.rate_hz == 0
+        assert np.all(np.isnan(scan.amplitude_uv[silent]))
+        assert not np.any(scan.signal_to_noise[silent])
+
+
+def test_sites_sit_on_neurons_and_stimulation_sites_on_excitatory_ones(culture: VirtualCulture) -> None:
+    selection, tissue = culture.selection, culture.tissue
+    pairs = culture.visibility.pairs_of(selection.stimulation)
+    nearest = [
+        pairs.neuron[pairs.electrode == i][np.argmin(pairs.distance_um[pairs.electrode == i])]
+        for i in range(len(selection.stimulation))
+    ]
+    assert np.mean(tissue.is_excitatory[nearest]) > 0.8
+    assert set(culture.stimulation_electrodes) <= set(selection.recording.tolist())
+
+
+def test_a_recording_is_what_the_tissue_does_on_its_own() -> None:
+    with small_culture() as culture:
+        schedule = culture.schedule(SHORT, seed=2)
+        snapshot = culture.tissue.snapshot()
+        start_s = culture.tissue.now_s
+        recording = culture.record(SHORT, seed=2)
+        tissue = Tissue(1, FEW)
+        tissue.restore(snapshot)
+        assert recording.start_min == 0.0
+        table, pairs = culture.selection.recording, culture.visibility.pairs
+        expected = []
+        recorded_s, passed_s = 0.0, start_s
+        for block in schedule.blocks:
+            tissue.rest(round(block.setup_s / 2e-4) * 2e-4)
+            passed_s += block.setup_s
+            pulses = []
+            for row, time_s in enumerate(block.stimuli.time_s):
+                x_um, y_um = MAXONE.position_um(block.stimuli.electrodes[row])
+                pulses.append(TissuePulse(passed_s + time_s, x_um + 8.75, y_um + 8.75))
+            spikes = tissue.advance(block.duration_s, pulses)
+            for time_s, neuron in zip(spikes.time_s.tolist(), spikes.neuron.tolist(), strict=True):
+                for electrode in pairs.electrode[pairs.neuron == neuron]:
+                    if electrode in table:
+                        since_s = time_s - passed_s
+                        expected.append(
+                            (round((recorded_s + since_s) * 20_000), int(np.searchsorted(table, electrode)))
+                        )
+            passed_s += block.duration_s
+            recorded_s += block.duration_s
+        frames = np.rint(recording.spike_times_s * 20_000).astype(int).tolist()
+        assert sorted(zip(frames, recording.spike_channels.tolist(), strict=True)) == sorted(expected)
+        assert recording.duration_s == pytest.approx(schedule.recorded_s)
+        assert culture.now_s == pytest.approx(schedule.duration_s)
+
+
+@pytest.mark.parametrize("piece_s", [0.0125, 0.00007, 0.3])
+def test_the_same_spikes_however_time_is_cut(piece_s: float) -> None:
+    whole, cut = small_culture().open(), small_culture().open()
+    total_s = 0.6
+    stimuli = [stimulus(whole, 0.0201 * i, i % 5) for i in range(1, 20)]
+    expected = whole.deliver(stimuli, total_s)
+    times, channels, now_s = [], [], 0.0
+    for i in range(1, round(total_s / piece_s) + 1):
+        end_s = min(i * piece_s, total_s)
+        due = [s for s in stimuli if now_s <= s.time_s < end_s]
+        moved = [Stimulus(max(0.0, s.time_s - now_s), s.electrodes, s.pulse) for s in due]
+        observed = cut.deliver(moved, end_s - now_s)
+        times.append(now_s + observed.spikes.time_s)
+        channels.append(observed.spikes.channel)
+        now_s = cut.now_s
+    known = expected.spikes.time_s < now_s - 1e-9
+    np.testing.assert_allclose(np.concatenate(times), expected.spikes.time_s[known], atol=2e-9)
+    assert np.array_equal(np.concatenate(channels), expected.spikes.channel[known])
+    assert len(np.concatenate(times)) > 50
+
+
+def test_stimulate_and_present_see_what_a_recording_sees() -> None:
+    one, other = small_culture().open(), small_culture().open()
+    seen = one.stimulate(one.patterns[0].tolist(), PUBLISHED_PULSE, (2.0, 10.0))
+    recording = other.present([stimulus(other, 0.0)], until_ms=10.0)
+    inside = (recording.spike_times_s >= 0.002 - 1e-9) & (recording.spike_times_s < 0.010 - 1e-9)
+    np.testing.assert_allclose(seen.time_s, recording.spike_times_s[inside], atol=1e-9)
+    assert sorted(seen.channel.tolist()) == sorted(recording.spike_channels[inside].tolist())
+    assert len(seen.time_s) > 0
+
+
+def test_the_strength_of_a_pulse_is_its_cathodic_charge() -> None:
+    def answer(pulse: Pulse) -> int:
+        with small_culture() as culture:
+            return sum(
+                len(culture.stimulate(culture.patterns[i].tolist(), pulse, (0.0, 10.0)).time_s) for i in range(10)
+            )
+
+    published = answer(PUBLISHED_PULSE)
+    same_charge = Pulse((Phase(1000, amplitude_mv=-100), Phase(1000, amplitude_mv=100)))
+    half = Pulse((Phase(250, amplitude_mv=-200), Phase(250, amplitude_mv=200)))
+    anodic = Pulse((Phase(50, amplitude_mv=100), Phase(50, amplitude_mv=0)))
+    assert answer(same_charge) == published
+    assert answer(anodic) < answer(half) < published
+
+
+def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    with small_culture() as culture:
+        culture.record(SHORT, seed=1)
+        # Ends in the middle of a step, with a pulse just given.
+        culture.deliver([stimulus(culture, 0.01)], 0.01013)
+        culture.save_state(tmp_path / "culture.state", sessions=1)
+        expected = culture.record(SHORT, seed=2)
+    again = small_culture()
+    assert again.restore_state(tmp_path / "culture.state") == {"sessions": 1}
+    with again:
+        assert again.record(SHORT, seed=2).equals(expected)
+    with pytest.raises(Mismatch, match="which differs in seed"):
+        small_culture(2).restore_state(tmp_path / "culture.state")
+    with pytest.raises(Mismatch, match="which differs in scan_s"):
+        small_culture(scan_s=2.0).restore_state(tmp_path / "culture.state")
+    whole = (tmp_path / "culture.state").read_bytes()
+    for damaged in (b"", whole[:100], whole[: len(whole) // 2], b"text", whole[:-200]):
+        (tmp_path / "bad.state").write_bytes(damaged)
+        with pytest.raises(InvalidFile, match=r"bad.state: expected the whole state"):
+            small_culture().restore_state(tmp_path / "bad.state")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(InvalidFile, match=r"other.npz: expected the whole state"):
+        small_culture().restore_state(tmp_path / "other.npz")
+    with pytest.raises(InvalidFile, match="no such file"):
+        small_culture().restore_state(tmp_path / "none.state")
+
+
+def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:
+    with small_culture() as culture:
+        recording = culture.record(SHORT)
+    recording.save(tmp_path / "one.nwb")
+    again = Recording.load(tmp_path / "one.nwb")
+    assert again.equals(recording)
+    assert Protocol.from_json(again.provenance["protocol"]) == SHORT
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
+        VirtualCulture(-1)
+    with pytest.raises(InvalidArgument, match="scan_s: expected above 0"):
+        VirtualCulture(1, scan_s=0.0)
+    with pytest.raises(InvalidArgument, match="expected one that was opened"):
+        _ = VirtualCulture(1).channels
+
+
+def test_a_replay_answers_with_what_was_measured() -> None:
+    protocol = Protocol((10.0, 40.0), order="mixed", pulses=2, patterns=5, presentations=8, setup_s=0.0, pause_s=0.2)
+    with small_culture() as culture:
+        source = culture.record(protocol)
+
+    def responses(recording: Recording, frequency_hz: float) -> list[tuple[tuple[int, int], ...]]:
+        found = []
+        stimuli = recording.stimuli
+        for i in np.flatnonzero(stimuli.is_last_of_presentation & (stimuli.frequency_hz == frequency_hz)):
+            until_s = stimuli.time_s[i] + 0.012
+            first, last = np.searchsorted(recording.spike_times_s, [stimuli.time_s[i] - 1e-9, until_s - 1e-9])
+            frames = np.rint((recording.spike_times_s[first:last] - stimuli.time_s[i]) * 20_000).astype(int)
+            found.append(
+                tuple(sorted(zip(frames.tolist(), recording.spike_channels[first:last].tolist(), strict=True)))
+            )
+        return found
+
+    with ReplayCulture([source], seed=3) as replay:
+        drawn = replay.record(protocol, seed=9)
+    with ReplayCulture([source], how="in order") as replay:
+        in_order = replay.record(protocol, seed=9)
+    for frequency_hz in (10.0, 40.0):
+        measured = responses(source, frequency_hz)
+        assert responses(in_order, frequency_hz) == measured
+        assert set(responses(drawn, frequency_hz)) <= set(measured)
+    with (
+        ReplayCulture([source]) as replay,
+        pytest.raises(InvalidArgument, match=r"expected one that was recorded \(10, 40 Hz\), got 20"),
+    ):
+        replay.present([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)])

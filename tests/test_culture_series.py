@@ -1,0 +1,150 @@
+"""A series of recordings, interrupted at any moment, is the undisturbed one. Oracle: the undisturbed run itself."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from animat.cultures.series import STATE_FILE, record_virtual_series
+from animat.cultures.virtual import VirtualCulture
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.recordings.protocol import Protocol
+from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.selection import Selection
+from cultures import small_culture
+
+SHORT = Protocol((20.0, 80.0), patterns=5, presentations=10, setup_s=0.5, pause_s=0.2)
+PROGRAM = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from cultures import small_culture
+from test_culture_series import record
+record(sys.argv[2], sessions=int(sys.argv[3]))
+"""
+
+
+def record(folder: str | Path, *, sessions: int = 4, seed: int = 1, protocol: Protocol = SHORT) -> list[Path]:
+    return record_virtual_series(lambda: small_culture(seed), protocol, folder, sessions=sessions, interval_min=2.0)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return record(tmp_path_factory.mktemp("undisturbed"))
+
+
+def same(files: list[Path], others: list[Path]) -> bool:
+    return len(files) == len(others) and all(
+        a.name == b.name and read_recording(a).equals(read_recording(b)) for a, b in zip(files, others, strict=True)
+    )
+
+
+def copied(files: list[Path], to: Path) -> Path:
+    shutil.copytree(files[0].parent, to)
+    return to
+
+
+def test_a_series_has_its_recordings_at_their_minutes(undisturbed: list[Path]) -> None:
+    folder = undisturbed[0].parent
+    assert [file.name for file in undisturbed] == [f"recording_{m:04}_min.nwb" for m in (0, 2, 4, 6)]
+    recordings = read_recordings(folder)
+    assert [recording.start_min for recording in recordings] == [0.0, 2.0, 4.0, 6.0]
+    assert len({tuple(recording.stimuli.pattern.tolist()) for recording in recordings}) == 4
+    selection = Selection.load(folder / "selection.json")
+    assert selection.recording.tolist() == recordings[0].channels.electrode.tolist()
+    assert sorted(p.name for p in folder.iterdir() if p.suffix != ".nwb") == [STATE_FILE, "selection.json"]
+
+
+def test_it_is_longer_when_asked_again_for_more(undisturbed: list[Path], tmp_path: Path) -> None:
+    record(tmp_path / "a", sessions=1)
+    record(tmp_path / "a", sessions=3)
+    assert same(record(tmp_path / "a"), undisturbed)
+
+
+def test_what_is_there_is_kept_and_nothing_is_done_again(
+    undisturbed: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = [file.stat().st_mtime_ns for file in undisturbed]
+    monkeypatch.setattr(VirtualCulture, "_open", lambda self: pytest.fail("opened in vain"))
+    assert record(undisturbed[0].parent) == undisturbed
+    assert record(undisturbed[0].parent, sessions=2) == undisturbed[:2]
+    assert [file.stat().st_mtime_ns for file in undisturbed] == times
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        [STATE_FILE],
+        ["recording_0006_min.nwb"],
+        ["recording_0002_min.nwb"],
+        ["recording_0000_min.nwb", STATE_FILE],
+        ["recording_0004_min.nwb", "recording_0006_min.nwb", "selection.json"],
+    ],
+)
+def test_whatever_is_lost_comes_back_the_same(undisturbed: list[Path], tmp_path: Path, lost: list[str]) -> None:
+    folder = copied(undisturbed, tmp_path / "series")
+    for name in lost:
+        (folder / name).unlink()
+    assert same(record(folder), undisturbed)
+
+
+def test_a_state_that_is_behind_its_recordings_catches_up(undisturbed: list[Path], tmp_path: Path) -> None:
+    # As if killed between a recording and the state after it.
+    record(tmp_path / "behind", sessions=1)
+    for file in undisturbed[1:3]:
+        shutil.copy(file, tmp_path / "behind")
+    assert same(record(tmp_path / "behind"), undisturbed)
+
+
+def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path], tmp_path: Path) -> None:
+    folder = undisturbed[0].parent
+    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture and protocol \(seed 2\)"):
+        record(folder, seed=2)
+    with pytest.raises(Mismatch, match="protocol"):
+        record(folder, protocol=Protocol((20.0, 80.0), patterns=5, presentations=9, setup_s=0.5, pause_s=0.2))
+    other = copied(undisturbed, tmp_path / "other")
+    shutil.copy(other / "recording_0002_min.nwb", other / "recording_0004_min.nwb")
+    with pytest.raises(Mismatch, match=r"recording_0004_min.nwb: expected"):
+        record(other)
+    (other / "recording_0004_min.nwb").unlink()
+    (other / STATE_FILE).write_bytes(b"damaged")
+    with pytest.raises(InvalidFile, match=r"culture.state: expected the whole state"):
+        record(other)
+
+
+def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match=r"interval_min: expected at least the 0\.04 min"):
+        record_virtual_series(lambda: small_culture(), SHORT, tmp_path, sessions=2, interval_min=0.01)
+    with pytest.raises(InvalidArgument, match="sessions: expected at least 1"):
+        record_virtual_series(lambda: small_culture(), SHORT, tmp_path, sessions=0)
+    assert not list(tmp_path.glob("*.nwb"))
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_at_any_moment_it_goes_on_to_the_same_bits(undisturbed: list[Path], tmp_path: Path, seed: int) -> None:
+    folder, rng, kills = tmp_path / "series", random.Random(seed), 0
+    command = [sys.executable, "-B", "-c", PROGRAM, str(Path(__file__).parent), str(folder), "4"]
+    for _ in range(40):
+        process = subprocess.Popen(command, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
+        try:
+            # Ever later, so that it comes to an end; the import alone takes a second.
+            process.wait(rng.uniform(0.5, 2.5 + 0.1 * kills))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+            for file in folder.glob("*.nwb"):
+                read_recording(file)
+            continue
+        assert process.returncode == 0
+        break
+    assert kills >= 1
+    assert same(sorted(folder.glob("*.nwb")), undisturbed)
+    assert not list(folder.glob(".*"))
