@@ -76,7 +76,7 @@ import sys
 from pathlib import Path
 from test_training import SHORT, timeline_of
 from animat.training.trainer import train
-train(SHORT, timeline_of(), Path(sys.argv[1]))
+train(SHORT, timeline_of(), Path(sys.argv[1]), checkpoint_s=0.0)
 """
 
 
@@ -139,19 +139,19 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
         raise Stop
 
     with pytest.raises(Stop):
-        train_group(group, checkpoint, stop)
+        train_group(group, checkpoint, stop, checkpoint_s=0.0)
     with pytest.raises(InvalidFile, match="of another"):
-        train_group(replace(group, fingerprint="other"), checkpoint, stop)
+        train_group(replace(group, fingerprint="other"), checkpoint, stop, checkpoint_s=0.0)
     checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
     with pytest.raises(InvalidFile, match="cannot be read"):
-        train_group(group, checkpoint, stop)
+        train_group(group, checkpoint, stop, checkpoint_s=0.0)
 
 
 def weights_after(training: Training, timeline: SimulatorTimeline, checkpoint: Path) -> bytes:
     """The first layer of the first policy, trained in this process."""
     group = Group(training, (0,), timeline, "any", {})
     policy = train_group(group, checkpoint, lambda done, mean_return: None)[0]
-    checkpoint.unlink()
+    assert not checkpoint.exists(), "training took longer than expected and left a checkpoint for the next one"
     return policy.weights[0].tobytes()
 
 
@@ -209,9 +209,9 @@ def test_groups_are_even_and_depend_on_the_number_of_policies_only() -> None:
 
 def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:
     short = replace(SHORT, iterations=1_000, policies=1)
-    # A file where the folder of checkpoints should be.
-    (tmp_path / ".unfinished").write_text("in the way")
-    with pytest.raises(InvalidFile, match="cannot be written"):
+    (tmp_path / ".unfinished").mkdir()
+    (tmp_path / ".unfinished" / "from-p0.npz").write_text("in the way")
+    with pytest.raises(InvalidFile, match="cannot be read"):
         train(short, timeline_of(), tmp_path)
     assert not bits(tmp_path)
 
@@ -221,6 +221,7 @@ def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:
     [
         ({"policies": 0}, "policies"),
         ({"iterations": 0}, "iterations"),
+        ({"iterations": 2**31}, "iterations"),
         ({"seed": -1}, "seed"),
         ({"duration_min": 0.0}, "duration_min"),
         ({"duration_min": float("nan")}, "duration_min"),

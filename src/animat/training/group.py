@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,10 @@ Report = Callable[[int, float], None]
 """Told after each chunk how many are done, and the mean return of the episodes that ended in it (NaN for none)."""
 
 
+CHECKPOINT_S = 2.0
+"""Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
+
+
 @dataclass(frozen=True, eq=False)
 class Group:
     """Some of a training's policies, and what they are trained on.
@@ -43,15 +48,16 @@ class Group:
     provenance: dict[str, Any]
 
 
-def train_group(group: Group, checkpoint: Path, report: Report) -> list[Policy]:
+def train_group(group: Group, checkpoint: Path, report: Report, *, checkpoint_s: float = CHECKPOINT_S) -> list[Policy]:
     """Train a group of policies, going on from its checkpoint where there is one.
 
     The result is the same, bit for bit, however often the training was stopped and started again.
 
     Args:
         group: the policies to train.
-        checkpoint: file to write after each chunk, complete or absent; the caller removes it when it is done with.
+        checkpoint: file to write now and then, complete or absent; the caller removes it when it is done with.
         report: told after each chunk.
+        checkpoint_s: seconds between checkpoints; they change how much is done again, never the result.
 
     Raises:
         InvalidFile: if the checkpoint cannot be read or written, or is of another training.
@@ -73,6 +79,7 @@ def train_group(group: Group, checkpoint: Path, report: Report) -> list[Policy]:
         done, learners, curve = _read_checkpoint(checkpoint, group.fingerprint, learners, curve)
 
     start_min = 0.0 if timeline is None else float(timeline.start_min[0])
+    written = time.monotonic()
     for index in range(done, CHUNKS):
         first, last = training.chunk(index)
         simulator = None if timeline is None else timeline.at(start_min + training.minute(index))
@@ -82,25 +89,27 @@ def train_group(group: Group, checkpoint: Path, report: Report) -> list[Policy]:
             curve[index] = np.stack(
                 [np.full(len(episodes), last * settings.environments), episodes, returns / episodes], axis=1
             )
-        _write_checkpoint(checkpoint, group.fingerprint, index + 1, learners, curve)
+        if time.monotonic() - written > checkpoint_s:
+            _write_checkpoint(checkpoint, group.fingerprint, index + 1, learners, curve)
+            written = time.monotonic()
         report(index + 1, float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan"))
     return [
         _policy(
             group,
             environment.scales,
-            jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), learners.trained),
+            jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), learners.deployed),
             curve[:, i],
         )
         for i in range(len(group.members))
     ]
 
 
-def _policy(group: Group, scales: np.ndarray, trained: Any, curve: np.ndarray) -> Policy:
+def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> Policy:
     training, timeline = group.training, group.timeline
     through_neurons = training.mapping is not None and timeline is not None
     return Policy(
-        weights=tuple(layer.weight for layer in trained.actor),
-        biases=tuple(layer.bias[0] for layer in trained.actor),
+        weights=tuple(layer.weight for layer in actor),
+        biases=tuple(layer.bias[0] for layer in actor),
         scales=scales,
         robot=training.robot,
         mapping=training.mapping,

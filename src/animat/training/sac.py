@@ -41,6 +41,7 @@ class SAC:
         discount: gamma.
         follow: share of the critics that the target critics take over at each update (tau).
         reward_scale: rewards are multiplied by it inside the learner only.
+        averaging: the deployed actor is an average over about the last 1 / averaging of its training so far.
         first_alpha: weight of the entropy bonus at the start.
         entropy_share: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
         entropy_nats: the entropy that a continuous action keeps.
@@ -58,12 +59,15 @@ class SAC:
     discount: float = 0.99
     follow: float = 0.005
     reward_scale: float = 0.1
+    averaging: int = 8
     first_alpha: float = 0.1
     entropy_share: float = 0.1
     entropy_nats: float = -1.0
 
     def __post_init__(self) -> None:
-        for name in ("environments", "updates", "batch", "replay", "hidden"):
+        if self.replay > 2**23:
+            raise InvalidArgument(f"replay: expected at most 8388608, as float32 numbers no more, got {self.replay}")
+        for name in ("environments", "updates", "batch", "replay", "hidden", "averaging"):
             if getattr(self, name) < 1:
                 raise InvalidArgument(f"{name}: expected at least 1, got {getattr(self, name)}")
         if self.replay % self.environments:
@@ -91,9 +95,10 @@ class Trained(NamedTuple):
 
 
 class Learner(NamedTuple, Generic[RobotState]):
-    """One policy while it is trained: everything that the next iteration depends on."""
+    """One policy while it is trained: everything that the next iteration depends on, and the actor to be deployed."""
 
     trained: Trained
+    deployed: Network
     targets: Network
     optimiser: Any
     replay: Float[Array, "transitions row"]
@@ -240,6 +245,7 @@ def begin(environment: Environment[RobotState], settings: SAC, key: PRNGKeyArray
     trained = Trained(actor, critics, jnp.float32(math.log(settings.first_alpha)))
     return Learner(
         trained=trained,
+        deployed=actor,
         targets=critics,
         optimiser=_adam(settings).init(trained),
         replay=jnp.zeros((settings.replay, 2 * n + 3)),
@@ -287,7 +293,8 @@ def train_chunk(
         )
         available = jnp.minimum(written + settings.environments, settings.replay)
         learner = _learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
-        return learner._replace(key=key), jax.tree.map(jnp.add, before, finished)
+        learner = learner._replace(key=key, deployed=_average(settings, learner.deployed, learner.trained.actor, index))
+        return learner, jax.tree.map(jnp.add, before, finished)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
     trained: tuple[Learner[RobotState], Finished] = jax.lax.fori_loop(
@@ -371,6 +378,17 @@ def _learn(
         update, (learner.trained, learner.targets, learner.optimiser), uniforms
     )
     return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
+
+
+def _average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
+    """Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824): it forgets in proportion to its age.
+
+    The last actor of a training is as good as its last few updates were lucky; the average is not. With k the
+    averaging and t the rounds done: average += (k + 1) / (t + k) (actor - average), so that the first is taken whole.
+    """
+    rate = (settings.averaging + 1.0) / (index + 1.0 + settings.averaging)
+    moved: Network = jax.tree.map(lambda average, new: average + rate * (new - average), deployed, actor)
+    return moved
 
 
 def _adam(settings: SAC) -> optax.GradientTransformation:

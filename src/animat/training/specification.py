@@ -56,6 +56,10 @@ class Training:
         for name in ("policies", "iterations"):
             if getattr(self, name) < 1:
                 raise InvalidArgument(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.iterations > 2**31 - 1 - self.algorithm.environments:
+            raise InvalidArgument(
+                f"iterations: expected at most 2e9, as they are counted in int32, got {self.iterations}"
+            )
         if self.seed < 0:
             raise InvalidArgument(f"seed: expected a whole number from 0 on, got {self.seed}")
         if not (math.isfinite(self.duration_min) and self.duration_min > 0):

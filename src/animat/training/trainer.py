@@ -12,6 +12,7 @@ import selectors
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import numpy as np
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress, Silent
-from animat.training.group import Group, split_groups
+from animat.training.group import CHECKPOINT_S, Group, split_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import written_whole
@@ -38,6 +39,7 @@ def train(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
+    checkpoint_s: float = CHECKPOINT_S,
     sources: Sequence[str] = (),
 ) -> dict[str, Policy]:
     """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which says what they are.
@@ -51,6 +53,7 @@ def train(
         folder: where the policies go; made where it is missing.
         workers: processes to use, each pinned to a core of its own; None: as many as there are cores.
         progress: told how far it is.
+        checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
         sources: names of the recordings, for the manifest.
 
     Returns:
@@ -77,7 +80,7 @@ def train(
         Group(training, members, _on_host(timeline), manifest["fingerprint"], _provenance(manifest, members))
         for members in split_groups(training.policies)
     ]
-    _run([group for group in groups if not _is_trained(group, folder)], folder, workers, progress)
+    _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
     shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
     return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
 
@@ -151,7 +154,7 @@ def _on_host(timeline: SimulatorTimeline | None) -> Any:
     return replace(timeline, simulators=jax.device_get(timeline.simulators))
 
 
-def _run(groups: list[Group], folder: Path, workers: int | None, progress: Progress) -> None:
+def _run(groups: list[Group], folder: Path, workers: int | None, checkpoint_s: float, progress: Progress) -> None:
     """Train the groups on processes, each pinned to its own core; the first error ends all."""
     cores = sorted(os.sched_getaffinity(0))
     free = cores[: min(len(cores), len(groups), workers or len(cores))]
@@ -164,7 +167,7 @@ def _run(groups: list[Group], folder: Path, workers: int | None, progress: Progr
         while waiting or running:
             while waiting and free:
                 group, core = waiting.pop(0), free.pop(0)
-                process = _start(group, folder, core)
+                process = _start(group, folder, core, checkpoint_s)
                 assert process.stdout is not None
                 selector.register(process.stdout, selectors.EVENT_READ, core)
                 running[core] = (process, group)
@@ -198,12 +201,12 @@ def _run(groups: list[Group], folder: Path, workers: int | None, progress: Progr
         selector.close()
 
 
-def _start(group: Group, folder: Path, core: int) -> subprocess.Popen[bytes]:
+def _start(group: Group, folder: Path, core: int, checkpoint_s: float) -> subprocess.Popen[bytes]:
     checkpoint = folder / _UNFINISHED / f"from-p{group.members[0]}.npz"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "animat.training.worker", str(core)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    assert process.stdin is not None
-    process.stdin.write(pickle.dumps((group, folder, checkpoint)))
-    process.stdin.close()
-    return process
+    # From a file, not a pipe: the job may be larger than a pipe holds, and is read only once JAX is imported.
+    with tempfile.TemporaryFile() as job:
+        pickle.dump((group, folder, checkpoint, checkpoint_s), job)
+        job.seek(0)
+        return subprocess.Popen(
+            [sys.executable, "-m", "animat.training.worker", str(core)], stdin=job, stdout=subprocess.PIPE, bufsize=0
+        )

@@ -28,13 +28,15 @@ def main() -> int:
     group: Group
     folder: Path
     checkpoint: Path
-    group, folder, checkpoint = pickle.load(sys.stdin.buffer)
+    checkpoint_s: float
+    group, folder, checkpoint, checkpoint_s = pickle.load(sys.stdin.buffer)
 
     def report(done: int, mean_return: float) -> None:
         print(json.dumps({"done": done, "mean_return": mean_return}), flush=True)
 
     try:
-        for member, policy in zip(group.members, train_group(group, checkpoint, report), strict=True):
+        policies = train_group(group, checkpoint, report, checkpoint_s=checkpoint_s)
+        for member, policy in zip(group.members, policies, strict=True):
             policy.save(folder / f"p{member}.safetensors")
         checkpoint.unlink(missing_ok=True)
     except AnimatError as error:
