@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcommand
 
-from animat.errors import AnimatError, InvalidArgument
+from animat.errors import AnimatError, InvalidArgument, Mismatch
 from animat.recordings.findings import Finding
 
 if TYPE_CHECKING:
@@ -147,12 +147,13 @@ class Inspect(Responding):
         from animat.neurons.inspection import inspect_recording
         from animat.recordings.reading import list_recordings, read_recording
         from animat.report.inspection import draw_inspection, inspection_text
+        from animat.report.series import draw_series
 
         by = None if self.conditions is None else conditions_named(self.conditions)
         files = list_recordings(self.recordings)
         if self.out is not None and len({file.name for file in files}) < len(files):
             raise InvalidArgument("--out: expected recordings of different names, got two alike; inspect them apart")
-        inspected = []
+        inspected, series = [], []
         for file in files:
             recording = read_recording(file)
             inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
@@ -162,7 +163,17 @@ class Inspect(Responding):
                 figures = [str(figure) for figure in draw_inspection(recording, inspection, self.out, self.format)]
                 print(f"figures: {', '.join(figures)}\n")
                 inspected[-1]["figures"] = figures
-        return {"recordings": inspected}
+                series.append((recording.start_min, file, inspection.responses))
+        if self.out is None or not series:
+            return {"recordings": inspected}
+        first = read_recording(min(series, key=lambda one: one[0])[1])
+        try:
+            figures = [str(figure) for figure in draw_series(first, [one[2] for one in series], self.out, self.format)]
+        except Mismatch as unlike:
+            print(f"no figures of the series: {unlike}")
+            return {"recordings": inspected}
+        print(f"figures of the series: {', '.join(figures)}")
+        return {"recordings": inspected, "figures": figures}
 
 
 @dataclass(frozen=True)
@@ -265,7 +276,6 @@ class Evaluate(Fitting):
     def run(self) -> dict[str, Any]:
         """Evaluate."""
         from animat.compilation import keep_compilations
-        from animat.errors import Mismatch
         from animat.training.policy import load_policies
 
         if self.episodes < 1:

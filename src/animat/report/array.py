@@ -1,0 +1,90 @@
+"""The array from above: where is recorded, how active each site is, and where is stimulated."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.selection import Selection
+from animat.report.style import GREY, RED, add_legend, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MOST_LABELS = 64
+
+
+def draw_array(recording: Recording) -> Figure:
+    """Recording sites coloured by their firing rate, and the electrodes that were stimulated.
+
+    A stimulated electrode is drawn where a channel reads it; the title counts those whose position is not known.
+    """
+    channels, stimuli = recording.channels, recording.stimuli
+    figure = new_figure(8.5, 5.2)
+    axes = figure.subplots()
+    rate_hz = np.bincount(recording.spike_channels, minlength=len(channels)) / max(recording.duration_s, 1e-9)
+    known = np.isfinite(channels.x_um) & np.isfinite(channels.y_um)
+    # A few channels of a very high rate must not leave all others dark.
+    highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
+    drawn = axes.scatter(
+        channels.x_um[known],
+        channels.y_um[known],
+        c=rate_hz[known],
+        vmin=0,
+        vmax=max(highest_hz, 1e-9),
+        cmap="cividis",
+        s=9,
+        linewidths=0,
+    )
+    bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
+    bar.set_label("firing rate, stimulated time included (Hz)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    stimulated = np.unique(stimuli.electrodes[stimuli.electrodes != UNKNOWN])
+    place = {int(e): i for i, e in enumerate(channels.electrode.tolist()) if e != UNKNOWN and known[i]}
+    rows = [place[e] for e in stimulated.tolist() if e in place]
+    _ring(axes, channels.x_um[rows], channels.y_um[rows], f"{len(rows)} stimulated electrodes")
+    unplaced = len(stimulated) - len(rows)
+    title = f"{np.count_nonzero(known):,} recording sites at {recording.start_min:g} min"
+    if np.any(~known):
+        title += f"; {np.count_nonzero(~known):,} channels of unknown position are not drawn"
+    if unplaced:
+        title += f"; {unplaced} stimulated electrodes that no channel reads are not drawn"
+    _finish(axes, title)
+    return figure
+
+
+def draw_selection(selection: Selection) -> Figure:
+    """The whole array with the recording sites, the stimulation sites with their numbers, and the first pattern."""
+    array = selection.array
+    figure = new_figure(8.5, 5.2)
+    axes = figure.subplots()
+    x_um, y_um = array.position_um(selection.recording)
+    axes.scatter(x_um, y_um, s=7, color=GREY, linewidths=0, label=f"{len(selection.recording):,} recording sites")
+    x_um, y_um = array.position_um(selection.stimulation)
+    _ring(axes, x_um, y_um, f"{len(selection.stimulation)} stimulation sites")
+    if len(selection.stimulation) <= _MOST_LABELS:
+        for electrode, x, y in zip(selection.stimulation.tolist(), x_um.tolist(), y_um.tolist(), strict=True):
+            axes.annotate(str(electrode), (x, y), xytext=(4, 3), textcoords="offset points", fontsize=6)
+    if len(selection.patterns):
+        x_um, y_um = array.position_um(selection.patterns[0])
+        axes.scatter(x_um, y_um, s=26, color=RED, linewidths=0, label=f"pattern 0 of {len(selection.patterns)}")
+    axes.set_xlim(-2 * array.pitch_um, (array.columns + 1) * array.pitch_um)
+    _finish(axes, f"{array.name}: {selection.passed:,} of {selection.scanned:,} scanned electrodes passed")
+    return figure
+
+
+def _ring(axes: Axes, x_um: np.ndarray, y_um: np.ndarray, label: str) -> None:
+    if len(x_um):
+        axes.scatter(x_um, y_um, s=55, facecolors="none", edgecolors=RED, linewidths=1.2, label=label)
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_aspect("equal")
+    # Rows are counted from the top, as on the chip.
+    axes.invert_yaxis()
+    style_axes(axes, title, "x (um)", "y (um)")
+    if axes.get_legend_handles_labels()[0]:
+        add_legend(axes, loc="upper left", bbox_to_anchor=(0, -0.14), ncols=3)

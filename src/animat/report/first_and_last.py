@@ -1,0 +1,63 @@
+"""Response histograms of every condition at the start and at the end of a series, with P50 of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from animat.neurons.responses import Responses
+from animat.report.response_histograms import rate_edges
+from animat.report.style import GREY, MEDIAN, add_legend, condition_colours, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_BINS = 30
+_MOST_PANELS = 12
+
+
+def draw_first_and_last(series: Sequence[Responses]) -> Figure:
+    """Non-burst responses of each condition: filled in the first recording, as an outline in the last.
+
+    Args:
+        series: responses of the recordings in the order of time, with the same conditions. At most 12 conditions
+            are drawn.
+    """
+    first, last = series[0], series[-1]
+    conditions = first.conditions[:_MOST_PANELS]
+    figure = new_figure(6.0, 1.0 + 1.3 * max(len(conditions), 1))
+    panels = figure.subplots(max(len(conditions), 1), 1, sharex=True, squeeze=False)[:, 0]
+    colours = condition_colours([condition.unit for condition in first.conditions])
+    edges_hz = rate_edges(first, np.concatenate([first.non_burst_rate_hz, last.non_burst_rate_hz]), _BINS)
+    for i, (axes, condition) in enumerate(zip(panels, conditions, strict=False)):
+        for responses, filled in ((first, True), (last, False)):
+            x = responses.rates_of(i)
+            share = np.histogram(x, edges_hz)[0] / max(len(x), 1)
+            colour = colours[i] if filled else GREY
+            label = f"{responses.start_min:g} min"
+            axes.stairs(share, edges_hz, fill=filled, color=colour, linewidth=None if filled else 1.6, label=label)
+            if math.isfinite(responses.median_rate_hz):
+                axes.axvline(
+                    responses.median_rate_hz,
+                    color=MEDIAN if filled else GREY,
+                    linewidth=1.3,
+                    linestyle="--",
+                    label=f"P50 at {responses.start_min:g} min: {responses.median_rate_hz:.1f} Hz" if i == 0 else None,
+                )
+        shares = [responses.shares_above_median()[i] for responses in (first, last)]
+        style_axes(
+            axes,
+            f"{condition.label}: P(x ≥ P50) {shares[0]:.2f} in the first, {shares[1]:.2f} in the last recording",
+            "",
+            "fraction",
+        )
+        if i == 0:
+            add_legend(axes, loc="upper right")
+    left_out = len(first.conditions) - len(conditions)
+    figure.supxlabel(
+        "response x (Hz per channel)" + (f"; {left_out} more conditions are not drawn" if left_out else ""), fontsize=9
+    )
+    return figure

@@ -1,0 +1,54 @@
+"""The figures of a series of recordings of one culture, in a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from animat.errors import InvalidArgument, Mismatch
+from animat.neurons.responses import Responses
+from animat.recordings.recording import Recording
+from animat.report.array import draw_array
+from animat.report.drift import draw_drift
+from animat.report.first_and_last import draw_first_and_last
+from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.style import save_figure
+
+
+def draw_series(
+    first: Recording, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
+) -> list[Path]:
+    """Draw a series: `series-array`, `series-responses`, `series-over-time` (of the first condition), `series-drift`.
+
+    Args:
+        first: the first recording, for the array.
+        series: responses of all recordings, in any order.
+        folder: where to; it is made if it is missing.
+        file_format: `"png"`, `"svg"` or `"pdf"`.
+
+    Returns:
+        The files: the array only where its positions are known, the others only for two recordings or more.
+
+    Raises:
+        InvalidArgument: for no responses.
+        Mismatch: for recordings with different conditions.
+        InvalidFile: if a file cannot be written.
+    """
+    if not series:
+        raise InvalidArgument("series: expected the responses of at least one recording, got none")
+    ordered = sorted(series, key=lambda responses: responses.start_min)
+    for responses in ordered[1:]:
+        if [c.label for c in responses.conditions] != [c.label for c in ordered[0].conditions]:
+            raise Mismatch(
+                f"conditions: expected the same in all recordings of a series, but those at {responses.start_min:g} "
+                f"min are others than those at {ordered[0].start_min:g} min: inspect them apart"
+            )
+    figures = {}
+    if first.channels.has_positions:
+        figures["array"] = draw_array(first)
+    if len(ordered) > 1 and all(len(responses) for responses in ordered):
+        figures["responses"] = draw_first_and_last(ordered)
+        figures["over-time"] = draw_responses_over_time(ordered, 0)
+        figures["drift"] = draw_drift(ordered)
+    return [save_figure(figure, Path(folder) / f"series-{what}.{file_format}") for what, figure in figures.items()]

@@ -1,0 +1,97 @@
+"""The figures of a series show what is in it: marks are counted and numbers read back from the axes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from animat.errors import InvalidArgument, Mismatch
+from animat.neurons.conditions import conditions_named
+from animat.neurons.responses import Responses, extract_responses
+from animat.recordings.array import MAXONE
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.recording import Recording
+from animat.recordings.selection import Selection
+from animat.report.array import draw_array, draw_selection
+from animat.report.drift import draw_drift
+from animat.report.first_and_last import draw_first_and_last
+from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.series import draw_series
+from animat.report.style import MEDIAN
+
+
+@pytest.fixture(scope="module")
+def recordings() -> list[Recording]:
+    return [make_up_recording(1, start_min=m, patterns=40, channels=64) for m in (0.0, 30.0, 60.0)]
+
+
+@pytest.fixture(scope="module")
+def series(recordings: list[Recording]) -> list[Responses]:
+    return [extract_responses(recording) for recording in recordings]
+
+
+def test_a_series_has_its_figures(recordings: list[Recording], series: list[Responses], tmp_path: Path) -> None:
+    files = draw_series(recordings[0], series[::-1], tmp_path / "figures", "svg")
+    names = ["series-array.svg", "series-responses.svg", "series-over-time.svg", "series-drift.svg"]
+    assert [file.name for file in files] == names
+    assert "P50 at 60 min" in files[1].read_text()
+    assert [file.name for file in draw_series(recordings[0], series[:1], tmp_path)] == ["series-array.png"]
+    nowhere = replace(recordings[0].channels, x_um=np.full(64, np.nan))
+    assert draw_series(replace(recordings[0], channels=nowhere), series[:1], tmp_path) == []
+    with pytest.raises(InvalidArgument, match="at least one recording"):
+        draw_series(recordings[0], [], tmp_path)
+    others = extract_responses(recordings[1], conditions_named("pattern"))
+    with pytest.raises(Mismatch, match="at 30 min are others than those at 0 min"):
+        draw_series(recordings[0], [series[0], others], tmp_path)
+
+
+def test_the_array_shows_every_site_and_counts_what_it_cannot_place(recordings: list[Recording]) -> None:
+    axes = draw_array(recordings[0]).axes[0]
+    assert len(axes.collections[0].get_offsets()) == 64
+    # Made-up cultures stimulate electrodes that no channel reads.
+    assert len(axes.collections) == 1
+    assert "32 stimulated electrodes that no channel reads are not drawn" in axes.get_title(loc="left")
+    unknown = recordings[0].channels.x_um.copy()
+    unknown[:3] = np.nan
+    some = draw_array(replace(recordings[0], channels=replace(recordings[0].channels, x_um=unknown))).axes[0]
+    assert len(some.collections[0].get_offsets()) == 61
+    assert "3 channels of unknown position" in some.get_title(loc="left")
+
+
+def test_a_selection_shows_its_sites_with_their_numbers() -> None:
+    selection = Selection(MAXONE, np.arange(0, 20_000, 200), np.array([200, 4000, 8000]), np.array([[200, 8000]]))
+    axes = draw_selection(selection).axes[0]
+    assert [len(drawn.get_offsets()) for drawn in axes.collections] == [100, 3, 2]
+    assert [text.get_text() for text in axes.texts] == ["200", "4000", "8000"]
+    np.testing.assert_allclose(axes.collections[2].get_offsets(), np.column_stack(MAXONE.position_um([200, 8000])))
+
+
+def test_the_drift_is_the_percentiles(series: list[Responses]) -> None:
+    upper, middle, lower = draw_drift(series).axes
+    medians = [np.median(r.rate_hz[~r.is_burst]) for r in series]
+    np.testing.assert_allclose(upper.lines[0].get_xydata(), np.column_stack([[0, 30, 60], medians]))
+    for i, line in enumerate(middle.lines[:5]):
+        np.testing.assert_allclose(line.get_ydata(), [r.shares_above_median()[i] for r in series])
+    np.testing.assert_allclose(lower.lines[0].get_ydata(), [r.is_burst.mean() for r in series])
+
+
+def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
+    axes = draw_responses_over_time(series, 0).axes[0]
+    marks = [line.get_xdata()[0] for line in axes.lines if to_hex(line.get_color()) == MEDIAN.lower()]
+    np.testing.assert_allclose(marks, [np.median(r.rates_of(0)) for r in series])
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["0", "30", "60"]
+    many = [replace(series[0], start_min=float(m)) for m in range(50)]
+    drawn = draw_responses_over_time(many, 0).axes[0]
+    assert "(20 of 50 recordings)" in drawn.get_title(loc="left")
+
+
+def test_first_and_last_hold_every_response(series: list[Responses]) -> None:
+    panels = draw_first_and_last(series).axes
+    assert len(panels) == 5
+    for panel in panels:
+        for drawn in panel.patches:
+            assert drawn.get_data().values.sum() == pytest.approx(1.0)
