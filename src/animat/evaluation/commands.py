@@ -1,0 +1,173 @@
+"""The commands that an action leads to, as a distribution: what an expectation over the neurons is taken over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64
+
+from animat.animat import Animat, Environment
+from animat.errors import InvalidArgument
+from animat.mapping import Mapping, Thresholds
+from animat.neurons.simulator import NeuronSimulator
+
+CONTINUOUS_ACTIONS = 21
+"""How many evenly spaced commands stand for a continuous action."""
+
+_QUANTILES = 2048
+"""How many responses of equal probability stand for a condition's distribution, where the mapping is continuous."""
+
+_MOST_LEVELS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """For each action, the commands u it can lead to, with their probabilities.
+
+    Attributes:
+        actions: what an environment is handed for each action: an index, or a command, shape (actions,).
+        levels: the commands of each action, in [-1, 1], shape (actions, levels).
+        probabilities: of each of them; every row adds up to 1, shape (actions, levels).
+    """
+
+    actions: np.ndarray
+    levels: Float64[np.ndarray, "actions levels"]
+    probabilities: Float64[np.ndarray, "actions levels"]
+
+    def with_noise(self, largest: float) -> Commands:
+        """The same with each command changed by noise evenly distributed in [-largest, largest].
+
+        Two points at +-largest / sqrt(3) stand for it: the mean of a cubic polynomial over them is the right one.
+        """
+        shift = largest / np.sqrt(3)
+        if shift == 0:
+            return self
+        levels = np.concatenate([self.levels - shift, self.levels + shift], axis=1)
+        return Commands(self.actions, levels, np.concatenate([self.probabilities, self.probabilities], axis=1) / 2)
+
+    def onto(self, nodes: Float64[np.ndarray, " nodes"], *, smooth: bool) -> Float64[np.ndarray, "actions nodes"]:
+        """Weights that take a function's values at a few commands to its mean over each action's commands.
+
+            E[f(u) | action] = sum_k w_k f(u_k),    w_k = E[l_k(u) | action]
+
+        with l_k the polynomials (smooth) or the hats (not) that are 1 at node k and 0 at the others. Where all
+        commands are nodes, the weights are their probabilities.
+
+        Args:
+            nodes: the commands at which the function is known, rising.
+            smooth: whether the function is well told by one polynomial through all nodes; a weight may then be
+                negative.
+        """
+        if smooth:
+            basis = np.ones((*self.levels.shape, len(nodes)))
+            for k, at in enumerate(nodes):
+                for other in np.delete(nodes, k):
+                    basis[..., k] *= (self.levels - other) / (at - other)
+        elif len(nodes) == 1:
+            basis = np.ones((*self.levels.shape, 1))
+        else:
+            left = np.clip(np.searchsorted(nodes, self.levels, side="right") - 1, 0, len(nodes) - 2)
+            part = np.clip((self.levels - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
+            hats = np.eye(len(nodes))
+            basis = (1 - part)[..., None] * hats[left] + part[..., None] * hats[left + 1]
+        weights: Float64[np.ndarray, "actions nodes"] = np.einsum("al,alk->ak", self.probabilities, basis)
+        return weights
+
+
+def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> Commands:
+    """What each action of an environment leads to.
+
+    For thresholds the probabilities are exact: where a condition's distribution passes each threshold is found by
+    bisection, to the last bit of a float32. For a continuous mapping a condition is stood for by 2048 responses of
+    equal probability; a continuous action by 21 evenly spaced commands.
+
+    Args:
+        environment: robot and mapping.
+        simulator: the neurons' answers; None without neurons.
+
+    Raises:
+        InvalidArgument: for an Animat without a simulator.
+    """
+    if not isinstance(environment, Animat):
+        actions: np.ndarray
+        if environment.n_actions is None:
+            actions = np.linspace(-1.0, 1.0, CONTINUOUS_ACTIONS).astype(np.float32)
+        else:
+            actions = np.arange(environment.n_actions)
+        nothing_random = jnp.zeros(environment.noise_size - environment.robot.noise_size)
+        leads_to = [float(environment.actuate(nothing_random, jnp.asarray(a), simulator)[2]) for a in actions]
+        return Commands(actions, np.array(leads_to)[:, None], np.ones((len(actions), 1)))
+    if simulator is None:
+        raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
+    if isinstance(environment.mapping, Thresholds):
+        levels, probabilities = _steps(environment.mapping, simulator)
+    else:
+        levels, probabilities = _quantiles(environment.mapping, simulator)
+    n_actions = environment.n_conditions
+    if environment.delivery == "shuffled":
+        # Whatever is chosen, any condition is delivered: every action leads to the mixture of all.
+        levels = np.tile(levels.reshape(1, -1), (n_actions, 1))
+        probabilities = np.tile(probabilities.reshape(1, -1) / n_actions, (n_actions, 1))
+    return Commands(np.arange(n_actions), levels, probabilities)
+
+
+def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[np.ndarray, " nodes"], bool]:
+    """The fewest commands from which the means over all cases' commands can be had, and whether by polynomials.
+
+    Args:
+        cases: what is to be averaged over.
+        n_smooth: how many Chebyshev nodes tell a function of the command well; None: it is not smooth.
+    """
+    levels = np.unique(np.concatenate([np.ravel(case.levels[case.probabilities > 0]) for case in cases]))
+    levels = levels[np.concatenate([[True], np.diff(levels) > 1e-6])]
+    if len(levels) <= (_MOST_LEVELS if n_smooth is None else n_smooth):
+        return levels, False
+    if n_smooth is None:
+        return np.linspace(-1.0, 1.0, CONTINUOUS_ACTIONS), False
+    middle, half = (levels[-1] + levels[0]) / 2, (levels[-1] - levels[0]) / 2
+    return middle - half * np.cos(np.pi * np.arange(n_smooth) / (n_smooth - 1)), True
+
+
+def _steps(mapping: Thresholds, simulator: NeuronSimulator) -> tuple[np.ndarray, np.ndarray]:
+    """Every level's probability, from the shares of responses below each level."""
+    below = np.asarray(_shares_below(mapping, simulator), np.float64)
+    probabilities = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
+    return np.tile(np.array(mapping.levels), (len(below), 1)), probabilities
+
+
+@partial(jax.jit, static_argnums=0)
+def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Array, "conditions thresholds"]:
+    """The quantiles at which the command steps up to each level but the lowest, by bisection."""
+
+    def is_below(condition: Array, level: Array, quantile: Array) -> Array:
+        # Levels are 0.2 apart.
+        command = mapping.command(simulator.quantile(condition, quantile), simulator.percentiles)
+        return jnp.asarray(command < level - 0.1)
+
+    def share_below(condition: Array, level: Array) -> Float[Array, ""]:
+        def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+            low, high = bounds
+            middle = (low + high) / 2
+            below = is_below(condition, level, middle)
+            return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+        high = jax.lax.fori_loop(0, 40, halve, (jnp.float32(0), jnp.float32(1)))[1]
+        return jnp.where(is_below(condition, level, jnp.float32(0)), high, 0.0)
+
+    levels = jnp.asarray(mapping.levels[1:], jnp.float32)
+    return jax.vmap(lambda c: jax.vmap(lambda level: share_below(c, level))(levels))(jnp.arange(simulator.n_conditions))
+
+
+def _quantiles(mapping: Mapping, simulator: NeuronSimulator) -> tuple[np.ndarray, np.ndarray]:
+    """The commands at evenly spaced quantiles of each condition."""
+    uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
+    quantile = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
+    x = quantile(jnp.arange(simulator.n_conditions), uniforms)
+    levels = np.asarray(mapping.command(x, simulator.percentiles), np.float64)
+    return levels, np.full(levels.shape, 1 / _QUANTILES)

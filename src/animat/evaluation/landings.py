@@ -1,0 +1,136 @@
+"""Where one iteration leads from the nodes of a grid, or from any states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32, Int32
+
+from animat.errors import InvalidArgument
+from animat.evaluation.grid import Grid
+from animat.robots.base import Robot
+
+ENDED, ENDS_NEXT = -1, -2
+
+_NODES_AT_ONCE = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class Landings:
+    """Where one iteration leads, for each of a few commands and draws of the robot's noise.
+
+    Attributes:
+        rows: first of the rows around the state that follows; of a row's nodes all the same, as the first coordinate
+            has no part in how the others move; shape (landings, rows).
+        row_places: distances from it in steps, shape (landings, rows, axes).
+        nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next iteration will
+            end it, shape (landings, rows, nodes).
+        places: distances from it in steps; for `ENDS_NEXT` the reward of the next iteration, shape
+            (landings, rows, nodes).
+        rewards: of the iteration, shape (landings, rows, nodes).
+    """
+
+    rows: Int32[np.ndarray, "landings rows"]
+    row_places: Float32[np.ndarray, "landings rows axes"]
+    nodes: Int32[np.ndarray, "landings rows nodes"]
+    places: Float32[np.ndarray, "landings rows nodes"]
+    rewards: Float32[np.ndarray, "landings rows nodes"]
+
+    def bounds(self) -> Iterator[tuple[float, float]]:
+        """What a value can be at least and at most, with 1, 2, 3, ... iterations left."""
+        ended = self.nodes == ENDED
+        last = np.concatenate([self.rewards[ended], self.places[self.nodes == ENDS_NEXT]])
+        going = self.rewards[~ended]
+        lowest = highest = 0.0
+        while True:
+            lowest = min(float(last.min(initial=np.inf)), float(going.min(initial=np.inf)) + lowest)
+            highest = max(float(last.max(initial=-np.inf)), float(going.max(initial=-np.inf)) + highest)
+            yield lowest, highest
+
+
+class Motion:
+    """One iteration of a robot as landings on a grid; compiled once."""
+
+    def __init__(
+        self,
+        robot: Robot[Any],
+        grid: Grid,
+        commands: Float[np.ndarray, " commands"],
+        uniforms: Float[np.ndarray, "draws noise"],
+    ) -> None:
+        """Set up the commands and the draws of noise; a landing is a pair of them, commands outer."""
+        self._grid = grid
+        self._u = jnp.repeat(jnp.asarray(commands, jnp.float32), len(uniforms))
+        self._noise = jnp.tile(jnp.asarray(uniforms, jnp.float32), (len(commands), 1))
+
+        def land(state: Any, u: Array, noise: Float[Array, " noise"]) -> tuple[Array, ...]:
+            after, reward, terminated = robot.advance(noise, state, u)
+            row, row_places, positions, node, place = grid.locate(after)
+            if grid.end_is_known:
+                _, last_reward, ends = robot.advance(jnp.full(robot.noise_size, 0.5), after, jnp.float32(0))
+                node, place = jnp.where(ends, ENDS_NEXT, node), jnp.where(ends, last_reward, place)
+            node = jnp.where(terminated, ENDED, node)
+            return row, row_places, node, place, jnp.asarray(reward, jnp.float32), positions
+
+        def from_states(states: Any) -> tuple[Array, ...]:
+            return jax.vmap(jax.vmap(land, (0, None, None)), (None, 0, 0))(states, self._u, self._noise)
+
+        def from_rows(rows: Int32[Array, " rows"]) -> tuple[Array, ...]:
+            along = jnp.arange(grid.along.stored)
+            states = jax.vmap(jax.vmap(grid.state_at, (None, 0)), (0, None))(rows, along)
+            flat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), len(along))).ravel(), states)
+            shape = (len(self._u), len(rows), len(along))
+            row, row_places, node, place, reward, positions = (
+                x.reshape(*shape, *x.shape[2:]) for x in from_states(flat)
+            )
+            middle = len(along) // 2
+            parted = jnp.abs(positions - positions[:, :, middle : middle + 1])
+            # Where the task has ended it does not matter where.
+            parted = jnp.max(jnp.where((node >= 0)[..., None], parted, 0.0), initial=0.0)
+            return row[:, :, middle], row_places[:, :, middle], node, place, reward, parted
+
+        self._from_states = jax.jit(from_states)
+        self._from_rows = jax.jit(from_rows)
+
+    def from_states(self, states: Any) -> Landings:
+        """Landings from states (the robot's own tuple, each number with an axis of states), each a row of one node."""
+        row, row_places, *along = (np.asarray(x) for x in self._from_states(states)[:-1])
+        return Landings(row, row_places, *(x[:, :, None] for x in along))
+
+    def from_grid(self) -> Landings:
+        """Landings from every node of the grid.
+
+        Raises:
+            InvalidArgument: if the grid's first coordinate has a part in how the others move.
+        """
+        grid, n = self._grid, len(self._u)
+        at_once = max(1, min(grid.n_rows, _NODES_AT_ONCE // (grid.along.stored * n)))
+        shape = (n, grid.n_rows, grid.along.stored)
+        landings = Landings(
+            np.empty(shape[:2], np.int32),
+            np.empty((*shape[:2], len(grid.rows)), np.float32),
+            np.empty(shape, np.int32),
+            np.empty(shape, np.float32),
+            np.empty(shape, np.float32),
+        )
+        for start in range(0, grid.n_rows, at_once):
+            # The last block starts earlier instead of being shorter: one shape is compiled.
+            start = min(start, grid.n_rows - at_once)
+            *parts, parted = self._from_rows(jnp.arange(start, start + at_once, dtype=jnp.int32))
+            # Rounding may part the nodes of a row by the last bits, not more.
+            if parted > 0.01:
+                raise InvalidArgument(
+                    f"grid: expected a first coordinate that has no part in how the others move, got {grid.along.name}"
+                )
+            for whole, part in zip(_fields(landings), parts, strict=True):
+                whole[:, start : start + at_once] = part
+        return landings
+
+
+def _fields(landings: Landings) -> tuple[np.ndarray, ...]:
+    return landings.rows, landings.row_places, landings.nodes, landings.places, landings.rewards

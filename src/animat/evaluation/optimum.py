@@ -1,0 +1,287 @@
+"""The best possible return: what no controller can beat, with these neurons, this mapping and this robot."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Float32, Float64, UInt16
+
+from animat.animat import Environment
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.commands import Commands, commands_of, nodes_for
+from animat.evaluation.grid import Grid, grid_for
+from animat.evaluation.landings import Motion
+from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
+from animat.neurons.simulator import NeuronSimulator
+from animat.progress import Progress, Silent
+
+Case = tuple[Environment[Any], NeuronSimulator | None]
+"""What a limit is asked for: an environment, and the simulator in it (None without neurons)."""
+
+COARSER = 0.75
+"""Steps along each axis of the grid that the value is compared with, as a part of those of the grid in use."""
+
+_TABLES_AT_ONCE_MIB = 400
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best possible mean return of any controller, and how well it is known.
+
+    Attributes:
+        value: by dynamic programming, of a controller that knows the time left.
+        grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
+        monte_carlo: mean return of that controller, run on the environment itself: a return that can be had.
+        standard_error: of `monte_carlo`.
+        without_clock: mean return of the same controller if it acts as if all of the episode lay ahead, always: what
+            can be had without knowing the time, as a policy does not. A better one may exist, not above `value`.
+        without_clock_standard_error: of `without_clock`.
+        episodes: that both were measured in.
+        nodes: of the grid.
+        horizon_observed: that `value` knows the time left; policies do not.
+    """
+
+    value: float
+    grid_error: float
+    monte_carlo: float
+    standard_error: float
+    without_clock: float
+    without_clock_standard_error: float
+    episodes: int
+    nodes: int
+    horizon_observed: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return asdict(self)
+
+    def to_text(self) -> str:
+        """In a line: the value and how well it is known."""
+        return (
+            f"best possible return {self.value:.1f} (grid {self.grid_error:.1f}); its controller, run: "
+            f"{self.monte_carlo:.1f} ± {self.standard_error:.1f}, without knowing the time left "
+            f"{self.without_clock:.1f} ± {self.without_clock_standard_error:.1f}"
+        )
+
+
+def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
+    """The best possible return in one environment; arguments, errors and method as in `best_returns`."""
+    return best_returns([(environment, simulator)], **options)[0]
+
+
+def best_returns(
+    cases: Sequence[Case],
+    *,
+    grid: Grid | None = None,
+    resolution: float = 1.0,
+    episodes: int = 4000,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> tuple[Optimum, ...]:
+    """The best possible mean return of any controller, for several mappings or simulators of one robot at once.
+
+        V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
+
+    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. V is kept
+    at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
+    `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
+    a return that can be had and cannot lie above the true limit by more than chance.
+
+    Args:
+        cases: environments, all of the same robot, each with its simulator (None without neurons).
+        grid: over the robot's states; None: `grid_for(robot)`.
+        resolution: steps of the grid along each axis, as a multiple; 0.6 is fast and rough.
+        episodes: to run the controller in.
+        seed: decides every random draw.
+        progress: what to report to.
+
+    Raises:
+        InvalidArgument: for no cases, a robot without a grid, or a number that is not positive.
+        Mismatch: for cases of different robots.
+    """
+    if not cases:
+        raise InvalidArgument("cases: expected at least one environment, got none")
+    if episodes < 2:
+        raise InvalidArgument(f"episodes: expected at least 2, got {episodes}")
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise InvalidArgument(f"resolution: expected a positive number, got {resolution!r}")
+    robot = cases[0][0].robot
+    for environment, _ in cases:
+        if environment.robot != robot:
+            raise Mismatch(f"cases: expected all of one robot, got {robot} and {environment.robot}")
+    fine = (grid_for(robot) if grid is None else grid).scaled(resolution)
+    coarse = fine.scaled(COARSER)
+    progress = Silent() if progress is None else progress
+
+    kept_mib = 2 * fine.size * robot.episode_limit / 2**20
+    at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
+    optima: list[Optimum] = []
+    for start in range(0, len(cases), at_once):
+        batch = cases[start : start + at_once]
+        rough = _Programme(coarse, batch).run(None, seed)
+        programme = _Programme(fine, batch)
+        tables = _Tables(fine, len(batch), robot.episode_limit)
+        values = programme.run(tables, seed)
+        for case in range(len(batch)):
+            known = programme.play(tables, case, episodes, seed, clock=True)
+            unknown = programme.play(tables, case, episodes, seed, clock=False)
+            optima.append(
+                Optimum(
+                    value=float(values[case]),
+                    grid_error=float(abs(values[case] - rough[case])),
+                    monte_carlo=float(known.mean()),
+                    standard_error=float(known.std(ddof=1) / math.sqrt(episodes)),
+                    without_clock=float(unknown.mean()),
+                    without_clock_standard_error=float(unknown.std(ddof=1) / math.sqrt(episodes)),
+                    episodes=episodes,
+                    nodes=fine.size,
+                )
+            )
+            progress.update(len(optima), len(cases), f"limit {values[case]:.1f}")
+    return tuple(optima)
+
+
+class _Tables:
+    """Values for every time left, for the controller to look up: in 16 bits each, as all of them must be kept."""
+
+    def __init__(self, grid: Grid, n_cases: int, n_times: int) -> None:
+        self._shape = (grid.n_rows, grid.along.stored)
+        self._kept: UInt16[np.ndarray, "times cases nodes"] = np.empty((n_times, n_cases, grid.size), np.uint16)
+        self._low = np.empty((n_times, n_cases))
+        self._step = np.empty((n_times, n_cases))
+
+    def keep(self, remaining: int, values: Float32[np.ndarray, "rows cases nodes"]) -> None:
+        """Keep the values for a time left."""
+        for case in range(values.shape[1]):
+            of_case = values[:, case].ravel()
+            low, high = float(of_case.min()), float(of_case.max())
+            step = max(high - low, 1e-6) / 65535
+            self._low[remaining, case], self._step[remaining, case] = low, step
+            # Adding half and cutting off rounds, and is a pass less.
+            self._kept[remaining, case] = (of_case - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
+
+    def values(self, remaining: int, case: int) -> Float32[np.ndarray, "rows nodes"]:
+        """Look them up."""
+        kept: Float32[np.ndarray, " nodes"] = self._kept[remaining, case].astype(np.float32)
+        kept *= np.float32(self._step[remaining, case])
+        kept += np.float32(self._low[remaining, case])
+        return kept.reshape(self._shape)
+
+
+class _Programme:
+    """Dynamic programming on one grid, for some cases at once."""
+
+    def __init__(self, grid: Grid, cases: Sequence[Case]) -> None:
+        self._grid, self._cases = grid, cases
+        self._robot = robot = cases[0][0].robot
+        self._commands = [commands_of(*case) for case in cases]
+        commands = self._commands
+        uniforms: Float[np.ndarray, "draws noise"] = np.full((1, robot.noise_size), 0.5)
+        if grid.noise_in_command is not None:
+            commands = [of_case.with_noise(grid.noise_in_command) for of_case in commands]
+        elif robot.noise_size:
+            # Two points a number: exact for the mean of a cubic polynomial.
+            points = (0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12))
+            uniforms = np.array(list(itertools.product(points, repeat=robot.noise_size)))
+        nodes, smooth = nodes_for(commands, grid.smooth_commands)
+        weights = [_spread(of_case, nodes, smooth, len(uniforms)) for of_case in commands]
+        most = max(len(of_case) for of_case in weights)
+        # A case of fewer actions has its last one again.
+        self._weights = np.stack([np.pad(w, ((0, most - len(w)), (0, 0)), mode="edge") for w in weights])
+        self._motion = Motion(robot, grid, nodes, uniforms)
+
+    def run(self, tables: _Tables | None, seed: int) -> Float64[np.ndarray, " cases"]:
+        """Step back from the end of an episode to its start; the value there, and all values into the tables."""
+        grid, n_cases = self._grid, len(self._cases)
+        landings = self._motion.from_grid()
+        shape = (grid.n_rows, n_cases, grid.along.stored)
+        values = np.zeros(math.prod(shape), np.float32)
+        before = np.empty_like(values)
+        for remaining, (lowest, highest) in zip(range(self._robot.episode_limit), landings.bounds(), strict=False):
+            if tables is not None:
+                tables.keep(remaining, values.reshape(shape))
+            step_back(
+                values,
+                landings.rows,
+                landings.row_places,
+                landings.nodes,
+                landings.places,
+                landings.rewards,
+                grid.row_offsets,
+                self._weights,
+                remaining,
+                np.float32(lowest),
+                np.float32(highest),
+                before,
+            )
+            values, before = before, values
+        starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
+        return self._interpolate(values.reshape(shape), starts)
+
+    def play(
+        self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool
+    ) -> Float64[np.ndarray, " episodes"]:
+        """Returns of the maximising controller on the environment itself."""
+        environment, simulator = self._cases[case]
+        limit = self._robot.episode_limit
+
+        @jax.jit
+        def step(key: Any, state: Any, action: Any, simulator: Any) -> Any:
+            uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
+            return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
+
+        first, others = jax.random.split(jax.random.key(seed))
+        state = jax.vmap(environment.reset)(jax.random.split(first, episodes))
+        returns = np.zeros(episodes)
+        going = np.ones(episodes, bool)
+        chosen = np.zeros(episodes, np.uint8)
+        for iteration, key in enumerate(jax.random.split(others, limit)):
+            remaining = limit - 1 - iteration if clock else limit - 1
+            landings = self._motion.from_states(state.robot)
+            look_ahead(
+                tables.values(remaining, case),
+                landings.rows,
+                landings.row_places,
+                landings.nodes[:, :, 0],
+                landings.places[:, :, 0],
+                landings.rewards[:, :, 0],
+                self._grid.row_offsets,
+                self._weights[case],
+                remaining,
+                chosen,
+            )
+            actions = self._commands[case].actions
+            action = actions[np.minimum(chosen, len(actions) - 1)]
+            outcome = step(key, state, action, simulator)
+            state = outcome.state
+            returns += np.where(going, np.asarray(outcome.reward, np.float64), 0.0)
+            going &= ~np.asarray(outcome.terminated)
+            if not going.any():
+                break
+        return returns
+
+    def _interpolate(
+        self, values: Float32[np.ndarray, "rows cases nodes"], states: Any
+    ) -> Float64[np.ndarray, " cases"]:
+        """The mean value of some states, of each case."""
+        rows, row_places, _, nodes, places = (np.asarray(x) for x in jax.vmap(self._grid.locate)(states))
+        weights = np.empty(len(self._grid.row_offsets), np.float32)
+        total = np.zeros(values.shape[1])
+        for row, of_rows, node, place in zip(rows, row_places, nodes, places, strict=True):
+            fill_row_weights(of_rows, weights)
+            around = values[row + self._grid.row_offsets, :, node : node + 4]
+            total += np.einsum("t,tcn,n->c", weights, around, np.array(cubic(place)))
+        return total / len(rows)
+
+
+def _spread(
+    commands: Commands, nodes: Float64[np.ndarray, " nodes"], smooth: bool, n_draws: int
+) -> Float32[np.ndarray, "actions landings"]:
+    """Weights of landings: a landing is a pair of a command and a draw of noise, all draws equally likely."""
+    return np.repeat(commands.onto(nodes, smooth=smooth) / n_draws, n_draws, axis=1).astype(np.float32)

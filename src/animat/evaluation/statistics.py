@@ -1,0 +1,267 @@
+"""Comparisons of policies by rank, their sizes and their intervals; and the score between random and the limit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+from animat.errors import InvalidArgument
+
+RESAMPLES = 10_000
+"""Bootstrap samples an interval is made of."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with a bootstrap interval.
+
+    Attributes:
+        value: of the samples themselves.
+        low, high: percentiles of the bootstrap.
+        confidence: the share of the bootstrap between them.
+    """
+
+    value: float
+    low: float
+    high: float
+    confidence: float
+
+    def to_dict(self) -> dict[str, float]:
+        """Everything as plain data."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two groups compared by rank, two-sided.
+
+    Attributes:
+        u: Mann-Whitney's U as the paper gives it, the smaller of `u_first` and n1 n2 - `u_first`.
+        u_first: pairs in which the first group's is larger, ties half.
+        n_first, n_second: samples of each.
+        p_normal: by the normal approximation with continuity correction (and correction for ties): the paper's.
+        p_exact: over all ways to part the samples as they are, ties among them.
+        effect: rank-biserial correlation, share of pairs in which the second is larger less the share in which the
+            first is, from -1 to 1, with its interval.
+        ties: whether any two samples are equal.
+    """
+
+    u: float
+    u_first: float
+    n_first: int
+    n_second: int
+    p_normal: float
+    p_exact: float
+    effect: Interval
+    ties: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return asdict(self)
+
+
+def compare(
+    first: ArrayLike, second: ArrayLike, *, confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
+) -> Comparison:
+    """The two-sided Mann-Whitney U test of two groups, by the normal approximation and exactly, and its effect size.
+
+        U_1 = #(first > second) + #(first = second) / 2,    U = min(U_1, n_1 n_2 - U_1),    effect = 1 - 2 U_1 / n_1 n_2
+
+    The normal approximation takes 1/2 off the distance of U from its mean (continuity) and uses the standard deviation
+    for tied ranks. If all samples are equal, p = 1.
+
+    Args:
+        first, second: one number a policy, such as its mean return.
+        confidence: of the effect's interval, both groups resampled.
+        resamples: how many.
+        seed: decides the resampling.
+
+    Raises:
+        InvalidArgument: for an empty group, numbers that are not finite, or a confidence outside 0 to 1.
+
+    Source: Mann and Whitney 1947, doi:10.1214/aoms/1177730491; the paper's table of comparisons.
+    """
+    a, b = _samples("first", first), _samples("second", second)
+    _check(confidence, resamples)
+    from scipy.stats import mannwhitneyu
+
+    u_first = float(_won(a, b).sum())
+    pooled = np.concatenate([a, b])
+    ties = len(np.unique(pooled)) < len(pooled)
+    if np.ptp(pooled) == 0:
+        p_normal = p_exact = 1.0
+    else:
+        # scipy's can exceed 1 by its continuity correction where U is at its mean.
+        p_normal = min(1.0, float(mannwhitneyu(a, b, alternative="two-sided", method="asymptotic").pvalue))
+        p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
+
+    rng = np.random.default_rng(seed)
+    total = len(a) * len(b)
+    # A resample is how often each sample was drawn, and its U a sum over pairs.
+    often_a = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), resamples)
+    often_b = rng.multinomial(len(b), np.full(len(b), 1 / len(b)), resamples)
+    low, high = _ends(1 - 2 * np.sum((often_a @ _won(a, b)) * often_b, axis=1) / total, confidence)
+    return Comparison(
+        u=min(u_first, total - u_first),
+        u_first=u_first,
+        n_first=len(a),
+        n_second=len(b),
+        p_normal=p_normal,
+        p_exact=p_exact,
+        effect=Interval(1 - 2 * u_first / total, low, high, confidence),
+        ties=ties,
+    )
+
+
+def p_of_u(u: float, n_first: int, n_second: int) -> float:
+    """The two-sided p that a U implies without ties, by the normal approximation with continuity correction.
+
+        z = (|U - m| - 1/2) / s,    m = n_1 n_2 / 2,    s^2 = n_1 n_2 (n_1 + n_2 + 1) / 12,
+        p = min(1, 2 (1 - Phi(z)))
+
+    Raises:
+        InvalidArgument: for a group of none, or a U that no groups of these sizes have.
+    """
+    if n_first < 1 or n_second < 1:
+        raise InvalidArgument(f"n: expected at least 1 sample in each group, got {n_first} and {n_second}")
+    total = n_first * n_second
+    if not 0 <= u <= total:
+        raise InvalidArgument(f"u: expected 0 to {total} for {n_first} and {n_second} samples, got {u:g}")
+    from scipy.stats import norm
+
+    z = (abs(u - total / 2) - 0.5) / np.sqrt(total * (n_first + n_second + 1) / 12)
+    return float(min(1.0, 2 * norm.sf(z)))
+
+
+def interquartile_mean(
+    samples: ArrayLike,
+    *,
+    strata: Sequence[Any] | None = None,
+    confidence: float = 0.95,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Interval:
+    """The mean of the middle half of samples, with its bootstrap interval.
+
+    A quarter of the samples, rounded down, is left out at each end. With strata, resampling keeps to each stratum, so
+    that the interval is of runs and not of the choice of tasks.
+
+    Args:
+        samples: numbers, shape (samples,).
+        strata: of each sample, what it belongs to (a task, a culture); None: all to one.
+        confidence: of the interval.
+        resamples: how many.
+        seed: decides the resampling.
+
+    Raises:
+        InvalidArgument: for no samples, numbers that are not finite, strata of another length, or a confidence outside
+            0 to 1.
+
+    Source: Agarwal et al. 2021, arXiv:2108.13264 (rliable).
+    """
+    x = _samples("samples", samples)
+    _check(confidence, resamples)
+    if strata is not None and len(strata) != len(x):
+        raise InvalidArgument(f"strata: expected one a sample, {len(x)}, got {len(strata)}")
+    from scipy.stats import trim_mean
+
+    _, stratum = np.unique([str(s) for s in strata] if strata is not None else np.zeros(len(x)), return_inverse=True)
+    rng = np.random.default_rng(seed)
+    drawn = np.empty((resamples, len(x)))
+    for which in range(stratum.max() + 1):
+        of_stratum = np.flatnonzero(stratum == which)
+        drawn[:, of_stratum] = x[rng.choice(of_stratum, (resamples, len(of_stratum)))]
+    low, high = _ends(trim_mean(drawn, 0.25, axis=1), confidence)
+    return Interval(float(trim_mean(x, 0.25)), low, high, confidence)
+
+
+def holm(p: Mapping[str, float]) -> dict[str, float]:
+    """Values of p corrected for how many comparisons were made: none is found by having asked often.
+
+        p'_(i) = min(1, max_(j <= i) (m - j + 1) p_(j)),    p_(1) <= ... <= p_(m)
+
+    Args:
+        p: of each comparison, by name.
+
+    Raises:
+        InvalidArgument: for a p outside 0 to 1.
+
+    Source: Holm 1979, Scandinavian Journal of Statistics 6, 65-70.
+    """
+    for name, value in p.items():
+        if not 0 <= value <= 1:
+            raise InvalidArgument(f"p: expected 0 to 1, got {value:g} for {name}")
+    highest = 0.0
+    corrected = {}
+    for i, name in enumerate(sorted(p, key=lambda name: p[name])):
+        highest = max(highest, min(1.0, (len(p) - i) * p[name]))
+        corrected[name] = highest
+    return {name: corrected[name] for name in p}
+
+
+def normalised_score(policy: float, random: float, limit: float) -> float:
+    """How far a policy has come from a random one to the best possible: (policy - random) / (limit - random).
+
+    0 is as good as random and 1 the limit (`animat.evaluation.optimum`), which a measured mean can pass by chance.
+
+    Raises:
+        InvalidArgument: if the limit is not above the random policy: nothing can be learned there.
+    """
+    if not limit > random:
+        raise InvalidArgument(
+            f"limit: expected more than the random policy's {random:g}, got {limit:g}; every controller is as good here"
+        )
+    return (policy - random) / (limit - random)
+
+
+def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
+    samples: Float64[np.ndarray, " samples"] = np.asarray(values, np.float64)
+    if samples.ndim != 1 or not len(samples):
+        raise InvalidArgument(f"{name}: expected one number a sample, at least one, got shape {samples.shape}")
+    if not np.all(np.isfinite(samples)):
+        raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones")
+    return samples
+
+
+def _check(confidence: float, resamples: int) -> None:
+    if not 0 < confidence < 1:
+        raise InvalidArgument(f"confidence: expected between 0 and 1, got {confidence:g}")
+    if resamples < 1:
+        raise InvalidArgument(f"resamples: expected at least 1, got {resamples}")
+
+
+def _won(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "n m"]:
+    """Of each pair, 1 if the first is larger, 1/2 if they are equal."""
+    difference = a[:, None] - b[None, :]
+    won: Float64[np.ndarray, "n m"] = (difference > 0) + 0.5 * (difference == 0)
+    return won
+
+
+def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
+    """The share of all ways to part the pooled samples in which U lies at least as far from its mean.
+
+    Ways are counted by the sum of the first group's ranks, sample by sample; ties share a rank, which may be a half,
+    so ranks are doubled. (scipy's own exact test does not know ties, and its permutations take a second.)
+    """
+    from scipy.stats import rankdata
+
+    ranks = np.rint(2 * rankdata(np.concatenate([a, b]))).astype(np.int64)
+    n = len(a)
+    ways = np.zeros((n + 1, int(ranks.sum()) + 1))
+    ways[0, 0] = 1.0
+    for seen, rank in enumerate(ranks, start=1):
+        for size in range(min(n, seen), 0, -1):
+            ways[size, rank:] += ways[size - 1, :-rank]
+        ways /= 2.0  # Keeps the counts of large groups from overflowing; only their shares are used.
+    distance = np.abs(np.arange(ways.shape[1]) - n * (len(ranks) + 1))
+    return float(ways[n, distance >= distance[ranks[:n].sum()]].sum() / ways[n].sum())
+
+
+def _ends(bootstrap: Float64[np.ndarray, " resamples"], confidence: float) -> tuple[float, float]:
+    low, high = np.quantile(bootstrap, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)

@@ -1,0 +1,186 @@
+"""The loops of dynamic programming that take the time, compiled: one step back in time, and a look ahead."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+f4 = np.float32
+ONE, TWO, HALF, SIXTH = f4(1), f4(2), f4(0.5), f4(1 / 6)
+
+compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+
+
+@compiled
+def cubic(place: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """The weights of four nodes for a value `place` steps from the first: the cubic polynomial through them."""
+    f = place - ONE
+    return (
+        -f * (f - ONE) * (f - TWO) * SIXTH,
+        (f + ONE) * (f - ONE) * (f - TWO) * HALF,
+        -(f + ONE) * f * (f - TWO) * HALF,
+        (f + ONE) * f * (f - ONE) * SIXTH,
+    )
+
+
+@compiled
+def fill_row_weights(places: Float32[np.ndarray, " axes"], weights: Float32[np.ndarray, " taps"]) -> None:
+    """The weights of the 4^axes rows around a state: products over the axes."""
+    filled = 1
+    weights[0] = ONE
+    for axis in range(len(places)):
+        w0, w1, w2, w3 = cubic(places[axis])
+        for i in range(filled - 1, -1, -1):
+            w = weights[i]
+            weights[4 * i + 3] = w * w3
+            weights[4 * i + 2] = w * w2
+            weights[4 * i + 1] = w * w1
+            weights[4 * i] = w * w0
+        filled *= 4
+
+
+@compiled
+def step_back(
+    values: Float32[np.ndarray, " nodes_of_all_rows_and_cases"],
+    rows: Int32[np.ndarray, "landings rows"],
+    row_places: Float32[np.ndarray, "landings rows axes"],
+    nodes: Int32[np.ndarray, "landings rows nodes"],
+    places: Float32[np.ndarray, "landings rows nodes"],
+    rewards: Float32[np.ndarray, "landings rows nodes"],
+    row_offsets: Int32[np.ndarray, " taps"],
+    weights: Float32[np.ndarray, "cases actions landings"],
+    remaining: int,
+    lowest: np.float32,
+    highest: np.float32,
+    best: Float32[np.ndarray, " nodes_of_all_rows_and_cases"],
+) -> None:
+    """What each state is worth under its best action, given what the states that follow are worth.
+
+        best(s) = max_a sum_k weights(a, k) (reward_k(s) + value(landing_k(s)))
+
+    The rows around a landing are the same for all of a row's nodes, and for all cases: they are added up once, node by
+    node, which is fast, and what is left to do for each node is to interpolate along the row.
+
+    Args:
+        values: of the states that follow, at the grid's nodes: row by row, in a row case by case.
+        rows, row_places, nodes, places, rewards: the landings, as in `animat.evaluation.landings.Landings`.
+        row_offsets: of the rows around a landing.
+        weights: of the landings, for each case and action.
+        remaining: iterations left after this one.
+        lowest, highest: what no value can be outside of; interpolation near a cliff could pass them.
+        best: filled, as `values`.
+    """
+    n_landings, n_rows, n_nodes = nodes.shape
+    n_cases, n_actions, _ = weights.shape
+    n_taps = len(row_offsets)
+    width = n_nodes * n_cases
+    tap_weights = np.empty(n_taps, np.float32)
+    summed = np.empty(width, np.float32)
+    landed = np.empty((n_landings, width), np.float32)
+    worth = np.empty(n_nodes, np.float32)
+    for row in range(n_rows):
+        for k in range(n_landings):
+            alive = False
+            for node in range(n_nodes):
+                alive |= nodes[k, row, node] >= 0
+            if alive:
+                fill_row_weights(row_places[k, row], tap_weights)
+                first = rows[k, row]
+                if n_taps == 1:
+                    summed[:] = values[first * width : (first + 1) * width]
+                else:
+                    summed[:] = f4(0)
+                    for tap in range(0, n_taps, 4):
+                        w0, w1 = tap_weights[tap], tap_weights[tap + 1]
+                        w2, w3 = tap_weights[tap + 2], tap_weights[tap + 3]
+                        i0 = (first + row_offsets[tap]) * width
+                        i1 = (first + row_offsets[tap + 1]) * width
+                        i2 = (first + row_offsets[tap + 2]) * width
+                        i3 = (first + row_offsets[tap + 3]) * width
+                        v0, v1 = values[i0 : i0 + width], values[i1 : i1 + width]
+                        v2, v3 = values[i2 : i2 + width], values[i3 : i3 + width]
+                        for j in range(width):
+                            summed[j] += (w0 * v0[j] + w1 * v1[j]) + (w2 * v2[j] + w3 * v3[j])
+            for node in range(n_nodes):
+                at = nodes[k, row, node]
+                reward = rewards[k, row, node]
+                if at < 0:
+                    if at == -2 and remaining > 0:
+                        reward += places[k, row, node]
+                    for case in range(n_cases):
+                        landed[k, case * n_nodes + node] = reward
+                else:
+                    w0, w1, w2, w3 = cubic(places[k, row, node])
+                    for case in range(n_cases):
+                        i = case * n_nodes + at
+                        landed[k, case * n_nodes + node] = reward + (
+                            (w0 * summed[i] + w1 * summed[i + 1]) + (w2 * summed[i + 2] + w3 * summed[i + 3])
+                        )
+        for case in range(n_cases):
+            start = row * width + case * n_nodes
+            here = best[start : start + n_nodes]
+            here[:] = f4(-np.inf)
+            for action in range(n_actions):
+                worth[:] = f4(0)
+                for k in range(n_landings):
+                    weight = weights[case, action, k]
+                    if weight != f4(0):
+                        there = landed[k, case * n_nodes : (case + 1) * n_nodes]
+                        for node in range(n_nodes):
+                            worth[node] += weight * there[node]
+                for node in range(n_nodes):
+                    here[node] = max(here[node], worth[node])
+            for node in range(n_nodes):
+                here[node] = min(max(here[node], lowest), highest)
+
+
+@compiled
+def look_ahead(
+    values: Float32[np.ndarray, "rows nodes"],
+    rows: Int32[np.ndarray, "landings states"],
+    row_places: Float32[np.ndarray, "landings states axes"],
+    nodes: Int32[np.ndarray, "landings states"],
+    places: Float32[np.ndarray, "landings states"],
+    rewards: Float32[np.ndarray, "landings states"],
+    row_offsets: Int32[np.ndarray, " taps"],
+    weights: Float32[np.ndarray, "actions landings"],
+    remaining: int,
+    chosen: UInt8[np.ndarray, " states"],
+) -> None:
+    """The best action of each of some states, by what the states that follow are worth (see `step_back`).
+
+    Args:
+        values: of the states that follow, of one case.
+        rows, row_places, nodes, places, rewards: the landings of the states.
+        row_offsets: of the rows around a landing.
+        weights: of the landings, for each action.
+        remaining: iterations left after this one.
+        chosen: filled.
+    """
+    n_landings, n_states = nodes.shape
+    n_taps = len(row_offsets)
+    tap_weights = np.empty(n_taps, np.float32)
+    landed = np.empty(n_landings, np.float32)
+    for state in range(n_states):
+        for k in range(n_landings):
+            landed[k] = rewards[k, state]
+            at = nodes[k, state]
+            if at == -2 and remaining > 0:
+                landed[k] += places[k, state]
+            if at >= 0:
+                fill_row_weights(row_places[k, state], tap_weights)
+                w0, w1, w2, w3 = cubic(places[k, state])
+                for tap in range(n_taps):
+                    row = values[rows[k, state] + row_offsets[tap]]
+                    landed[k] += tap_weights[tap] * (
+                        (w0 * row[at] + w1 * row[at + 1]) + (w2 * row[at + 2] + w3 * row[at + 3])
+                    )
+        highest = f4(-np.inf)
+        for action in range(len(weights)):
+            worth = f4(0)
+            for k in range(n_landings):
+                worth += weights[action, k] * landed[k]
+            if worth > highest:
+                highest = worth
+                chosen[state] = action

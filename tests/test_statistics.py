@@ -1,0 +1,164 @@
+"""Comparisons against scipy, the paper's table, plain counting and coverage on known distributions."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from animat.errors import InvalidArgument
+from animat.evaluation.statistics import compare, holm, interquartile_mean, normalised_score, p_of_u
+
+FINITE = st.floats(-1e3, 1e3, allow_nan=False)
+
+
+@pytest.mark.parametrize(("u", "p"), [(0, 1.8267e-4), (2, 3.2984e-4), (14, 7.2846e-3)])
+def test_the_papers_p_and_u_belong_together(u: int, p: float) -> None:
+    """Its table prints 1.82e-4 or 1.83e-4, 3.30e-4 and 7.28e-3 for ten against ten policies."""
+    assert p_of_u(u, 10, 10) == pytest.approx(p, rel=1e-4)
+    # Two groups with this U: all of the first below the second, then `u` of its pairs turned, one a step up.
+    first, second = np.arange(10.0), np.arange(10.0) + 100
+    for i in range(u):
+        first[9 - i // 10] = 100.5 + i % 10
+    compared = compare(first, second, resamples=10)
+    assert compared.u == u
+    assert compared.p_normal == pytest.approx(p, rel=1e-4)
+
+
+def test_complete_separation_of_ten_and_ten() -> None:
+    compared = compare(np.arange(10), np.arange(10) + 100)
+    assert (compared.u, compared.u_first) == (0, 0)
+    assert compared.p_normal == pytest.approx(1.8267e-4, rel=1e-4)
+    assert compared.p_exact == pytest.approx(2 / 184756)
+    assert (compared.effect.value, compared.effect.low, compared.effect.high) == (1, 1, 1)
+    assert not compared.ties
+    json.dumps(compared.to_dict())
+
+
+@given(st.lists(FINITE, min_size=1, max_size=9), st.lists(FINITE, min_size=1, max_size=9))
+@settings(max_examples=60, deadline=None)
+def test_u_and_effect_are_counts_of_pairs(first: list[float], second: list[float]) -> None:
+    compared = compare(first, second, resamples=5)
+    larger = sum(a > b for a, b in itertools.product(first, second))
+    equal = sum(a == b for a, b in itertools.product(first, second))
+    pairs = len(first) * len(second)
+    assert compared.u_first == larger + equal / 2
+    assert compared.u == min(compared.u_first, pairs - compared.u_first)
+    assert compared.effect.value == pytest.approx((pairs - equal - 2 * larger) / pairs)
+    swapped = compare(second, first, resamples=5)
+    assert swapped.u == compared.u
+    assert swapped.p_normal == pytest.approx(compared.p_normal)
+    assert swapped.effect.value == pytest.approx(-compared.effect.value)
+    assert 0 <= compared.p_normal <= 1
+
+
+def test_without_ties_p_is_that_of_u() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        a, b = rng.normal(size=8), rng.normal(0.5, size=11)
+        compared = compare(a, b, resamples=5)
+        assert compared.p_normal == pytest.approx(p_of_u(compared.u, 8, 11))
+        assert compared.p_exact == pytest.approx(scipy.stats.mannwhitneyu(a, b, method="exact").pvalue)
+
+
+def test_exact_p_with_ties_goes_through_all_ways() -> None:
+    a, b = [1.0, 2.0, 2.0, 5.0], [2.0, 3.0, 5.0, 6.0, 7.0]
+    pooled = np.array(a + b)
+
+    def u_of(places: tuple[int, ...]) -> float:
+        first = pooled[list(places)]
+        second = np.delete(pooled, list(places))
+        return float(np.sum(first[:, None] > second) + np.sum(first[:, None] == second) / 2)
+
+    observed = abs(u_of((0, 1, 2, 3)) - 10)
+    ways = [abs(u_of(places) - 10) >= observed for places in itertools.combinations(range(9), 4)]
+    compared = compare(a, b, resamples=5)
+    assert compared.ties
+    assert compared.p_exact == pytest.approx(np.mean(ways))
+
+
+def test_equal_samples_tell_nothing() -> None:
+    compared = compare([3.0] * 4, [3.0] * 5)
+    assert (compared.p_normal, compared.p_exact, compared.effect.value) == (1.0, 1.0, 0.0)
+
+
+def test_interquartile_mean_is_rliables() -> None:
+    x = np.random.default_rng(2).normal(size=30)
+    told = interquartile_mean(x)
+    assert told.value == pytest.approx(scipy.stats.trim_mean(x, 0.25))
+    assert told.low < told.value < told.high
+    assert interquartile_mean(x) == told
+    assert interquartile_mean(range(12)).value == pytest.approx(5.5)
+
+
+def test_strata_are_resampled_apart() -> None:
+    """Two tasks without any spread within them: nothing is uncertain, unless they are thrown together."""
+    x, tasks = [0.0] * 10 + [1.0] * 10, ["easy"] * 10 + ["hard"] * 10
+    apart = interquartile_mean(x, strata=tasks)
+    assert (apart.low, apart.value, apart.high) == (0.5, 0.5, 0.5)
+    together = interquartile_mean(x)
+    assert together.low < 0.4 < 0.6 < together.high
+
+
+def test_intervals_cover_what_they_say() -> None:
+    """95 % intervals of symmetric samples, whose interquartile mean is 0: nearly 95 % hold it (bootstraps: fewer)."""
+    rng = np.random.default_rng(3)
+    held = [
+        told.low <= 0 <= told.high
+        for told in (interquartile_mean(rng.normal(size=40), resamples=400) for _ in range(400))
+    ]
+    assert 0.89 <= np.mean(held) <= 0.98
+
+
+def test_effect_interval_covers_the_true_effect() -> None:
+    """Normal samples one standard deviation apart: P(second > first) = Phi(1 / sqrt 2)."""
+    truth = 2 * scipy.stats.norm.cdf(1 / np.sqrt(2)) - 1
+    rng = np.random.default_rng(4)
+    held = []
+    for _ in range(300):
+        effect = compare(rng.normal(size=25), rng.normal(1, size=25), resamples=400).effect
+        held.append(effect.low <= truth <= effect.high)
+    assert 0.88 <= np.mean(held) <= 0.99
+
+
+def test_holm_by_hand() -> None:
+    """Of 0.01, 0.04, 0.03: 3 x 0.01, then 2 x 0.03, then no less than that."""
+    assert holm({"a": 0.01, "b": 0.04, "c": 0.03}) == pytest.approx({"a": 0.03, "b": 0.06, "c": 0.06})
+    assert holm({"a": 0.7, "b": 0.8}) == {"a": 1.0, "b": 1.0}
+    assert holm({}) == {}
+
+
+def test_holm_keeps_the_chance_of_any_false_finding() -> None:
+    rng = np.random.default_rng(5)
+    found = [min(holm({str(i): p for i, p in enumerate(rng.random(8))}).values()) < 0.05 for _ in range(4000)]
+    assert np.mean(found) == pytest.approx(0.05, abs=0.012)
+
+
+def test_normalised_score() -> None:
+    assert normalised_score(-80, -80, 17) == 0
+    assert normalised_score(17, -80, 17) == 1
+    assert normalised_score(0, -50, 50) == 0.5
+    with pytest.raises(InvalidArgument, match="limit"):
+        normalised_score(1.0, 2.0, 2.0)
+
+
+def test_refusals_name_the_argument() -> None:
+    with pytest.raises(InvalidArgument, match="first"):
+        compare([], [1.0])
+    with pytest.raises(InvalidArgument, match="second"):
+        compare([1.0], [float("nan")])
+    with pytest.raises(InvalidArgument, match="confidence"):
+        interquartile_mean([1.0], confidence=1.0)
+    with pytest.raises(InvalidArgument, match="resamples"):
+        interquartile_mean([1.0], resamples=0)
+    with pytest.raises(InvalidArgument, match="strata"):
+        interquartile_mean([1.0, 2.0], strata=["a"])
+    with pytest.raises(InvalidArgument, match="p:"):
+        holm({"a": 1.5})
+    with pytest.raises(InvalidArgument, match="u:"):
+        p_of_u(101, 10, 10)
