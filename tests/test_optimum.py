@@ -1,0 +1,288 @@
+"""The best possible return against closed forms, games tried to the end, and the environments themselves."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.animat import Animat, WithoutNeurons
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.commands import commands_of
+from animat.evaluation.grid import Axis, Grid, grid_for
+from animat.evaluation.optimum import best_return, best_returns
+from animat.evaluation.rollouts import Constant, Uniform, roll_out
+from animat.evaluation.sweeping import cubic
+from animat.mapping import Linear, Thresholds
+from animat.neurons.made_up import made_up_simulator
+from animat.neurons.simulator import EmpiricalSimulator
+from animat.robots.base import Quantity, Robot
+from animat.robots.cartpole import Cartpole
+from animat.robots.navigation import Navigation, NavigationState
+
+SIMULATOR = made_up_simulator()
+
+
+def coins(*heads: int) -> EmpiricalSimulator:
+    """Neurons that pass the only threshold in so many of ten responses, for each condition."""
+    values = np.array([[0.0] * (10 - n) + [1.0] * n for n in heads])
+    return EmpiricalSimulator(
+        jnp.asarray(values, jnp.float32), jnp.full(len(heads), 10), jnp.linspace(0, 1, 11, dtype=jnp.float32)
+    )
+
+
+class StairState(NamedTuple):
+    step: Any
+
+
+@dataclass(frozen=True)
+class Stairs(Robot[StairState]):
+    """Up or down one of four steps from the middle; 1 at the top, 0 at the bottom, both the end."""
+
+    episode_limit: int = 200
+    noise_size: ClassVar[int] = 0
+    name: ClassVar[str] = "stairs"
+    paper_iterations: ClassVar[int] = 0
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        return (Quantity("step", "1", 1.0),)
+
+    def reset(self, key: Any) -> StairState:
+        return StairState(jnp.float32(2))
+
+    def advance(self, uniforms: Any, state: StairState, u: Any) -> tuple[StairState, Any, Any]:
+        step = state.step + jnp.where(u > 0, 1.0, -1.0)
+        return StairState(step), jnp.where(step >= 4, 1.0, 0.0), (step >= 4) | (step <= 0)
+
+    def observe(self, state: StairState) -> Any:
+        return jnp.stack(state)
+
+
+STEPS = Grid(Axis("step", "1", 0.0, 4.0, 5), (), tuple, lambda coordinates: StairState(*coordinates))
+
+
+def test_gamblers_ruin() -> None:
+    """With the better coin (0.6), the top comes first with probability 1 / (1 + (q / p)^2)."""
+    found = best_return(Animat(Stairs(), Thresholds(1), 2), coins(3, 6), grid=STEPS)
+    truth = 1 / (1 + (0.4 / 0.6) ** 2)
+    assert found.value == pytest.approx(truth, abs=1e-5)
+    assert found.grid_error == pytest.approx(0, abs=1e-6)
+    assert abs(found.monte_carlo - truth) < 4 * found.standard_error
+    assert abs(found.without_clock - truth) < 4 * found.without_clock_standard_error
+    json.dumps(found.to_dict())
+    assert f"{found.value:.1f}" in found.to_text()
+
+
+@pytest.mark.parametrize(("limit", "truth"), [(1, 0.0), (2, 0.36), (3, 0.36), (4, 0.36 + 2 * 0.24 * 0.36)])
+def test_short_horizons_by_hand(limit: int, truth: float) -> None:
+    """Two up, or one down on the way: p p, then (p q + q p) p p more."""
+    found = best_return(Animat(Stairs(limit), Thresholds(1), 2), coins(3, 6), grid=STEPS, episodes=2)
+    assert found.value == pytest.approx(truth, abs=1e-5)
+
+
+@dataclass(frozen=True)
+class Lottery(Stairs):
+    """Two iterations whose rewards are cubic in the robot's own noise."""
+
+    episode_limit: int = 2
+    noise_size: ClassVar[int] = 1
+    name: ClassVar[str] = "lottery"
+
+    def advance(self, uniforms: Any, state: StairState, u: Any) -> tuple[StairState, Any, Any]:
+        return state, u + uniforms[0] ** 3, jnp.bool_(False)
+
+
+def test_noise_of_the_robot_is_averaged_over() -> None:
+    """The mean of a cubed uniform is 1/4; the best command is 1."""
+    found = best_return(WithoutNeurons(Lottery(), None), None, grid=STEPS)
+    assert found.value == pytest.approx(2 * (1 + 1 / 4), abs=1e-5)
+    assert abs(found.monte_carlo - found.value) < 4 * found.standard_error
+
+
+def expectimax(environment: Animat[Any], simulator: Any) -> float:
+    """All that can happen, tried out: every command at every iteration, folded back by the best action."""
+    robot = environment.robot
+    commands = commands_of(environment, simulator)
+    noise = jnp.full(robot.noise_size, 0.5)
+    step = jax.jit(jax.vmap(lambda state, u: robot.advance(noise, state, u), (0, None)))
+    state = jax.tree.map(lambda x: jnp.asarray(x)[None], robot.reset(jax.random.key(0)))
+    levels = commands.levels[0]
+    rewards, ends = [], []
+    for _ in range(robot.episode_limit):
+        after = [step(state, jnp.float32(u)) for u in levels]
+        rewards.append(np.stack([np.asarray(r, float) for _, r, _ in after], -1))
+        ends.append(np.stack([np.asarray(e) for _, _, e in after], -1))
+        state = jax.tree.map(lambda *xs: jnp.stack(xs, -1).ravel(), *[s for s, _, _ in after])
+    worth = np.zeros(len(jax.tree.leaves(state)[0]))
+    for reward, end in zip(reversed(rewards), reversed(ends), strict=True):
+        of_levels = reward + np.where(end, 0.0, worth.reshape(reward.shape))
+        worth = (of_levels @ commands.probabilities.T).max(-1)
+    return float(worth[0])
+
+
+def test_navigation_tried_to_the_end() -> None:
+    """Nine iterations by two commands, from a start near the goal, which some ways reach."""
+    robot = Navigation(episode_limit=9, goal_x_m=0.2, goal_y_m=0.12, goal_radius_m=0.06)
+    environment = Animat(robot, Thresholds(1), 5)
+    truth = expectimax(environment, SIMULATOR)
+    found = best_return(environment, SIMULATOR, resolution=2.0)
+    assert found.value == pytest.approx(truth, abs=3 * found.grid_error + 0.2)
+    assert abs(found.monte_carlo - truth) < 4 * found.standard_error + 0.1
+
+
+def test_navigation_with_ten_levels_tried_to_the_end() -> None:
+    environment = Animat(Navigation(episode_limit=4), Thresholds(9), 5)
+    found = best_return(environment, SIMULATOR, resolution=0.5, episodes=2)
+    assert found.value == pytest.approx(expectimax(environment, SIMULATOR), abs=0.003)
+
+
+@pytest.mark.oracle
+def test_cartpole_tried_to_the_end() -> None:
+    """Twelve pushes, too strong and without noise: many ways fall."""
+    robot = Cartpole(force_n=4.0, force_noise=0.0, episode_limit=12)
+    environment = Animat(robot, Thresholds(1), 5)
+    truth = expectimax(environment, SIMULATOR)
+    assert truth < 0
+    found = best_return(environment, SIMULATOR)
+    assert found.value == pytest.approx(truth, abs=3 * found.grid_error + 0.5)
+
+
+@pytest.mark.parametrize(
+    ("robot", "resolution"), [pytest.param(Cartpole(), 0.75, marks=pytest.mark.oracle), (Navigation(), 0.5)]
+)
+def test_where_nothing_can_be_chosen_the_limit_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
+    """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
+    environment = Animat(robot, Thresholds(1), 5, delivery="shuffled")
+    found = best_return(environment, SIMULATOR, resolution=resolution, episodes=2)
+    returns = roll_out(environment, SIMULATOR, Uniform(), 1, episodes=8000, seed=5).returns
+    error = float(returns.std() / math.sqrt(returns.size))
+    assert abs(found.value - returns.mean()) < 4 * error + found.grid_error
+
+
+def test_a_pole_is_balanced_without_neurons() -> None:
+    found = best_return(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, resolution=0.6, episodes=100)
+    assert found.value == pytest.approx(120, abs=0.01)
+    assert found.monte_carlo == 120
+
+
+def test_more_separated_conditions_allow_more() -> None:
+    robot = Navigation()
+    means = [[42.0 + spread * (i - 2) for i in range(5)] for spread in (0.0, 3.0, 6.0, 9.0)]
+    cases = [(Animat(robot, Thresholds(1), 5), made_up_simulator(m)) for m in means]
+    found = best_returns(cases, resolution=0.5, episodes=2)
+    values = [optimum.value for optimum in found]
+    assert values == sorted(values)
+    assert values[-1] - values[0] > 20
+    one = best_return(*cases[2], resolution=0.5, episodes=2)
+    assert one.value == pytest.approx(values[2], abs=0.01)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9), Linear()])
+def test_the_controller_gets_what_was_promised(robot: Robot[Any], mapping: Any) -> None:
+    environment = Animat(robot, mapping, 5)
+    found = best_return(environment, SIMULATOR)
+    assert abs(found.monte_carlo - found.value) < 4 * found.standard_error + 2 * found.grid_error
+    assert found.without_clock < found.value + 4 * found.without_clock_standard_error
+    for action in range(5):
+        constant = roll_out(environment, SIMULATOR, Constant(jnp.array([action])), 1, episodes=1000, seed=2).returns
+        assert constant.mean() - 4 * constant.std() / math.sqrt(1000) < found.value
+
+
+@pytest.mark.oracle
+def test_the_cartpoles_grid_is_fine_enough() -> None:
+    """Three refinements of 9 thresholds, the hardest: the default is within 1 of the finest."""
+    case = (Animat(Cartpole(), Thresholds(9), 5), SIMULATOR)
+    default, finest = (best_return(*case, resolution=r, episodes=2).value for r in (1.0, 1.4))
+    assert default == pytest.approx(finest, abs=1.0)
+
+
+def test_probabilities_of_commands_are_those_of_the_distribution() -> None:
+    commands = commands_of(Animat(Navigation(), Thresholds(9), 5), SIMULATOR)
+    edges, percentiles = np.asarray(SIMULATOR.edges_hz), np.asarray(SIMULATOR.percentiles)
+    for row, cumulative in zip(commands.probabilities, np.asarray(SIMULATOR.cumulative), strict=True):
+        below = np.interp(percentiles[1:10], edges, cumulative)
+        np.testing.assert_allclose(row, np.diff(np.pad(below, 1, constant_values=(0, 1))), atol=2e-6)
+    np.testing.assert_allclose(commands.levels[0], Thresholds(9).levels)
+
+
+def test_a_response_on_the_threshold_is_above_it() -> None:
+    """Measured values, five of ten on the median itself."""
+    values = jnp.asarray([[0.0] * 5 + [0.5] * 5, [0.0] * 10, [1.0] * 10], jnp.float32)
+    simulator = EmpiricalSimulator(values, jnp.full(3, 10), jnp.linspace(0, 1, 11, dtype=jnp.float32))
+    commands = commands_of(Animat(Navigation(), Thresholds(1), 3), simulator)
+    np.testing.assert_allclose(commands.probabilities, [[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]], atol=1e-6)
+
+
+def test_continuous_commands_have_the_mean_and_spread_of_samples() -> None:
+    environment = Animat(Navigation(), Linear(), 5)
+    commands = commands_of(environment, SIMULATOR)
+    for condition in range(5):
+        x = jax.vmap(SIMULATOR.sample, (0, None))(jax.random.split(jax.random.key(1), 40_000), jnp.int32(condition))
+        u = np.asarray(Linear().command(x, SIMULATOR.percentiles))
+        nodes = np.linspace(-1, 1, 7)
+        for smooth in (True, False):
+            weights = commands.onto(nodes, smooth=smooth)[condition]
+            assert weights.sum() == pytest.approx(1)
+            assert weights @ nodes == pytest.approx(u.mean(), abs=0.01)
+        assert commands.onto(nodes, smooth=True)[condition] @ nodes**3 == pytest.approx((u**3).mean(), abs=0.01)
+
+
+def test_cubic_weights_keep_cubic_polynomials() -> None:
+    nodes = np.arange(4.0)
+    for place in (0.0, 0.3, 1.5, 2.0, 2.9):
+        weights = np.array(cubic(np.float32(place)))
+        for power in range(4):
+            assert weights @ nodes**power == pytest.approx(place**power, abs=1e-4)
+
+
+@pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
+def test_nodes_of_a_grid_are_found_where_they_are(robot: Robot[Any]) -> None:
+    grid = grid_for(robot)
+    rows = jnp.asarray(np.random.default_rng(0).integers(0, grid.n_rows, 200))
+    nodes = jnp.asarray(np.random.default_rng(1).integers(0, grid.along.stored, 200))
+    located = jax.vmap(grid.locate)(jax.vmap(grid.state_at)(rows, nodes))
+    np.testing.assert_allclose(located.node + located.place, nodes, atol=1e-3)
+    indices = np.stack(np.unravel_index(np.asarray(rows), [axis.stored for axis in grid.rows]), -1)
+    for axis, index, position in zip(grid.rows, indices.T, np.asarray(located.positions).T, strict=True):
+        if axis.periodic:
+            index, position = (index - 1) % axis.nodes, (position - 1) % axis.nodes
+        np.testing.assert_allclose(position, index, atol=1e-3)
+
+
+def test_refusals_say_what_to_do() -> None:
+    environment = Animat(Navigation(), Thresholds(1), 5)
+    with pytest.raises(InvalidArgument, match="cases"):
+        best_returns([])
+    with pytest.raises(Mismatch, match="one robot"):
+        best_returns([(environment, SIMULATOR), (Animat(Cartpole(), Thresholds(1), 5), SIMULATOR)])
+    with pytest.raises(InvalidArgument, match="simulator"):
+        best_return(environment, None)
+    with pytest.raises(InvalidArgument, match="hand in a Grid"):
+        best_return(Animat(Stairs(), Thresholds(1), 2), coins(3, 6))
+    with pytest.raises(InvalidArgument, match="angle_limit_rad"):
+        grid_for(Cartpole.as_printed())
+    with pytest.raises(InvalidArgument, match="resolution"):
+        best_return(environment, SIMULATOR, resolution=0.0)
+    with pytest.raises(InvalidArgument, match="episodes"):
+        best_return(environment, SIMULATOR, episodes=1)
+    with pytest.raises(InvalidArgument, match="axis x"):
+        Axis("x", "m", 0.0, 1.0, 3)
+    grid = grid_for(Navigation()).scaled(0.3)
+    turned = replace(
+        grid,
+        along=grid.rows[1],
+        rows=(grid.along, grid.rows[0]),
+        to_coordinates=lambda s: (s.heading_rad, s.x_m, s.y_m),
+        to_state=lambda c: NavigationState(c[1], c[2], c[0]),
+    )
+    with pytest.raises(InvalidArgument, match="first coordinate"):
+        best_return(environment, SIMULATOR, grid=turned)
