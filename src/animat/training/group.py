@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from animat.animat import Environment
 from animat.errors import InvalidFile
 from animat.neurons.timeline import SimulatorTimeline
 from animat.training.policy import Policy
@@ -71,8 +72,7 @@ def train_group(group: Group, checkpoint: Path, report: Report, *, checkpoint_s:
     chunk = jax.jit(
         jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)), donate_argnums=0
     )
-    keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
-    learners = jax.jit(jax.vmap(partial(begin, environment, settings)))(keys)
+    learners = _begin(group, environment)
     curve = np.full((CHUNKS, len(group.members), 3), np.nan)
     done = 0
     if checkpoint.exists():
@@ -93,6 +93,22 @@ def train_group(group: Group, checkpoint: Path, report: Report, *, checkpoint_s:
             _write_checkpoint(checkpoint, group.fingerprint, index + 1, learners, curve)
             written = time.monotonic()
         report(index + 1, float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan"))
+    return _policies(group, environment, learners, curve)
+
+
+def untrained_policies(group: Group) -> list[Policy]:
+    """A group's policies as they are before their first iteration: what training is compared with."""
+    environment = group.training.environment(0 if group.timeline is None else len(group.timeline.conditions))
+    return _policies(group, environment, _begin(group, environment), np.zeros((0, len(group.members), 3)))
+
+
+def _begin(group: Group, environment: Environment[Any]) -> Learner[Any]:
+    training = group.training
+    keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
+    return jax.jit(jax.vmap(partial(begin, environment, training.algorithm)))(keys)  # type: ignore[no-any-return]
+
+
+def _policies(group: Group, environment: Environment[Any], learners: Learner[Any], curve: np.ndarray) -> list[Policy]:
     return [
         _policy(
             group,

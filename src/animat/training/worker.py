@@ -18,7 +18,7 @@ def main() -> int:
     """Read a job, train it, write its policies; report each chunk as a line."""
     # JAX sizes its thread pool by the cores it may use, and one pinned core beats two shared ones: pin first.
     os.sched_setaffinity(0, {int(sys.argv[1])})
-    _end_with_parent()
+    end_with_parent()
 
     from animat.compilation import keep_compilations
     from animat.errors import AnimatError
@@ -45,7 +45,7 @@ def main() -> int:
     return 0
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """Ask the kernel to kill this process when the one that started it is gone, however that ended."""
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,0 +1,78 @@
+"""The paper's study as a value, and the figures that it printed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from animat.studies.specification import Body, Compared, Condition, Culture, Study
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A comparison as the paper gives it: p, and the U that this p implies. The second condition was the better."""
+
+    p: float
+    u: float
+
+
+PRINTED: dict[tuple[str, str], Printed] = {
+    ("before and after training", "cartpole"): Printed(1.82e-4, 0),
+    ("before and after training", "navigation"): Printed(1.83e-4, 0),
+    ("control and 1 threshold", "cartpole"): Printed(1.83e-4, 0),
+    ("control and 1 threshold", "navigation"): Printed(1.83e-4, 0),
+    ("1 and 9 thresholds", "cartpole"): Printed(1.83e-4, 0),
+    ("1 and 9 thresholds", "navigation"): Printed(3.30e-4, 2),
+    ("without and with shadowing", "cartpole"): Printed(7.28e-3, 14),
+    ("without and with shadowing", "navigation"): Printed(1.83e-4, 0),
+}
+"""By the comparison's and the robot's name. Source: Sawada et al. 2022, its table of comparisons."""
+
+CONDITIONS = (
+    Condition("before training", trained=False),
+    Condition("1 threshold"),
+    Condition("9 thresholds", mapping="9-thresholds"),
+    Condition("control", delivery="shuffled"),
+    Condition("without shadowing", shadowing=False),
+    Condition("linear", mapping="linear"),
+    Condition("without neurons", mapping="none"),
+)
+
+COMPARISONS = (
+    Compared("before and after training", "before training", "1 threshold", at_min=0.0, episodes=30),
+    Compared("control and 1 threshold", "control", "1 threshold", at_min=140.0),
+    Compared("1 and 9 thresholds", "1 threshold", "9 thresholds", at_min=140.0),
+    Compared("without and with shadowing", "without shadowing", "1 threshold", at_min=140.0),
+)
+
+
+def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) -> Study:
+    """The paper's study on a virtual culture; quick: every step of it, with fewer policies, iterations, recordings.
+
+    Args:
+        culture_seed: which virtual culture.
+        seed: decides every draw of training and evaluation.
+        quick: for a first look; its figures are no results.
+    """
+    if not quick:
+        return Study(
+            title="The paper's study on a virtual culture",
+            culture=Culture(seed=culture_seed),
+            conditions=CONDITIONS,
+            comparisons=COMPARISONS,
+            seed=seed,
+            paper=True,
+        )
+    return Study(
+        title="The paper's study on a virtual culture, in short",
+        culture=Culture(seed=culture_seed, sessions=8, interval_min=20.0),
+        robots=(Body("cartpole", iterations=60_000), Body("navigation", iterations=60_000)),
+        conditions=CONDITIONS,
+        comparisons=COMPARISONS,
+        policies=4,
+        seed=seed,
+        episodes=50,
+        episodes_over_time=10,
+        limit_resolution=0.5,
+        limit_episodes=1000,
+        paper=True,
+    )

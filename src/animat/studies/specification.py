@@ -1,0 +1,287 @@
+"""What a study is: recordings or a culture, robots, conditions, comparisons, how often and from which seeds."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from animat.errors import InvalidArgument
+from animat.mapping import MAPPING_NAMES
+from animat.robots.base import Robot
+from animat.robots.registry import robot_named
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,60}")
+
+MAPPINGS = (*MAPPING_NAMES, "none")
+"""Names of mappings that a condition may have; none is the baseline without neurons."""
+
+
+def _check_algorithm(settings: dict[str, float]) -> None:
+    from animat.training.sac import SAC
+
+    known = SAC.__dataclass_fields__
+    for name in settings:
+        if name not in known:
+            raise InvalidArgument(f"algorithm: expected settings among {', '.join(known)}, got {name!r}")
+    SAC(**settings)  # type: ignore[arg-type]
+
+
+def _check_name(what: str, name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise InvalidArgument(f"{what}: expected letters, digits, spaces, dots and dashes, got {name!r}")
+
+
+def _unlike(what: str, names: Sequence[str]) -> None:
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times")
+
+
+def _at_least(where: str, owner: object, **least: int) -> None:
+    for name, value in least.items():
+        if getattr(owner, name) < value:
+            prefix = f"{where}." if where else ""
+            raise InvalidArgument(f"{prefix}{name}: expected at least {value}, got {getattr(owner, name)}")
+
+
+def _positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise InvalidArgument(f"{name}: expected a positive number, got {value:g}")
+
+
+@dataclass(frozen=True)
+class Culture:
+    """Where the recordings come from: files, or a culture that is recorded for the study.
+
+    Attributes:
+        kind: `"virtual"`, simulated neurons; `"made-up"`, responses of known distributions, for trials; `"files"`.
+        files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
+        seed: which virtual or made-up culture.
+        sessions, interval_min: how many recordings, and the minutes from one to the next.
+        order, pulses, presentations: how stimuli are presented (`animat.recordings.protocol`).
+        channels: of a made-up culture.
+    """
+
+    kind: Literal["virtual", "made-up", "files"] = "virtual"
+    files: tuple[str, ...] = ()
+    seed: int = 1
+    sessions: int = 15
+    interval_min: float = 10.0
+    order: Literal["blocked", "mixed"] = "blocked"
+    pulses: int = 1
+    presentations: int = 100
+    channels: int = 256
+
+    def __post_init__(self) -> None:
+        if (self.kind == "files") != bool(self.files):
+            raise InvalidArgument(f"culture.files: expected some for kind = 'files' only, got {len(self.files)}")
+        _at_least("culture", self, seed=0, sessions=1, pulses=1, presentations=2, channels=1)
+        _positive("culture.interval_min", self.interval_min)
+        if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
+            raise InvalidArgument("culture.order: a made-up culture is recorded blocked with one pulse, got otherwise")
+
+
+@dataclass(frozen=True)
+class Simulators:
+    """How responses are read and neuron simulators made of them; as the options of `animat train`.
+
+    Attributes:
+        kind, bins, range_hz: of the simulators; 20 bins up to the first recording's largest response by default.
+        conditions: what the agent picks from, such as `frequency` or `interval:5,10+-25%`; empty: by frequency.
+        window_ms: start and end of the response window.
+        burst_threshold: share of active channels above which a response is a burst; None: by Otsu's method.
+        despite: findings to go on in spite of.
+    """
+
+    kind: Literal["histogram", "empirical"] = "histogram"
+    bins: int = 20
+    range_hz: float | None = None
+    conditions: str = ""
+    window_ms: tuple[float, float] = (2.0, 10.0)
+    burst_threshold: float | None = None
+    despite: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Body:
+    """A robot of the study.
+
+    Attributes:
+        name: `cartpole` or `navigation`.
+        iterations: of training, for each policy; None: the paper's.
+        parameters: in place of its defaults, such as `pole_mass_kg`.
+    """
+
+    name: str
+    iterations: int | None = None
+    parameters: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.iterations is not None and self.iterations < 1:
+            raise InvalidArgument(f"robots.iterations: expected at least 1, got {self.iterations}")
+        self.robot()
+
+    def robot(self) -> Robot[Any]:
+        """The robot itself."""
+        return robot_named(self.name, **self.parameters)
+
+    @property
+    def trained_for(self) -> int:
+        """Iterations of training."""
+        return self.robot().paper_iterations if self.iterations is None else self.iterations
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One way to train policies, on each robot.
+
+    Attributes:
+        name: what it is called in tables and folders.
+        mapping: from responses to commands; `"none"` is the baseline without neurons.
+        shadowing: whether simulators are refreshed during training.
+        delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
+        percentiles: of the mapping: `"moving"` with the simulator, or held from the `"first"` recording.
+        trained: false for policies as they are before training.
+    """
+
+    name: str
+    mapping: str = "1-threshold"
+    shadowing: bool = True
+    delivery: Literal["chosen", "shuffled"] = "chosen"
+    percentiles: Literal["moving", "first"] = "moving"
+    trained: bool = True
+
+    def __post_init__(self) -> None:
+        _check_name("conditions.name", self.name)
+        if self.mapping not in MAPPINGS:
+            raise InvalidArgument(f"conditions.mapping: expected one of {', '.join(MAPPINGS)}, got {self.mapping!r}")
+
+    @property
+    def slug(self) -> str:
+        """The name as a folder's."""
+        return self.name.lower().replace(" ", "-")
+
+    @property
+    def through_neurons(self) -> bool:
+        """Whether there are neurons in it."""
+        return self.mapping != "none"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Two conditions that are compared on every robot, by the policies' mean returns.
+
+    Attributes:
+        name: of the comparison.
+        first, second: names of conditions; the second is the one expected to be better.
+        at_min: minute of the recording that they are evaluated on; None: the last.
+        episodes: of each policy.
+    """
+
+    name: str
+    first: str
+    second: str
+    at_min: float | None = None
+    episodes: int = 100
+
+    def __post_init__(self) -> None:
+        _check_name("comparisons.name", self.name)
+        if self.episodes < 1:
+            raise InvalidArgument(f"comparisons.episodes: expected at least 1, got {self.episodes}")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything that decides how a study comes out, but for the recordings in files.
+
+    Attributes:
+        title: of the report.
+        culture: the recordings.
+        simulators: how responses are read and fitted.
+        robots, conditions, comparisons: what is trained and what is compared.
+        policies: of each condition on each robot.
+        seed: decides every draw of training and evaluation.
+        training_min: minutes of the culture's clock that a training stands for.
+        episodes: of each policy where no comparison says otherwise, and of controls.
+        episodes_over_time: of each policy at every recording.
+        limit_resolution: steps of the grid of the best possible return, as a multiple; 0.6 is fast and rough.
+        limit_episodes: episodes in which that controller's return is checked.
+        algorithm: settings of `animat.training.sac.SAC` in place of its defaults.
+        paper: whether the paper's own figures are printed beside comparisons of the same name and robot.
+
+    Raises:
+        InvalidArgument: naming the setting, what was expected and what came.
+    """
+
+    title: str = "Study"
+    culture: Culture = field(default_factory=Culture)
+    simulators: Simulators = field(default_factory=Simulators)
+    robots: tuple[Body, ...] = (Body("cartpole"), Body("navigation"))
+    conditions: tuple[Condition, ...] = (Condition("1 threshold"),)
+    comparisons: tuple[Compared, ...] = ()
+    policies: int = 10
+    seed: int = 1
+    training_min: float = 60.0
+    episodes: int = 100
+    episodes_over_time: int = 30
+    limit_resolution: float = 1.0
+    limit_episodes: int = 4000
+    algorithm: dict[str, float] = field(default_factory=dict)
+    paper: bool = False
+
+    def __post_init__(self) -> None:
+        for what in ("robots", "conditions"):
+            if not getattr(self, what):
+                raise InvalidArgument(f"{what}: expected at least one, got none")
+        _unlike("robots", [body.name for body in self.robots])
+        _unlike("conditions", [condition.slug for condition in self.conditions])
+        _unlike("comparisons", [compared.name for compared in self.comparisons])
+        _at_least("", self, policies=1, seed=0, episodes=1, episodes_over_time=1, limit_episodes=2)
+        _positive("training_min", self.training_min)
+        _positive("limit_resolution", self.limit_resolution)
+        known = [condition.name for condition in self.conditions]
+        for compared in self.comparisons:
+            for side in ("first", "second"):
+                name = getattr(compared, side)
+                if name not in known:
+                    raise InvalidArgument(
+                        f"comparisons.{side}: expected one of the conditions {', '.join(known)}, got {name!r} in "
+                        f"{compared.name!r}"
+                    )
+        if self.algorithm:
+            _check_algorithm(self.algorithm)
+
+    def condition(self, name: str) -> Condition:
+        """The condition of this name."""
+        return next(condition for condition in self.conditions if condition.name == name)
+
+    def minutes_of(self, condition: Condition, last_min: float) -> dict[float, int]:
+        """Minutes that a condition is evaluated at for comparisons, and in how many episodes; the last at least."""
+        minutes: dict[float, int] = {}
+        for compared in self.comparisons:
+            if condition.name in (compared.first, compared.second):
+                at = last_min if compared.at_min is None else compared.at_min
+                minutes[at] = max(minutes.get(at, 0), compared.episodes)
+        minutes.setdefault(last_min, self.episodes)
+        return minutes
+
+    def limit_minutes(self, last_min: float) -> list[float]:
+        """Minutes at which anything is evaluated, rising."""
+        return sorted({at for condition in self.conditions for at in self.minutes_of(condition, last_min)})
+
+    def mappings(self) -> list[str]:
+        """The mappings of all conditions, each once; none among them where there is a baseline."""
+        return list(dict.fromkeys(condition.mapping for condition in self.conditions))
+
+    @property
+    def needs_neurons(self) -> bool:
+        """Whether any condition has neurons in it."""
+        return any(condition.through_neurons for condition in self.conditions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return asdict(self)

@@ -1,0 +1,62 @@
+"""A process that runs jobs on one core: `python -m animat.studies.worker CPU`, started by `Processes`.
+
+Tasks come pickled on standard input, from the process that started it; progress goes out as JSON lines.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from animat.errors import AnimatError
+from animat.studies.jobs import Task
+from animat.studies.specification import Study
+from animat.training.worker import end_with_parent
+
+_TELL_EVERY_S = 0.2
+
+
+def main() -> int:
+    """Run tasks until standard input ends."""
+    # Before JAX or BLAS are loaded: they size their threads by the cores they may use.
+    os.sched_setaffinity(0, {int(sys.argv[1])})
+    end_with_parent()
+    # What libraries print must not end up among the events.
+    events = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+
+    def tell(**event: Any) -> None:
+        print(json.dumps(event), file=events, flush=True)
+
+    from animat.compilation import keep_compilations
+
+    keep_compilations()
+    while True:
+        try:
+            job: tuple[Task, Study, Path] = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return 0
+        task, study, folder = job
+        last = 0.0
+
+        def report(share: float, words: str) -> None:
+            nonlocal last
+            if time.monotonic() - last > _TELL_EVERY_S:
+                last = time.monotonic()
+                tell(kind="progress", share=share, words=words)
+
+        try:
+            files = task.run(study, folder, report)
+        except AnimatError as error:
+            tell(kind="failed", words=str(error))
+        else:
+            tell(kind="done", files=[str(file) for file in files])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
