@@ -1,8 +1,8 @@
 """Training at the paper's length against what is possible on made-up responses of known distributions.
 
 Five conditions answer with gamma distributions of shape 6 and means 30, 36, 42, 48, 54 Hz, in 20 bins over 0-120 Hz.
-By dynamic programming (`animat.evaluation.optimum`) no controller of the cartpole can have a mean return above 18.5 with
-one threshold and 71.2 with nine; without knowing the time left, as a policy does not, 16.9 and 68.9 were had. A random
+By dynamic programming (`animat.evaluation.optimum`) no controller of the cartpole has a mean return above 18.5 with one
+threshold and 71.2 with nine; without knowing the time left, as a policy does not, 16.9 and 68.9 were had. A random
 one gets -80 and -77.
 """
 
