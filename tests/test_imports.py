@@ -27,10 +27,11 @@ MAY_IMPORT = {
     "training": {"animat", "neurons", "mapping", "robots", "recordings"},
     "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
     "cultures": {"recordings"},
+    "closed_loop": {"cultures", "neurons", "mapping", "robots", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
     "gym": {"animat", "neurons", "mapping", "robots", "recordings", "report"},
 }
-"""Each room, and the rooms before it in the story that it may look into; `cli` and the public names may look into all."""
+"""Each room, and the rooms before it in the story that it may look into; `cli` and the public names look into all."""
 
 
 def imports_of(file: Path) -> set[str]:

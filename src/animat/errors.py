@@ -36,3 +36,15 @@ class UnsafeStimulus(AnimatError):
     def __init__(self, limit: str, message: str) -> None:
         super().__init__(f"{limit}: {message}; nothing was delivered")
         self.limit = limit
+
+
+class BudgetSpent(AnimatError):
+    """A stimulation budget does not hold what was asked for; nothing of the request was delivered."""
+
+
+class LoopEnded(AnimatError):
+    """A closed loop ended before its time, by a fault or a person; all of its ticks are in its folder."""
+
+
+class DeviceFailed(AnimatError):
+    """A device cannot be used or failed while it was (no driver, no connection, a pulse that did not come)."""

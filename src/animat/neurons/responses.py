@@ -12,7 +12,7 @@ from animat.errors import Mismatch, UnusableData
 from animat.neurons.bursts import separate_bursts
 from animat.neurons.conditions import NO_CONDITION, Condition, Conditions, default_conditions
 from animat.neurons.quality import findings_on
-from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, count_active_channels, count_spikes
+from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import Recording
@@ -140,14 +140,11 @@ def extract_responses(
     # An end that is the last stimulus' or spike's own time is rounded like them.
     inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
     used = read & inside
-    from_s = stimuli.time_s[used] + window_ms[0] * 1e-3
-    to_s = stimuli.time_s[used] + window_ms[1] * 1e-3
-    spikes = count_spikes(recording, from_s, to_s)
-    active_ratio = count_active_channels(recording, from_s, to_s) / n_channels
+    rate_hz, active_ratio = read_windows(recording, stimuli.time_s[used], window_ms)
     bursts = separate_bursts(active_ratio, burst_threshold)
     responses = Responses(
         condition=assignment.condition[used],
-        rate_hz=spikes / ((window_ms[1] - window_ms[0]) * 1e-3 * n_channels),
+        rate_hz=rate_hz,
         active_ratio=active_ratio,
         is_burst=bursts.is_burst,
         conditions=assignment.conditions,

@@ -3,17 +3,56 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sized
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument
-from animat.recordings.recording import Recording
 
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
 
 _BLOCK = 1 << 26
+
+
+class Spiking(Protocol):
+    """Spikes on channels, in the order of time: a `Recording`, or the piece of one that a closed loop has just seen."""
+
+    @property
+    def spike_times_s(self) -> Float64[np.ndarray, " spikes"]:
+        """Times of the spikes, rising."""
+
+    @property
+    def spike_channels(self) -> Int64[np.ndarray, " spikes"]:
+        """The channel of each spike."""
+
+    @property
+    def channels(self) -> Sized:
+        """The channel table."""
+
+
+def read_windows(
+    recording: Spiking, after_s: Float64[np.ndarray, " windows"], window_ms: tuple[float, float]
+) -> tuple[Float64[np.ndarray, " windows"], Float64[np.ndarray, " windows"]]:
+    """The response in the window after each of some times: its rate x and its ratio of active channels.
+
+        x = S / (T N)
+
+    Offline and in a closed loop a response is what this function says it is. From the same times it gives the same
+    bits, from a piece of a recording as from the whole.
+
+    Args:
+        recording: the spikes, on at least one channel.
+        after_s: of the pulses, in seconds on the clock of the spikes.
+        window_ms: start and end of the window after each.
+    """
+    from_s, to_s = after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3
+    n_channels = len(recording.channels)
+    spikes = count_spikes(recording, from_s, to_s)
+    rate_hz = spikes / ((window_ms[1] - window_ms[0]) * 1e-3 * n_channels)
+    return rate_hz, count_active_channels(recording, from_s, to_s) / n_channels
 
 
 def check_window(window_ms: tuple[float, float]) -> None:
@@ -30,7 +69,7 @@ def check_window(window_ms: tuple[float, float]) -> None:
 
 
 def count_spikes(
-    recording: Recording, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
 ) -> Int64[np.ndarray, " windows"]:
     """The number of spikes with from_s <= time < to_s, on all channels together.
 
@@ -47,7 +86,7 @@ def count_spikes(
 
 
 def count_active_channels(
-    recording: Recording, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
 ) -> Int64[np.ndarray, " windows"]:
     """The number of channels with at least one spike in each window; edges and arguments as in `count_spikes`."""
     n_channels = len(recording.channels)
@@ -64,7 +103,7 @@ def count_active_channels(
 
 
 def spikes_in(
-    recording: Recording, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
 ) -> tuple[Int64[np.ndarray, " pairs"], Int64[np.ndarray, " pairs"]]:
     """All pairs of a window and a spike in it, as rows of both; edges and arguments as in `count_spikes`."""
     first = np.searchsorted(recording.spike_times_s, from_s, side="left")

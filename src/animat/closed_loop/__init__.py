@@ -1,0 +1,1 @@
+"""The closed loop: policy, stimulus, culture, response, mapping, robot, in time and logged."""

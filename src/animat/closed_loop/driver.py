@@ -1,0 +1,355 @@
+"""The loop itself: observe, choose, stimulate, read the response, move the robot, write it down."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.closed_loop.body import Body
+from animat.closed_loop.contenders import Contender
+from animat.closed_loop.log import Record
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.tick import Ending, Handled, Tick
+from animat.closed_loop.timing import Clock
+from animat.cultures.base import Culture
+from animat.cultures.budget import Account
+from animat.cultures.observed import Observed
+from animat.errors import BudgetSpent, UnsafeStimulus
+from animat.neurons.windows import read_windows
+from animat.recordings.recording import UNKNOWN, Channels
+from animat.recordings.schedule import TICK_S, on_ticks
+from animat.recordings.stimulus import Stimulus
+
+
+class Stop(Exception):
+    """The session is over before its plan is done."""
+
+    def __init__(self, ending: Ending) -> None:
+        super().__init__(ending.sentence)
+        self.ending = ending
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """What was seen in a stretch of time, on the session's clock, its times on the culture's samples."""
+
+    start_s: float
+    duration_s: float
+    spike_times_s: Float64[np.ndarray, " spikes"]
+    spike_channels: Int64[np.ndarray, " spikes"]
+    channels: Channels
+    stimulus_time_s: Float64[np.ndarray, " stimuli"]
+
+
+class Driver:
+    """Runs episodes on a culture; everything that happens is appended to `records`, for another thread to write.
+
+    Args:
+        culture: open.
+        loop: the settings.
+        contenders: who acts.
+        turns: whose turn each episode is.
+        account: of the stimulation budget.
+        clock: the machine's.
+        seed: decides every random draw.
+    """
+
+    def __init__(
+        self,
+        culture: Culture,
+        loop: Loop,
+        contenders: Sequence[Contender],
+        turns: Sequence[int],
+        account: Account,
+        clock: Clock,
+        seed: int,
+    ) -> None:
+        self.records: deque[Record] = deque()
+        self.episodes_done = 0
+        self.is_stopped = False
+        self.expected_by = float("inf")
+        """When, on `time.monotonic()`, the culture should have answered at the latest; a supervisor watches it."""
+        self._culture, self._loop, self._contenders, self._turns = culture, loop, contenders, turns
+        self._account, self._clock = account, clock
+        self._rng = np.random.default_rng([seed, 21])
+        self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
+        self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
+        usable = culture.patterns[: loop.patterns]
+        self._patterns = [tuple(int(e) for e in row if e != UNKNOWN) for row in usable]
+        self._deck: list[int] = []
+        self._presented = 0
+        self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
+        self._data_at_s = self._wall_zero_s = 0.0
+        self._last_command = 0.0
+
+    def run(self) -> Ending:
+        """Run all episodes; whatever goes wrong is an ending, never an exception."""
+        self._zero_s = self._culture.now_s
+        self._data_at_s = self._wall_zero_s = self._clock.now_s()
+        try:
+            for episode, turn in enumerate(self._turns):
+                self._run_episode(episode, self._contenders[turn])
+                self.episodes_done = episode + 1
+        except Stop as stop:
+            return stop.ending
+        except Exception as error:
+            return Ending("crash", f"an error of the loop itself: {_words(error)}")
+        return Ending("plan", f"all {len(self._turns)} episodes were run")
+
+    def _run_episode(self, episode: int, contender: Contender) -> None:
+        loop = self._loop
+        observation = self._body.reset()
+        self._last_command = 0.0
+        self._see((), loop.pause_s, pause=True)
+        # The first pulse comes as if one had been given at the end of the pause.
+        self._last_pulse_s = self._culture.now_s
+        for iteration in range(loop.robot.episode_limit):
+            chosen = self._choose(contender, observation)
+            repeats = 0
+            while True:
+                delivered = chosen
+                if contender.delivery == "shuffled":
+                    delivered = int(self._rng.integers(len(loop.conditions)))
+                tick, again = self._present(contender, episode, iteration, chosen, delivered, repeats)
+                if not again:
+                    break
+                repeats += 1
+            if tick.terminated or tick.truncated:
+                break
+            observation = np.array(tick.observation)
+
+    def _choose(self, contender: Contender, observation: Float64[np.ndarray, " observations"]) -> int:
+        n = len(self._loop.conditions)
+        try:
+            chosen = int(contender.controller.act(observation, self._rng))
+        except Exception as error:
+            raise Stop(Ending("controller", f"{contender.name} raised {_words(error)}")) from error
+        if not 0 <= chosen < n:
+            raise Stop(Ending("controller", f"{contender.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
+        return chosen
+
+    def _present(
+        self, contender: Contender, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
+    ) -> tuple[Tick, bool]:
+        """Present a condition and move the robot by the answer; returns whether to present it once more instead."""
+        loop, culture = self._loop, self._culture
+        frequency_hz = loop.conditions[delivered].value
+        times_s, late_s = self._times(frequency_hz)
+        stimuli: list[Stimulus] = []
+        if contender.delivery != "silent":
+            stimuli = [
+                Stimulus(float(t), self._patterns[p], loop.pulse, frequency_hz, p, self._presented)
+                for t, p in zip(times_s, self._deal(), strict=True)
+            ]
+        # Two samples more than the window: no spike at its very end can then be seen only in the next stretch.
+        duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
+        handed_over_s = self._clock.now_s()
+        began_s = culture.now_s
+        stretch = self._see(stimuli, duration_s)
+        pulse_time_s = stretch.stimulus_time_s
+        if not stimuli:
+            pulse_time_s = self._on_samples(began_s - self._zero_s + times_s)
+        after_s = pulse_time_s[-1:]
+        rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
+        self._last_pulse_s = self._zero_s + float(after_s[0])
+        is_burst = bool(active_ratio[0] > loop.burst_threshold)
+        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats
+        tick: dict[str, Any] = {
+            "number": self._presented,
+            "contender": contender.name,
+            "episode": episode,
+            "iteration": iteration,
+            "chosen": chosen,
+            "delivered": delivered,
+            "frequency_hz": frequency_hz,
+            "patterns": tuple(stimulus.pattern for stimulus in stimuli),
+            "pulse_time_s": tuple(pulse_time_s.tolist()) if stimuli else (),
+            "read_after_s": float(after_s[0]),
+            "spikes": round(float(rate_hz[0]) * (loop.window_ms[1] - loop.window_ms[0]) * 1e-3 * len(self._channels)),
+            "rate_hz": float(rate_hz[0]),
+            "active_ratio": float(active_ratio[0]),
+            "is_burst": is_burst,
+            "handled": "repeated" if again else "unfinished",
+            "command": None,
+            "reward": None,
+            "observation": (),
+            "terminated": False,
+            "truncated": False,
+            "late_s": late_s,
+            "decided_s": handed_over_s - self._data_at_s,
+        }
+        self._presented += 1
+        self._data_at_s = self._clock.now_s()
+        tick["wall_s"] = self._data_at_s - self._wall_zero_s
+        try:
+            if late_s > TICK_S and loop.on_late == "stop":
+                raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
+            if not again:
+                tick |= self._move(tick["rate_hz"], is_burst, iteration)
+        finally:
+            # Whatever happens to the robot, what the culture did is written down.
+            finished = Tick(**tick)
+            self.records.append(
+                Record(
+                    {"kind": "seen", **_span(stretch), "stimuli": _rows(stimuli), "tick": vars(finished)},
+                    stretch.spike_times_s,
+                    stretch.spike_channels,
+                )
+            )
+        return finished, again
+
+    def _move(self, rate_hz: float, is_burst: bool, iteration: int) -> dict[str, Any]:
+        loop = self._loop
+        handled: Handled = "skipped" if is_burst and loop.on_burst == "skip" else "used"
+        if handled == "used":
+            # In float32, as when it was trained: a response that lies on a percentile is then on it here as well.
+            self._last_command = float(loop.mapping.command(np.float32(rate_hz), loop.percentiles))
+        try:
+            moved = self._body.step(self._last_command)
+        except Exception as error:
+            raise Stop(Ending("robot", f"the robot raised {_words(error)}")) from error
+        if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
+            raise Stop(Ending("robot", f"the robot came to {moved.observation.tolist()} with reward {moved.reward:g}"))
+        return {
+            "handled": handled,
+            "command": self._last_command,
+            "reward": moved.reward,
+            "observation": tuple(moved.observation.tolist()),
+            "terminated": moved.terminated,
+            "truncated": iteration + 1 >= loop.robot.episode_limit and not moved.terminated,
+        }
+
+    def _times(self, frequency_hz: float) -> tuple[Float64[np.ndarray, " pulses"], float]:
+        """When the pulses of a presentation come, from now, and how late the first one is."""
+        now_s = self._culture.now_s
+        wanted_s = self._last_pulse_s + 1 / frequency_hz - now_s
+        first_s = max(wanted_s, 0.0)
+        if self._loop.real_time:
+            behind_s = self._clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
+            first_s = max(first_s, behind_s)
+        times_s = on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
+        # Half a grid step is the grid's and not lateness.
+        late_s = float(times_s[0]) - wanted_s
+        return times_s, late_s if late_s > TICK_S / 2 + 1e-9 else 0.0
+
+    def _deal(self) -> list[int]:
+        """A pattern for each pulse, all different where there are enough, from a deck that is shuffled when empty."""
+        hand: list[int] = []
+        while len(hand) < self._loop.pulses:
+            if not self._deck:
+                self._deck = self._rng.permutation(len(self._patterns)).tolist()
+            place = next((i for i, pattern in enumerate(self._deck) if pattern not in hand), 0)
+            hand.append(self._deck.pop(place))
+        return hand
+
+    def _see(self, stimuli: Sequence[Stimulus], duration_s: float, pause: bool = False) -> Stretch:
+        """Deliver, watch, and check what came back; a pause is written down here."""
+        if self.is_stopped:
+            raise Stop(Ending("person", "stopped by a person"))
+        culture, account = self._culture, self._account
+        try:
+            account.check(stimuli)
+        except BudgetSpent as spent:
+            raise Stop(Ending("budget", str(spent))) from spent
+        began = time.monotonic()
+        self.expected_by = began + duration_s + self._loop.patience_s
+        try:
+            observed = culture.deliver(stimuli, duration_s)
+        except Exception as error:
+            # Whoever stopped the culture ended the session, not the culture's refusal that follows.
+            ending = _ending_of(error, culture, self.is_stopped)
+            asked = [float(stimulus.time_s) for stimulus in stimuli]
+            self.records.append(
+                Record({"kind": "event", "what": "culture", "sentence": ending.sentence, "asked_for_s": asked})
+            )
+            raise Stop(ending) from error
+        finally:
+            self.expected_by = float("inf")
+        account.spend(stimuli)
+        wrong = self._wrong_with(observed, len(stimuli), duration_s)
+        if wrong is not None:
+            words = {"kind": "event", "what": "culture", "sentence": wrong, "got": repr(observed)[:2000]}
+            self.records.append(Record(words))
+            raise Stop(Ending("culture", wrong))
+        offset_s = observed.start_s - self._zero_s
+        stretch = Stretch(
+            offset_s,
+            observed.duration_s,
+            self._on_samples(offset_s + observed.spikes.time_s),
+            np.asarray(observed.spikes.channel, np.int64),
+            self._channels,
+            self._on_samples(offset_s + observed.stimulus_time_s),
+        )
+        self._seen_until_s = offset_s + observed.duration_s
+        if pause:
+            self.records.append(
+                Record(
+                    {"kind": "seen", **_span(stretch), "stimuli": [], "tick": None},
+                    stretch.spike_times_s,
+                    stretch.spike_channels,
+                )
+            )
+        if self._loop.real_time:
+            self._clock.sleep_until(self._wall_zero_s + (culture.now_s - self._zero_s))
+        return stretch
+
+    def _on_samples(self, times_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
+        # The same numbers that a recording of the session holds: only then are windows the same to the last bit.
+        return np.asarray(np.rint(times_s * self._rate_hz) / self._rate_hz)
+
+    def _wrong_with(self, observed: Observed, n_stimuli: int, duration_s: float) -> str | None:
+        """What a backend's answer cannot be, in a sentence; None for an answer that can be."""
+        try:
+            times_s, channel = observed.spikes
+            pulses_s, start_s, seen_s = observed.stimulus_time_s, observed.start_s, observed.duration_s
+            if len(times_s) != len(channel):
+                return f"the culture answered {len(times_s)} spike times for {len(channel)} channels"
+            if pulses_s.shape != (n_stimuli,):
+                return f"the culture answered {pulses_s.shape} stimulus times for {n_stimuli} stimuli"
+            if not (np.isfinite(start_s) and np.isfinite(seen_s) and seen_s >= duration_s - 1e-6):
+                return f"the culture answered a stretch of {seen_s} s from {start_s} s where {duration_s} s were asked"
+            if start_s - self._zero_s < self._seen_until_s - 1.5 / self._rate_hz:
+                return f"the culture's clock went back to {start_s} s"
+            for name, given_s in (("spike", times_s), ("stimulus", pulses_s)):
+                # Not (a <= b): a NaN fails it too.
+                if len(given_s) and not (given_s[0] >= -1e-9 and given_s[-1] <= seen_s + 1e-9):
+                    return f"the culture answered {name} times outside of the {seen_s:g} s that were seen"
+                if not bool((given_s[1:] >= given_s[:-1]).all()):
+                    return f"the culture answered {name} times that are no rising numbers"
+            if len(channel) and not (channel.min() >= 0 and channel.max() < len(self._channels)):
+                return f"the culture answered channel {int(channel.max())} of {len(self._channels)}"
+            if channel.dtype.kind not in "iu":
+                return f"the culture answered channels that are no whole numbers ({channel.dtype})"
+        except Exception as error:
+            return f"the culture answered something that cannot be read: {_words(error)}"
+        return None
+
+
+def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
+    if is_stopped:
+        return Ending("person", "stopped by a person")
+    if isinstance(error, UnsafeStimulus) and error.limit == "stimuli_per_session":
+        return Ending("budget", str(error))
+    if isinstance(error, UnsafeStimulus) and culture.is_stopped:
+        return Ending("culture", f"the culture was stopped: {error}")
+    lost = "the connection to the culture is lost: " if isinstance(error, OSError) else "the culture raised "
+    return Ending("culture", lost + _words(error))
+
+
+def _span(stretch: Stretch) -> dict[str, float]:
+    return {"start_s": stretch.start_s, "duration_s": stretch.duration_s}
+
+
+def _rows(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
+    """What was stimulated; when is in the tick."""
+    return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
+
+
+def _words(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no words'}"

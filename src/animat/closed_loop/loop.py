@@ -1,0 +1,194 @@
+"""How a closed loop is run: how actions are presented and answers read, and what happens when something goes wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, Self, get_args
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.typing import ArrayLike
+
+from animat.errors import InvalidArgument, UnusableData
+from animat.mapping import N_PERCENTILES, Mapping
+from animat.neurons.conditions import Condition
+from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window
+from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
+from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+from animat.robots.base import Robot
+from animat.robots.registry import robot_to_dict
+
+OnBurst = Literal["use", "repeat", "skip"]
+OnLate = Literal["go on", "stop"]
+
+
+class Trained(Protocol):
+    """What a loop takes from a policy, besides letting it act."""
+
+    @property
+    def robot(self) -> Robot[Any]:
+        """The robot it was trained on."""
+
+    @property
+    def mapping(self) -> Mapping | None:
+        """From a response to a command; None for a policy without neurons."""
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """What its actions are."""
+
+    @property
+    def window_ms(self) -> tuple[float, float] | None:
+        """The response window."""
+
+    @property
+    def presentation(self) -> Presentation | None:
+        """How stimuli were presented when its neurons were recorded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The settings of a closed loop.
+
+    An action is a presentation: `pulses` pulses, the first one 1/f after the last pulse of the action before it and
+    the others 1/f apart, each one of the patterns in random order; the response to the last one is read.
+
+    Attributes:
+        robot: that is driven.
+        mapping: from a response to a command.
+        conditions: what is chosen from: frequencies.
+        percentiles: of the simulator that the policy was trained on, in Hz, shape (11,).
+        pulses: of a presentation.
+        window_ms: the response window.
+        burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
+        pulse: what each electrode delivers.
+        patterns: how many of the culture's patterns are used, the first ones; None: all.
+        on_burst: `"use"` the response as any other; `"repeat"` the stimulus, at most `most_repeats` times; `"skip"`
+            it, and move the robot by the command before it (0 where there was none).
+        most_repeats: of one action; the response after that is used.
+        on_late: when a pulse comes later than it should: `"go on"`, or `"stop"` the session. It is logged either way.
+        pause_s: observed without a stimulus before each episode.
+        patience_s: how much longer than it should a culture may take to answer before it counts as hung.
+        real_time: whether a culture that is faster is held back to real time.
+
+    Raises:
+        InvalidArgument: for a setting that cannot be.
+        UnusableData: for conditions that are not frequencies.
+    """
+
+    robot: Robot[Any]
+    mapping: Mapping
+    conditions: tuple[Condition, ...]
+    percentiles: Float32[np.ndarray, " percentiles"] = field(repr=False)
+    pulses: int = 1
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
+    burst_threshold: float = 1.0
+    pulse: Pulse = PUBLISHED_PULSE
+    patterns: int | None = None
+    on_burst: OnBurst = "use"
+    most_repeats: int = 3
+    on_late: OnLate = "go on"
+    pause_s: float = 2.0
+    patience_s: float = 10.0
+    real_time: bool = False
+
+    def __post_init__(self) -> None:
+        percentiles = np.array(self.percentiles, np.float32)
+        if percentiles.shape != (N_PERCENTILES,) or not np.all(np.diff(percentiles) >= 0):
+            raise InvalidArgument(f"percentiles: expected {N_PERCENTILES} rising numbers in Hz, got {self.percentiles}")
+        percentiles.setflags(write=False)
+        object.__setattr__(self, "percentiles", percentiles)
+        check_window(self.window_ms)
+        _ = self.presentation
+        if not self.conditions:
+            raise InvalidArgument("conditions: expected at least one, got none")
+        for condition in self.conditions:
+            if condition.unit != "Hz" or not condition.value > 0:
+                raise UnusableData(
+                    f"condition {condition.label}: expected a frequency, as a closed loop presents by frequency; train "
+                    "on recordings whose conditions are frequencies"
+                )
+        for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
+            if getattr(self, name) not in allowed:
+                raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
+        for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
+        if self.patterns is not None and self.patterns < 1:
+            raise InvalidArgument(f"patterns: expected at least 1, got {self.patterns}")
+
+    @property
+    def presentation(self) -> Presentation:
+        """How it presents; frequencies are mixed, as each is chosen when it is its turn."""
+        return Presentation("mixed", self.pulses)
+
+    @classmethod
+    def of_policy(
+        cls, policy: Trained, percentiles: ArrayLike, *, pulses: int | None = None, **settings: Any
+    ) -> tuple[Self, tuple[Finding, ...]]:
+        """The loop that a policy was trained for, and where it differs from how the policy's recordings were made.
+
+        Args:
+            policy: its robot, mapping, conditions, window and presentation are taken.
+            percentiles: of the simulator that it was trained on, in Hz, shape (11,).
+            pulses: of a presentation; None: as many as in its recordings (1 where that is not known).
+            settings: the other attributes.
+
+        Raises:
+            UnusableData: for a policy without neurons.
+        """
+        if policy.mapping is None:
+            raise UnusableData("policy: expected one that acts through neurons, got one that was trained without")
+        recorded = policy.presentation
+        if pulses is None:
+            pulses = 1 if recorded is None else recorded.pulses
+        if policy.window_ms is not None:
+            settings = {"window_ms": policy.window_ms, **settings}
+        loop = cls(
+            policy.robot,
+            policy.mapping,
+            policy.conditions,
+            np.asarray(percentiles, np.float32),
+            pulses=pulses,
+            **settings,
+        )
+        return loop, _differences(policy, loop)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data, for the log of a session."""
+        plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return plain | {
+            "robot": robot_to_dict(self.robot),
+            "mapping": self.mapping.name,
+            "conditions": [condition.label for condition in self.conditions],
+            "percentiles": self.percentiles.tolist(),
+            "pulse": self.pulse.to_list(),
+        }
+
+
+def _differences(policy: Trained, loop: Loop) -> tuple[Finding, ...]:
+    recorded, found = policy.presentation, []
+    if recorded is None:
+        found.append(
+            f"how the policy's recordings were presented is not known; the loop presents {loop.presentation}, and a "
+            "culture answers otherwise to another presentation"
+        )
+    else:
+        if recorded.order != "mixed":
+            found.append(
+                f"the policy's recordings were {recorded.order}: all stimuli of a frequency together; a closed loop "
+                "presents them mixed, and a culture answers otherwise then: expect less than predicted (record with "
+                "--order mixed for a closed loop)"
+            )
+        if recorded.pulses != loop.pulses:
+            found.append(
+                f"the policy's recordings had {recorded.pulses} pulse(s) a presentation, the loop has {loop.pulses}; "
+                "the response after another number of pulses is another"
+            )
+    findings = [Finding("other-presentation", "warning", sentence) for sentence in found]
+    if policy.window_ms is not None and policy.window_ms != loop.window_ms:
+        sentence = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
+        findings.append(Finding("other-window", "warning", sentence))
+    return tuple(findings)

@@ -1,0 +1,235 @@
+"""Running a session: the loop in a thread of its own, and a supervisor that writes, watches, and ends it safely."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.closed_loop.contenders import Contender, interleaved
+from animat.closed_loop.driver import Driver
+from animat.closed_loop.log import LogWriter, Record
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.session import FORMAT, LOG_FILE, Session, read_session
+from animat.closed_loop.tick import Ending
+from animat.closed_loop.timing import Clock, WallClock
+from animat.cultures.base import Culture
+from animat.cultures.budget import Account
+from animat.errors import InvalidArgument, InvalidFile
+from animat.progress import Progress, Silent
+
+_POLL_S = 0.1
+_SYNC_S = 1.0
+_GRACE_S = 2.0
+"""How long the loop's thread gets to come to its end once it was told to."""
+
+
+def run_session(
+    culture: Culture,
+    loop: Loop,
+    contenders: Sequence[Contender],
+    folder: str | os.PathLike[str],
+    *,
+    episodes: int = 5,
+    seed: int = 1,
+    account: Account | None = None,
+    clock: Clock | None = None,
+    progress: Progress | None = None,
+) -> Session:
+    """Run contenders in closed loop on a culture, their episodes interleaved in random order.
+
+    Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, and once this
+    returns, or `recover_session` did its work, `session.nwb` is a recording like any other. Unless the plan was done
+    or the budget spent, the culture is then stopped: it delivers nothing until it is closed and opened again.
+    `ending` says what happened; nothing is raised for it, Ctrl-C included.
+
+    Args:
+        culture: open; it stays open.
+        loop: the settings.
+        contenders: who acts.
+        folder: for `session.log` and `session.nwb`.
+        episodes: of each contender.
+        seed: decides every random draw, but what the culture does.
+        account: of a stimulation budget; None: without end.
+        clock: the machine's; None: its monotonic one.
+        progress: told after each episode.
+
+    Raises:
+        InvalidArgument: for a culture that is closed or stopped, no contenders, or a session in the folder already.
+        InvalidFile: if the log cannot be begun.
+    """
+    _check(culture, loop, contenders, episodes, seed)
+    account, progress = account or Account(), progress or Silent()
+    turns = interleaved(len(contenders), episodes, np.random.default_rng([seed, 20]))
+    driver = Driver(culture, loop, contenders, turns, account, clock or WallClock(), seed)
+    log = LogWriter(Path(folder) / LOG_FILE, _header(culture, loop, contenders, turns, seed))
+    supervisor = _Supervisor(culture, loop, driver, log, progress, len(turns))
+    try:
+        ending = supervisor.run()
+    finally:
+        log.close()
+    session = replace(read_session(log.path), ending=ending)
+    try:
+        session.recording().save(session.recording_file)
+    except InvalidFile as error:
+        sentence = f"{ending.sentence}; and {error} (animat recover {folder} writes it when there is room)"
+        session = replace(session, ending=replace(ending, sentence=sentence))
+    return session
+
+
+class _Supervisor:
+    def __init__(
+        self, culture: Culture, loop: Loop, driver: Driver, log: LogWriter, progress: Progress, episodes: int
+    ) -> None:
+        self._culture, self._loop, self._driver = culture, loop, driver
+        self._log, self._progress, self._episodes = log, progress, episodes
+        self._synced = time.monotonic()
+        self._ending: Ending | None = None
+
+    def run(self) -> Ending:
+        """Start the loop and stay with it to its end."""
+        driver = self._driver
+        thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
+        with _interrupts(self._stop_for_a_person), _without_collector():
+            thread.start()
+            ending = self._watch(thread)
+            if ending is not None:
+                # The loop did not end by itself: it is told to, and left alone if it does not.
+                driver.is_stopped = True
+                self._halt(ending)
+                thread.join(_GRACE_S)
+            elif self._ending is None:
+                ending = Ending("crash", "the loop's thread ended without a word")
+            else:
+                ending = self._ending
+            if ending.by not in ("plan", "budget"):
+                self._halt(ending)
+            return self._finish(ending)
+
+    def _drive(self) -> None:
+        self._ending = self._driver.run()
+
+    def _watch(self, thread: threading.Thread) -> Ending | None:
+        """Write and watch while the loop runs; returns why it must be ended from outside, None if it ended."""
+        driver = self._driver
+        while thread.is_alive():
+            thread.join(_POLL_S)
+            try:
+                self._write()
+            except OSError as error:
+                return Ending("disk", f"the log cannot be written: {error.strerror or error}")
+            if time.monotonic() > driver.expected_by:
+                return Ending(
+                    "hang", f"the culture did not answer {self._loop.patience_s:g} s after it should have: left alone"
+                )
+            self._progress.update(driver.episodes_done, self._episodes)
+        return None
+
+    def _write(self) -> None:
+        records = self._driver.records
+        while records:
+            self._log.append(records[0])
+            # Taken away only once it is written: a full disk loses none that could be written later.
+            records.popleft()
+            # Let the loop's thread have the interpreter: it may have a deadline.
+            time.sleep(0)
+        if time.monotonic() - self._synced > _SYNC_S:
+            self._log.sync()
+            self._synced = time.monotonic()
+
+    def _finish(self, ending: Ending) -> Ending:
+        """Write what is left, and how it ended."""
+        try:
+            self._write()
+            self._log.append(Record({"kind": "end", "by": ending.by, "sentence": ending.sentence}))
+            self._log.sync()
+        except OSError as error:
+            left = len(self._driver.records)
+            sentence = f"{ending.sentence}; {left} ticks could not be written: {error.strerror or error}"
+            return Ending("disk" if ending.by in ("plan", "budget") else ending.by, sentence)
+        return ending
+
+    def _stop_for_a_person(self) -> None:
+        self._driver.is_stopped = True
+        self._halt(Ending("person", "stopped by a person (Ctrl-C)"))
+
+    def _halt(self, ending: Ending) -> None:
+        """Stop the culture, from a thread of its own: a backend that hangs must not hang the end as well."""
+        halting = threading.Thread(target=self._halt_now, args=(ending.sentence,), daemon=True)
+        halting.start()
+        halting.join(_GRACE_S)
+
+    def _halt_now(self, reason: str) -> None:
+        # The guard refuses every stimulus from here on, whatever the backend does about those under way.
+        with contextlib.suppress(Exception):
+            self._culture.stop(reason)
+
+
+@contextlib.contextmanager
+def _interrupts(stop: Any) -> Iterator[None]:
+    """Let Ctrl-C end the session in place of raising somewhere; only the main thread can."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: stop())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """Keep Python's cycle collector, which can take 50 ms, out of the loop; the loop makes no cycles."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def _header(
+    culture: Culture, loop: Loop, contenders: Sequence[Contender], turns: Sequence[int], seed: int
+) -> dict[str, Any]:
+    channels = culture.channels
+    return {
+        "kind": "header",
+        "format": FORMAT,
+        "recorded_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "start_min": culture.now_s / 60,
+        "sampling_rate_hz": culture.sampling_rate_hz,
+        "channels": {name: getattr(channels, name).tolist() for name in ("label", "electrode", "x_um", "y_um")},
+        "culture": culture.name,
+        "provenance": culture.provenance,
+        "limits": asdict(culture.limits),
+        "loop": loop.to_dict(),
+        "contenders": [{"name": c.name, "meaning": c.meaning, "delivery": c.delivery} for c in contenders],
+        "turns": [contenders[turn].name for turn in turns],
+        "seed": seed,
+    }
+
+
+def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episodes: int, seed: int) -> None:
+    if not culture.is_open or culture.is_stopped:
+        state = "stopped" if culture.is_open else "closed"
+        raise InvalidArgument(f"culture: expected an open one that may stimulate, got one that is {state}")
+    if not contenders or len({contender.name for contender in contenders}) < len(contenders):
+        raise InvalidArgument("contenders: expected at least one, each name once")
+    if episodes < 1:
+        raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    if seed < 0:
+        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    if loop.patterns is not None and loop.patterns > len(culture.patterns):
+        raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")

@@ -1,0 +1,93 @@
+"""What is written down of every tick of a closed loop, and how a session ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Self
+
+Handled = Literal["used", "repeated", "skipped", "unfinished"]
+EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One presentation, its response, and what came of it. Times are in seconds on the session's clock.
+
+    Attributes:
+        number: of the presentation in the session, from 0.
+        contender: whose episode it is.
+        episode: number of the episode in the session, from 0.
+        iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration.
+        chosen: the condition that was chosen.
+        delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
+        frequency_hz: of the delivered one.
+        patterns: of each pulse, none under the silent control.
+        pulse_time_s: when each pulse really began.
+        read_after_s: the pulse that the response was read after, or when it would have come.
+        spikes: in the response window.
+        rate_hz: x.
+        active_ratio: share of channels that spiked in the window.
+        is_burst: whether that is above the threshold.
+        handled: what was done with the response; `"unfinished"` if something went wrong before the robot had moved.
+        command: the robot was moved by; None where it was not.
+        reward: of the step.
+        observation: after the step.
+        terminated: the task ended by itself.
+        truncated: the episode limit ended it.
+        late_s: how much later than it should the first pulse came.
+        decided_s: from the end of the response window before, as data were there, until this presentation was handed
+            over.
+        wall_s: the machine's clock at the end, from the start of the session.
+    """
+
+    number: int
+    contender: str
+    episode: int
+    iteration: int
+    chosen: int
+    delivered: int
+    frequency_hz: float
+    patterns: tuple[int, ...]
+    pulse_time_s: tuple[float, ...]
+    read_after_s: float
+    spikes: int
+    rate_hz: float
+    active_ratio: float
+    is_burst: bool
+    handled: Handled
+    command: float | None
+    reward: float | None
+    observation: tuple[float, ...]
+    terminated: bool
+    truncated: bool
+    late_s: float
+    decided_s: float
+    wall_s: float
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """From what `vars` gave, through JSON."""
+        values = {each.name: data[each.name] for each in fields(cls)}
+        for name in ("patterns", "pulse_time_s", "observation"):
+            values[name] = tuple(values[name])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a session ended.
+
+    Attributes:
+        by: `"plan"`, all episodes were run; else what ended it before: the budget, a person (Ctrl-C), a fault of the
+            culture, its silence (`"hang"`), a late pulse where that should stop, the robot, the controller, the disk;
+            `"crash"` where nothing was written about it.
+        sentence: what happened.
+    """
+
+    by: EndedBy
+    sentence: str
+
+    @property
+    def is_fault(self) -> bool:
+        """Whether something went wrong that nobody asked for."""
+        return self.by not in ("plan", "budget", "person")

@@ -1,0 +1,102 @@
+"""How many pulses a culture may be given over all that is done with it, and how many it was given."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from animat.errors import BudgetSpent, InvalidArgument
+from animat.recordings.stimulus import Stimulus
+
+
+@dataclass(frozen=True)
+class Budget:
+    """An allowance of stimulation; None is no end. It comes on top of the culture's limits and replaces none of them.
+
+    Attributes:
+        pulses: in all, a pattern of electrodes that are pulsed together counting once.
+        pulses_per_electrode: on any one electrode.
+
+    Raises:
+        InvalidArgument: for a number below 0.
+    """
+
+    pulses: int | None = None
+    pulses_per_electrode: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("pulses", "pulses_per_electrode"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise InvalidArgument(f"budget.{name}: expected 0 or more, got {value}")
+
+
+class Account:
+    """What was spent of a budget, through recordings and closed loops alike.
+
+    Args:
+        budget: the allowance.
+    """
+
+    def __init__(self, budget: Budget | None = None) -> None:
+        self.budget = budget or Budget()
+        self.pulses = 0
+        self._on: Counter[int] = Counter()
+
+    @property
+    def most_on_an_electrode(self) -> int:
+        """Pulses on the electrode that had most."""
+        return max(self._on.values(), default=0)
+
+    @property
+    def per_electrode(self) -> dict[int, int]:
+        """Pulses that each electrode had."""
+        return dict(sorted(self._on.items()))
+
+    def check(self, stimuli: Sequence[Stimulus]) -> None:
+        """Raise unless the budget holds these stimuli too.
+
+        Raises:
+            BudgetSpent: naming what would be exceeded; nothing is written down.
+        """
+        budget = self.budget
+        if budget.pulses is not None and self.pulses + len(stimuli) > budget.pulses:
+            raise BudgetSpent(
+                f"budget.pulses: {self.pulses} of {budget.pulses} pulses are spent, and {len(stimuli)} more were wanted"
+            )
+        most = budget.pulses_per_electrode
+        if most is None:
+            return
+        for electrode, more in _counted(stimuli).items():
+            if self._on[electrode] + more > most:
+                raise BudgetSpent(
+                    f"budget.pulses_per_electrode: electrode {electrode} had {self._on[electrode]} of {most} pulses, "
+                    f"and {more} more were wanted"
+                )
+
+    def spend(self, stimuli: Sequence[Stimulus]) -> None:
+        """Write stimuli down as delivered."""
+        self.pulses += len(stimuli)
+        self._on.update(_counted(stimuli))
+
+    def to_dict(self) -> dict[str, Any]:
+        """What was spent of what, as plain data."""
+        return {
+            "pulses": self.pulses,
+            "of": self.budget.pulses,
+            "most_on_an_electrode": self.most_on_an_electrode,
+            "of_per_electrode": self.budget.pulses_per_electrode,
+        }
+
+    def __str__(self) -> str:
+        of, each = self.budget.pulses, self.budget.pulses_per_electrode
+        return (
+            f"{self.pulses:,}{'' if of is None else f' of {of:,}'} pulses; at most {self.most_on_an_electrode:,}"
+            f"{'' if each is None else f' of {each:,}'} on an electrode"
+        )
+
+
+def _counted(stimuli: Sequence[Stimulus]) -> Counter[int]:
+    return Counter(electrode for stimulus in stimuli for electrode in stimulus.electrodes)

@@ -1,0 +1,318 @@
+"""The closed loop presents as it should, reads responses as they are read offline, and writes everything down."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from animat.closed_loop.contenders import (
+    AnyCondition,
+    Contender,
+    HandMadeRule,
+    OneCondition,
+    controls,
+    interleaved,
+    lean,
+)
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.closed_loop.session import read_session
+from animat.cultures.budget import Account, Budget
+from animat.cultures.contract import CultureContract
+from animat.errors import BudgetSpent, InvalidArgument, UnusableData
+from animat.mapping import Linear, Thresholds
+from animat.neurons.conditions import ByFrequency, Condition
+from animat.neurons.responses import extract_responses
+from animat.recordings.protocol import Presentation
+from animat.recordings.reading import read_recording
+from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
+from animat.robots import Cartpole, Navigation
+from cultures import small_culture
+from fake_culture import CHANNELS, FakeCulture
+
+HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
+CONDITIONS = tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ)
+PERCENTILES = np.linspace(0.0, 125.0, 11)
+SHORT = Navigation(episode_limit=6)
+RANDOM = Contender("random", "any", AnyCondition(5))
+
+
+def loop_of(**changed: Any) -> Loop:
+    given = {"robot": SHORT, "mapping": Thresholds(9), "conditions": CONDITIONS, "percentiles": PERCENTILES}
+    return Loop(**(given | {"pause_s": 0.1} | changed))
+
+
+class TestFake(CultureContract):
+    """The fake is a culture: what the loop does with it, it does with any."""
+
+    is_repeatable = True
+
+    def make_culture(self) -> FakeCulture:
+        return FakeCulture()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    pulses=st.integers(1, 6),
+    jitter=st.booleans(),
+    on_burst=st.sampled_from(["use", "repeat", "skip"]),
+    window_ms=st.sampled_from([(2.0, 10.0), (0.0, 5.0), (3.15, 11.05)]),
+)
+def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    pulses: int,
+    jitter: bool,
+    on_burst: str,
+    window_ms: tuple[float, float],
+) -> None:
+    folder = tmp_path_factory.mktemp("session")
+    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms)
+    contenders = [
+        RANDOM,
+        Contender("shuffled", "", OneCondition(1), "shuffled"),
+        Contender("no", "", OneCondition(0), "silent"),
+    ]
+    with FakeCulture(seed, jitter=jitter) as culture:
+        session = run_session(culture, loop, contenders, folder, episodes=2, seed=seed)
+    assert session.ending.by == "plan", session.ending
+    assert_read_alike(folder, loop)
+    ticks = session.ticks
+    assert len(session.episodes) == 6
+    for tick in ticks:
+        if tick.handled == "used":
+            assert tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), loop.percentiles))
+        assert tick.is_burst == (tick.active_ratio > 0.9)
+        assert (tick.handled == "skipped") <= (on_burst == "skip" and tick.is_burst)
+        assert (tick.handled == "repeated") <= (on_burst == "repeat" and tick.is_burst)
+        assert tick.late_s == 0.0
+
+
+def assert_read_alike(folder: Path, loop: Loop) -> None:
+    """The session's NWB file, read like any other, gives the loop's x to the last bit."""
+    session = read_session(folder)
+    recording = read_recording(session.recording_file)
+    # How it ended may be on no disk, where that was full.
+    assert replace(recording, provenance={}).equals(replace(session.recording(), provenance={}))
+    assert recording.presentation == Presentation("mixed", loop.pulses)
+    responses = extract_responses(recording, ByFrequency(HZ), loop.window_ms, loop.burst_threshold)
+    stimulated = [tick for tick in session.ticks if tick.patterns]
+    assert len(responses) == len(stimulated)
+    np.testing.assert_array_equal(responses.rate_hz, [tick.rate_hz for tick in stimulated])
+    np.testing.assert_array_equal(responses.active_ratio, [tick.active_ratio for tick in stimulated])
+    np.testing.assert_array_equal(responses.is_burst, [tick.is_burst for tick in stimulated])
+    np.testing.assert_array_equal(responses.condition, [tick.delivered for tick in stimulated])
+    np.testing.assert_array_equal(responses.time_s, [tick.read_after_s for tick in stimulated])
+
+
+def test_on_the_virtual_culture_too(tmp_path: Path) -> None:
+    loop = loop_of(pulses=5, percentiles=np.linspace(0, 40, 11), burst_threshold=0.9)
+    with small_culture() as culture:
+        contenders = [RANDOM, Contender("no", "", OneCondition(4), "silent")]
+        session = run_session(culture, loop, contenders, tmp_path, episodes=2)
+        assert session.ending.by == "plan"
+        assert not culture.is_stopped
+        assert culture.delivered == sum(episode.pulses for episode in session.episodes) == 60
+    assert_read_alike(tmp_path, loop)
+    recording = session.recording()
+    assert recording.provenance["source"].startswith("virtual culture")
+    assert recording.start_min == session.log.header["start_min"]
+
+
+def test_presentations_are_those_of_a_recording(tmp_path: Path) -> None:
+    loop = loop_of(pulses=3, patterns=7)
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=8)
+    pulse_s = np.array([t for tick in session.ticks for t in tick.pulse_time_s])
+    frequency_hz = np.repeat([tick.frequency_hz for tick in session.ticks], 3)
+    first = np.array([tick.iteration == 0 for tick in session.ticks]).repeat(3) & (np.arange(len(pulse_s)) % 3 == 0)
+    # Every pulse 1/f after the one before it, f being its own: within the grid of 50 us.
+    np.testing.assert_allclose(np.diff(pulse_s)[~first[1:]], 1 / frequency_hz[1:][~first[1:]], atol=5.1e-5)
+    patterns = [tick.patterns for tick in session.ticks]
+    assert all(len(set(p)) == 3 for p in patterns)
+    counts = Counter(p for ps in patterns for p in ps)
+    assert set(counts) == set(range(7))
+    assert max(counts.values()) - min(counts.values()) <= 2
+    assert {tick.chosen for tick in session.ticks} == set(range(5))
+
+
+def test_contenders_take_turns_in_random_order() -> None:
+    rng = np.random.default_rng(1)
+    turns = interleaved(4, 50, rng)
+    rounds = np.array(turns).reshape(50, 4)
+    assert all(set(row.tolist()) == {0, 1, 2, 3} for row in rounds)
+    # Each stands in each place about as often as in any other: 12.5 times of 50, standard deviation 3.1.
+    assert all(4 <= np.sum(rounds[:, place] == who) <= 24 for place in range(4) for who in range(4))
+
+
+def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_condition(tmp_path: Path) -> None:
+    contenders = [Contender("no", "", OneCondition(0), "silent"), Contender("any", "", OneCondition(4), "shuffled")]
+    with FakeCulture() as culture:
+        session = run_session(culture, loop_of(), contenders, tmp_path, episodes=10)
+        assert culture.delivered == culture.pulses == 60
+    silent = [tick for tick in session.ticks if tick.contender == "no"]
+    assert not any(tick.patterns or tick.pulse_time_s for tick in silent)
+    assert all(tick.reward is not None for tick in silent)
+    shuffled = [tick.delivered for tick in session.ticks if tick.contender == "any"]
+    assert {tick.chosen for tick in session.ticks if tick.contender == "any"} == {4}
+    assert set(shuffled) == set(range(5))
+
+
+def test_a_response_on_a_percentile_passes_it_as_in_training(tmp_path: Path) -> None:
+    # x is k / (8 ms 16) = 7.8125 k Hz; with percentiles on such values ties are common. A window of 3 ms makes x a
+    # number that float32 cannot hold: compared in float64, it would lie under its own percentile half of the time.
+    window_ms = (2.0, 5.0)
+    step_hz = 1 / (0.003 * CHANNELS)
+    percentiles = (step_hz * np.array([0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 9])).astype(np.float32)
+    loop = loop_of(mapping=Thresholds(1), percentiles=percentiles, window_ms=window_ms)
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=10)
+    ties = [tick for tick in session.ticks if tick.spikes == 3]
+    assert ties
+    assert all(tick.command == (1.0 if tick.spikes >= 3 else -1.0) for tick in session.ticks)
+
+
+def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:
+    sessions = {}
+    for how in ("use", "repeat", "skip"):
+        loop = loop_of(robot=Navigation(episode_limit=40), burst_threshold=0.95, on_burst=how, mapping=Linear())
+        with FakeCulture() as culture:
+            sessions[how] = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=5)
+    for how, session in sessions.items():
+        bursts = [i for i, tick in enumerate(session.ticks) if tick.is_burst]
+        assert bursts, how
+        for i in bursts:
+            tick, after = session.ticks[i], session.ticks[i + 1 : i + 2]
+            if how == "use":
+                assert tick.handled == "used"
+            elif how == "skip":
+                before = session.ticks[i - 1]
+                held = before.command if i and before.episode == tick.episode else 0.0
+                assert (tick.handled, tick.command) == ("skipped", held)
+            elif after and tick.handled == "repeated":
+                assert (tick.command, tick.reward) == (None, None)
+                assert (after[0].iteration, after[0].delivered) == (tick.iteration, tick.delivered)
+                assert after[0].number == tick.number + 1
+    assert sum(episode.iterations for episode in sessions["repeat"].episodes) == 200
+    assert len(sessions["repeat"].ticks) > 200
+
+
+def test_a_stimulus_is_repeated_at_most_so_often(tmp_path: Path) -> None:
+    loop = loop_of(burst_threshold=0.0, on_burst="repeat", most_repeats=2)
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1)
+    assert [tick.handled for tick in session.ticks] == ["repeated", "repeated", "used"] * 6
+    assert session.episodes[0].is_whole
+
+
+class RecordedAs:
+    """What a loop takes from a policy."""
+
+    robot, mapping, conditions = SHORT, Thresholds(1), CONDITIONS
+
+    def __init__(self, presentation: Presentation | None, window_ms: tuple[float, float] | None = (2.0, 10.0)) -> None:
+        self.presentation, self.window_ms = presentation, window_ms
+
+
+def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not() -> None:
+    loop, findings = Loop.of_policy(RecordedAs(Presentation("mixed", 5)), PERCENTILES)
+    assert (loop.pulses, loop.presentation, findings) == (5, Presentation("mixed", 5), ())
+    loop, findings = Loop.of_policy(RecordedAs(Presentation("blocked", 1)), PERCENTILES)
+    assert loop.pulses == 1
+    assert [f.severity for f in findings] == ["warning"]
+    assert "blocked" in findings[0].sentence
+    _, findings = Loop.of_policy(RecordedAs(Presentation("mixed", 5)), PERCENTILES, pulses=2)
+    assert "5 pulse(s) a presentation, the loop has 2" in findings[0].sentence
+    loop, findings = Loop.of_policy(RecordedAs(None), PERCENTILES)
+    assert loop.pulses == 1
+    assert "not known" in findings[0].sentence
+    _, findings = Loop.of_policy(RecordedAs(Presentation("mixed")), PERCENTILES, window_ms=(3.0, 9.0))
+    assert [f.name for f in findings] == ["other-window"]
+    without = RecordedAs(Presentation("mixed"))
+    without.mapping = None  # type: ignore[assignment]
+    with pytest.raises(UnusableData, match="through neurons"):
+        Loop.of_policy(without, PERCENTILES)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"percentiles": [1, 2]}, "11 rising"),
+        ({"percentiles": PERCENTILES[::-1]}, "11 rising"),
+        ({"pulses": 0}, "at least 1 pulse"),
+        ({"window_ms": (10.0, 2.0)}, "start < end"),
+        ({"conditions": ()}, "at least one"),
+        ({"conditions": (Condition("electrode 5", 0.0),)}, "expected a frequency"),
+        ({"on_burst": "panic"}, "use, repeat, skip"),
+        ({"on_late": "panic"}, "go on, stop"),
+        ({"pause_s": -1.0}, "pause_s"),
+        ({"patience_s": float("nan")}, "patience_s"),
+        ({"patterns": 0}, "patterns"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises((InvalidArgument, UnusableData), match=words):
+        loop_of(**wrong)
+
+
+def test_a_session_needs_an_open_culture_contenders_and_a_folder_of_its_own(tmp_path: Path) -> None:
+    culture = FakeCulture()
+    with pytest.raises(InvalidArgument, match="closed"):
+        run_session(culture, loop_of(), [RANDOM], tmp_path)
+    with culture:
+        for contenders in ([], [RANDOM, RANDOM]):
+            with pytest.raises(InvalidArgument, match="contenders"):
+                run_session(culture, loop_of(), contenders, tmp_path)
+        with pytest.raises(InvalidArgument, match="patterns"):
+            run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
+        with pytest.raises(InvalidArgument, match="episodes"):
+            run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=0)
+        run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
+        before = (tmp_path / "session.log").read_bytes()
+        with pytest.raises(InvalidArgument, match="a session is there already"):
+            run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
+        assert (tmp_path / "session.log").read_bytes() == before
+        culture.stop()
+        with pytest.raises(InvalidArgument, match="stopped"):
+            run_session(culture, loop_of(), [RANDOM], tmp_path / "other")
+
+
+def test_the_hand_made_rule_steers_the_right_way() -> None:
+    rule = HandMadeRule(Cartpole(), up=4, down=0)
+    rng = np.random.default_rng(1)
+    assert rule.act(np.array([0.0, 0.0, 0.1, 0.0]), rng) == 4
+    assert rule.act(np.array([0.0, 0.0, 0.05, -1.0]), rng) == 0
+    # By the robot itself: a push by the rule brings a leaning pole back sooner than the opposite one.
+    navigation = Navigation()
+    # At the start the goal is to the right and below, that is, clockwise of facing right.
+    assert lean(navigation, np.array([0.0, 0.0, 0.0])) == pytest.approx(np.pi / 4)
+    assert lean(navigation, np.array([0.0, 0.0, np.pi])) == pytest.approx(-3 * np.pi / 4)
+    assert lean(navigation, np.array([0.9, 0.9, np.pi])) == pytest.approx(np.pi / 4)
+    names = [c.name for c in controls(Cartpole(), ["a", "b"], strongest=1, weakest=0, policy=rule)]
+    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "hand-made"]
+
+
+def test_a_budget_is_kept_to_the_pulse() -> None:
+    account = Account(Budget(pulses=10, pulses_per_electrode=4))
+    pair = [Stimulus(0.0, (1, 2), PUBLISHED_PULSE), Stimulus(0.1, (2, 3), PUBLISHED_PULSE)]
+    for _ in range(2):
+        account.check(pair)
+        account.spend(pair)
+    assert account.per_electrode == {1: 2, 2: 4, 3: 2}
+    with pytest.raises(BudgetSpent, match="electrode 2 had 4 of 4"):
+        account.check(pair)
+    account.check([Stimulus(0.0, (1,), PUBLISHED_PULSE)] * 2)
+    with pytest.raises(BudgetSpent, match="4 of 10 pulses are spent, and 7 more"):
+        account.check([Stimulus(0.0, (i,), PUBLISHED_PULSE) for i in range(10, 17)])
+    assert account.to_dict() == {"pulses": 4, "of": 10, "most_on_an_electrode": 4, "of_per_electrode": 4}
+    with pytest.raises(InvalidArgument, match="pulses"):
+        Budget(pulses=-1)
+    assert replace(Budget(), pulses=3) == Budget(3)

@@ -1,0 +1,403 @@
+"""Whatever goes wrong: no further pulse, every earlier tick on disk, and a file that can be read."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.closed_loop.contenders import Contender
+from animat.closed_loop.log import LogWriter, Record, read_log
+from animat.closed_loop.running import run_session
+from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
+from animat.cultures.budget import Account, Budget
+from animat.cultures.observed import Observed, Spikes
+from animat.cultures.safety import SIMULATED_LIMITS
+from animat.errors import InvalidFile, UnsafeStimulus
+from animat.recordings.reading import read_recording
+from animat.robots import Navigation
+from fake_culture import FakeCulture, Fault
+from test_closed_loop import RANDOM, assert_read_alike, loop_of
+
+LONG = Navigation(episode_limit=100_000, stride_m=1e-9)
+
+
+def run(folder: Path, culture: FakeCulture, **changed: Any) -> Session:
+    return run_session(culture, loop_of(**({"robot": Navigation(episode_limit=20)} | changed)), [RANDOM], folder)
+
+
+def assert_safe(session: Session, culture: FakeCulture, at_least: int) -> None:
+    """Stopped, no pulse after that, and on disk what was done: as a log and as a recording."""
+    assert culture.is_stopped
+    assert culture.halted
+    assert culture.after_halt == 0
+    with pytest.raises(UnsafeStimulus, match="stop"):
+        culture.stimulate(culture.stimulation_electrodes[:1], session_pulse())
+    again = read_session(session.folder)
+    assert again.ticks == session.ticks
+    assert len(again.ticks) >= at_least
+    assert [tick.number for tick in again.ticks] == list(range(len(again.ticks)))
+    assert_read_alike(session.folder, loop_of())
+
+
+def session_pulse() -> Any:
+    from animat.recordings.stimulus import PUBLISHED_PULSE
+
+    return PUBLISHED_PULSE
+
+
+def raising(error: Exception) -> Fault:
+    def fault(culture: FakeCulture, observed: Observed) -> Observed:
+        raise error
+
+    return fault
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (RuntimeError("the amplifier is on fire"), "the culture raised RuntimeError: the amplifier is on fire"),
+        (ConnectionResetError("gone"), "the connection to the culture is lost: ConnectionResetError: gone"),
+        (TimeoutError("no answer"), "the connection to the culture is lost"),
+        (KeyError("window"), "the culture raised KeyError"),
+    ],
+)
+def test_a_backend_that_raises_or_loses_its_connection(tmp_path: Path, error: Exception, words: str) -> None:
+    with FakeCulture(fault=raising(error), at=8) as culture:
+        session = run(tmp_path, culture)
+        assert session.ending.by == "culture"
+        assert words in session.ending.sentence
+        assert_safe(session, culture, 7)
+        assert len(session.ticks) == 7
+    events = [record.words for record in session.log.records if record.words["kind"] == "event"]
+    assert [len(event["asked_for_s"]) for event in events] == [1]
+    assert read_session(tmp_path).ending == session.ending
+
+
+def garbled(**changed: Any) -> Fault:
+    def fault(culture: FakeCulture, observed: Observed) -> Observed:
+        return replace(observed, **{name: change(observed) for name, change in changed.items()})
+
+    return fault
+
+
+def spikes(change: Callable[[Any, Any], tuple[Any, Any]]) -> Callable[[Observed], Spikes]:
+    return lambda observed: Spikes(*change(observed.spikes.time_s, observed.spikes.channel))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (garbled(spikes=spikes(lambda t, c: (t[:-1], c))), "spike times for"),
+        (garbled(spikes=spikes(lambda t, c: (t, c + 1000))), "channel 10"),
+        (garbled(spikes=spikes(lambda t, c: (t, c - 1000))), "channel -"),
+        (garbled(spikes=spikes(lambda t, c: (np.where(t > 0.01, np.nan, t), c))), "spike times"),
+        (garbled(spikes=spikes(lambda t, c: (t[::-1], c))), "no rising numbers"),
+        (garbled(spikes=spikes(lambda t, c: (t + 100.0, c))), "outside of the"),
+        (garbled(spikes=spikes(lambda t, c: (t, c.astype(float)))), "no whole numbers"),
+        (garbled(spikes=spikes(lambda t, c: (None, None))), "cannot be read"),
+        (garbled(spikes=lambda o: 7), "cannot be read"),
+        (garbled(stimulus_time_s=lambda o: np.empty(0)), "0,) stimulus times for 1"),
+        (garbled(stimulus_time_s=lambda o: np.array([np.nan])), "stimulus times"),
+        (garbled(duration_s=lambda o: 0.001), "a stretch of 0.001 s"),
+        (garbled(duration_s=lambda o: float("nan")), "a stretch of nan s"),
+        (garbled(start_s=lambda o: 3.0), "went back"),
+        (lambda culture, observed: None, "cannot be read"),
+    ],
+)
+def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str) -> None:
+    with FakeCulture(fault=fault, at=8) as culture:
+        session = run(tmp_path, culture)
+        assert session.ending.by == "culture"
+        assert words in session.ending.sentence
+        assert_safe(session, culture, 7)
+
+
+def test_a_backend_that_hangs(tmp_path: Path) -> None:
+    released = threading.Event()
+
+    def hang(culture: FakeCulture, observed: Observed) -> Observed:
+        released.wait(60)
+        return observed
+
+    with FakeCulture(fault=hang, at=8) as culture:
+        try:
+            session = run(tmp_path, culture, patience_s=0.3)
+            assert session.ending.by == "hang"
+            assert "did not answer 0.3 s after it should have" in session.ending.sentence
+            assert_safe(session, culture, 7)
+            pulses = culture.pulses
+        finally:
+            released.set()
+        thread = next((t for t in threading.enumerate() if t.name == "closed loop"), None)
+        if thread is not None:
+            thread.join(10)
+        # It woke up, and could do nothing more: neither to the culture nor to the log.
+        assert culture.pulses == pulses
+        assert read_session(tmp_path).ticks == session.ticks
+
+
+class FakeClock:
+    """A clock that moves when it is waited for, or told."""
+
+    def __init__(self) -> None:
+        self.time_s = 100.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def sleep_until(self, time_s: float) -> None:
+        self.time_s = max(self.time_s, time_s)
+
+
+@pytest.mark.parametrize("on_late", ["go on", "stop"])
+def test_a_backend_that_answers_late(tmp_path: Path, on_late: str) -> None:
+    clock = FakeClock()
+
+    def late(culture: FakeCulture, observed: Observed) -> Observed:
+        clock.time_s += observed.duration_s + 0.25
+        return observed
+
+    loop = loop_of(robot=Navigation(episode_limit=20), real_time=True, on_late=on_late)
+    with FakeCulture(fault=late, at=8) as culture:
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1, clock=clock)
+        was_late = [tick.number for tick in session.ticks if tick.late_s > 0]
+        # Delivery 0 is the pause: number 8 is tick 7, and tick 8 is the one that comes late.
+        assert was_late == [8]
+        tick = session.ticks[8]
+        window_s = 0.010 + 2 / 20_000
+        assert tick.late_s == pytest.approx(0.25 - (1 / tick.frequency_hz - window_s), abs=1e-4)
+        if on_late == "stop":
+            assert session.ending.by == "lateness"
+            assert f"{1000 * tick.late_s:.3g} ms late" in session.ending.sentence
+            assert_safe(session, culture, 9)
+            assert session.ticks[-1].handled == "unfinished"
+        else:
+            assert session.ending.by == "plan"
+            assert session.episodes[0].late == 1
+            assert clock.time_s == pytest.approx(100.0 + culture.now_s - 12.0, abs=1e-6)
+            assert_read_alike(tmp_path, loop)
+
+
+class Broken:
+    """A body that comes to an end in its seventh step."""
+
+    def __init__(self, how: str) -> None:
+        self.how, self.steps = how, 0
+
+    def __call__(self, step: Callable[[float], Any]) -> Callable[[float], Any]:
+        def broken(u: float) -> Any:
+            self.steps += 1
+            moved = step(u)
+            if self.steps < 7:
+                return moved
+            if self.how == "raises":
+                raise ZeroDivisionError("the wheel came off")
+            return moved._replace(reward=float("nan"))
+
+        return broken
+
+
+@pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
+def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from animat.closed_loop import driver
+
+    broken = Broken(how)
+
+    class BrokenBody(driver.Body):
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            self.step = broken(self.step)  # type: ignore[method-assign]
+
+    monkeypatch.setattr(driver, "Body", BrokenBody)
+    with FakeCulture() as culture:
+        session = run(tmp_path, culture)
+        assert session.ending.by == "robot"
+        assert words in session.ending.sentence
+        assert_safe(session, culture, 7)
+    assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["unfinished"]
+    assert not session.episodes[0].is_whole
+
+
+@pytest.mark.parametrize(("action", "words"), [(None, "raised TypeError"), (5, "chose 5"), (-1, "chose -1")])
+def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> None:
+    class Confused:
+        def act(self, observation: Any, rng: np.random.Generator) -> Any:
+            return action if rng.random() < 0.2 else 0
+
+    with FakeCulture() as culture:
+        session = run_session(culture, loop_of(robot=LONG), [Contender("it", "", Confused())], tmp_path, episodes=1)
+        assert session.ending.by == "controller"
+        assert f"it {words}" in session.ending.sentence
+        assert_safe(session, culture, 0)
+
+
+def test_ctrl_c(tmp_path: Path) -> None:
+    def press(culture: FakeCulture, observed: Observed) -> Observed:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
+        return observed
+
+    before = signal.getsignal(signal.SIGINT)
+    with FakeCulture(fault=press, at=8) as culture:
+        session = run(tmp_path, culture)
+        assert session.ending.by == "person"
+        assert_safe(session, culture, 7)
+        assert culture.deliveries <= 10
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("kind", ["pulses", "electrode", "session"])
+def test_the_budget_runs_out(tmp_path: Path, kind: str) -> None:
+    limits = replace(SIMULATED_LIMITS, stimuli_per_session=30) if kind == "session" else None
+    account = Account(Budget(30 if kind == "pulses" else None, 6 if kind == "electrode" else None))
+    with FakeCulture(limits=limits) as culture:
+        loop = loop_of(robot=LONG, pulses=4)
+        session = run_session(culture, loop, [RANDOM], tmp_path, account=account, episodes=1)
+        assert session.ending.by == "budget"
+        assert account.pulses == culture.pulses == culture.delivered
+        if kind == "electrode":
+            assert 4 < account.most_on_an_electrode <= 6
+        else:
+            # Four a presentation: the eighth would be over it.
+            assert account.pulses == 28
+    assert_read_alike(tmp_path, loop_of(pulses=4))
+
+
+class Disk:
+    """`os.write` of a disk that has room for so many bytes."""
+
+    def __init__(self, room: int) -> None:
+        self.room, self.real = room, os.write
+
+    def write(self, file: int, data: Any) -> int:
+        if self.room <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        part = bytes(data)[: self.room]
+        self.room -= len(part)
+        return self.real(file, part)
+
+
+def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(60_000)
+    monkeypatch.setattr("animat.closed_loop.log.os.write", disk.write)
+
+    def slowly(culture: FakeCulture, observed: Observed) -> Observed:
+        culture._at += 1
+        time.sleep(0.002)
+        return observed
+
+    with FakeCulture(fault=slowly, at=0) as culture:
+        session = run(tmp_path, culture, robot=LONG)
+        assert session.ending.by == "disk"
+        assert "No space left on device" in session.ending.sentence
+        assert disk.room == 0
+        assert_safe(session, culture, 20)
+    assert session.log.lost_bytes == 0
+    assert "could not be written" in session.ending.sentence
+    with pytest.raises(InvalidFile, match="No space left"):
+        Disk.write(disk, 0, b"")  # type: ignore[misc]
+        LogWriter(tmp_path / "other.log", {})
+
+
+def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> None:
+    # A folder stands where the file should go.
+    (tmp_path / "session.nwb").mkdir()
+    (tmp_path / "session.nwb" / "in the way").touch()
+    with FakeCulture() as culture:
+        session = run(tmp_path, culture, robot=Navigation(episode_limit=3))
+    assert session.ending.by == "plan"
+    assert "session.nwb: cannot be written" in session.ending.sentence
+    assert "animat recover" in session.ending.sentence
+    (tmp_path / "session.nwb" / "in the way").unlink()
+    (tmp_path / "session.nwb").rmdir()
+    assert recover_session(tmp_path).ticks == session.ticks
+    assert_read_alike(tmp_path, loop_of())
+
+
+KILLED = """
+import sys, time
+from test_closed_loop_faults import LONG, RANDOM, FakeCulture, loop_of, run_session
+
+def slowly(culture, observed):
+    culture._at += 1
+    time.sleep(0.005)
+    if culture._at % 20 == 0:
+        print(culture._at, time.monotonic(), flush=True)
+    return observed
+
+with FakeCulture(fault=slowly, at=0) as culture:
+    run_session(culture, loop_of(robot=LONG), [RANDOM], sys.argv[1], episodes=1)
+"""
+
+
+def test_killed_outright_it_loses_at_most_a_second(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
+    )
+    assert process.stdout is not None
+    told = []
+    while len(told) < 2 or told[-1][1] - told[0][1] < 2.0:
+        number, at_s = process.stdout.readline().split()
+        told.append((int(number), float(at_s)))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    session = read_session(tmp_path)
+    assert session.ending.by == "crash"
+    # What was done a second before the last sign of life is there, whatever came after it.
+    done = max(number for number, at_s in told if at_s < told[-1][1] - 1.0)
+    assert len(session.ticks) >= done - 1 > 20
+    with pytest.raises(InvalidFile):
+        read_recording(tmp_path / "session.nwb")
+    assert recover_session(tmp_path).ticks == session.ticks
+    assert_read_alike(tmp_path, loop_of())
+
+
+def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:
+    log = LogWriter(tmp_path / LOG_FILE, {"kind": "header"})
+    header_ends = (tmp_path / LOG_FILE).stat().st_size
+    rng = np.random.default_rng(1)
+    written = [Record({"n": n}, np.sort(rng.random(n)), rng.integers(0, 9, n)) for n in range(6)]
+    ends = []
+    for record in written:
+        log.append(record)
+        ends.append((tmp_path / LOG_FILE).stat().st_size)
+    log.sync()
+    log.close()
+    data = (tmp_path / LOG_FILE).read_bytes()
+    assert len(data) == ends[-1]
+    other = tmp_path / "cut.log"
+    for length in range(len(data) + 1):
+        other.write_bytes(data[:length])
+        if length < header_ends:
+            with pytest.raises(InvalidFile):
+                read_log(other)
+            continue
+        whole = [record for record, end in zip(written, ends, strict=True) if end <= length]
+        found = read_log(other)
+        assert [r.words for r in found.records] == [r.words for r in whole]
+        for got, want in zip(found.records, whole, strict=True):
+            np.testing.assert_array_equal(got.spike_times_s, want.spike_times_s)
+            np.testing.assert_array_equal(got.spike_channels, want.spike_channels)
+    # A byte that changed is noticed: nothing from there on is taken for true.
+    for place in range(ends[1], len(data), 7):
+        other.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        assert len(read_log(other).records) < len(written)
+    for content in (b"", b"ANIMAT", b"something else entirely"):
+        other.write_bytes(content)
+        with pytest.raises(InvalidFile):
+            read_log(other)
+    with pytest.raises(InvalidFile):
+        read_session(tmp_path / "nowhere")
