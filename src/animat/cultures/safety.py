@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from math import isfinite
-from typing import Any, Final, NamedTuple
+from itertools import pairwise
+from math import floor, isfinite
+from typing import Final, NamedTuple
 
 from animat.errors import InvalidArgument, UnsafeStimulus
-from animat.recordings.stimulus import Kind, Pulse, Stimulus
+from animat.recordings.stimulus import Kind, Phase, Pulse, Stimulus
 
 NS = 1_000_000_000
 _MAY_ADMIT: Final = object()
@@ -31,6 +32,13 @@ class Limits:
         stimuli_per_electrode_s: most stimuli on one electrode in any second.
         stimuli_per_s: most stimuli, on whatever electrodes, in any second.
         stimuli_per_session: most stimuli from `open` to `close`.
+        phases_per_pulse: most phases of a pulse.
+        alternates: whether phases that follow each other must differ in sign.
+        phase_step_us: phases last whole multiples of it; 0: any time.
+        amplitude_step: what the device rounds amplitudes to, 0 where it does not: the charges of the *rounded* phases
+            are what `charge_per_phase` and `net_charge` hold for.
+        interval_us: least time from the start of a stimulus to the start of the next one on the same electrode.
+        gap_us: least time from the end of a stimulus to the start of the next one, on whatever electrodes.
 
     Raises:
         InvalidArgument: for a limit that is no number or below 0.
@@ -45,6 +53,12 @@ class Limits:
     stimuli_per_electrode_s: int
     stimuli_per_s: int
     stimuli_per_session: int
+    phases_per_pulse: int = 1000
+    alternates: bool = False
+    phase_step_us: float = 0.0
+    amplitude_step: float = 0.0
+    interval_us: float = 0.0
+    gap_us: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in ("voltage", "current"):
@@ -52,7 +66,7 @@ class Limits:
         shortest, longest = self.phase_us
         if not (0 < shortest <= longest and isfinite(longest)):
             raise InvalidArgument(f"phase_us: expected (shortest, longest), above 0 and finite, got {self.phase_us}")
-        for name in _NUMBERS:
+        for name in (*_NUMBERS, *_LEAST, "phase_step_us", "amplitude_step"):
             if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
 
@@ -72,18 +86,29 @@ class Limits:
         looser = [name for name in _NUMBERS if getattr(self, name) > getattr(device, name)]
         if self.phase_us[0] < device.phase_us[0] or self.phase_us[1] > device.phase_us[1]:
             looser.append("phase_us")
+        looser += [name for name in _LEAST if getattr(self, name) < getattr(device, name)]
+        looser += ["alternates"] * (device.alternates and not self.alternates)
+        looser += ["phase_step_us"] * (not _is_multiple(self.phase_step_us, device.phase_step_us))
+        # What the device rounds to is no matter of wishes.
+        looser += ["amplitude_step"] * (self.amplitude_step != device.amplitude_step)
         if looser:
             raise InvalidArgument(
                 f"limits.{looser[0]}: expected no looser than the device's {getattr(device, looser[0])}, got "
                 f"{getattr(self, looser[0])}: limits can be tightened, never loosened"
             )
 
-    def to_dict(self) -> dict[str, Any]:
-        """As data for JSON."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+_LEAST = ("interval_us", "gap_us")
+_NUMBERS = tuple(
+    each.name
+    for each in fields(Limits)
+    if each.name not in ("kind", "phase_us", "alternates", "phase_step_us", "amplitude_step", *_LEAST)
+)
 
 
-_NUMBERS = tuple(each.name for each in fields(Limits) if each.name not in ("kind", "phase_us"))
+def _is_multiple(value: float, step: float) -> bool:
+    """Whether a value is a whole multiple of a step, above 0; of step 0 everything is."""
+    return step == 0 or (value > 0 and abs(value / step - round(value / step)) < 1e-9)
 
 
 SIMULATED_LIMITS = Limits(
@@ -99,6 +124,25 @@ SIMULATED_LIMITS = Limits(
 )
 """A simulation comes to no harm, so these are wide. `net_charge` lets even the paper's pulse pass, which as printed
 leaves 20 mV ms over; the limits of a living culture must not."""
+
+
+def delivered_pulse(pulse: Pulse, amplitude_step: float) -> Pulse:
+    """A pulse as a device delivers it that rounds amplitudes to whole steps, half away from 0; step 0: as it is."""
+    if amplitude_step == 0:
+        return pulse
+    rounded = [steps_of(phase.amplitude, amplitude_step) * amplitude_step for phase in pulse.phases]
+    if pulse.kind == "voltage":
+        return Pulse(tuple(Phase(p.duration_us, amplitude_mv=a) for p, a in zip(pulse.phases, rounded, strict=True)))
+    return Pulse(tuple(Phase(p.duration_us, amplitude_ua=a) for p, a in zip(pulse.phases, rounded, strict=True)))
+
+
+def steps_of(amplitude: float, amplitude_step: float) -> int:
+    """An amplitude in whole steps, half away from 0: opposite amplitudes stay opposite."""
+    return _sign(amplitude) * floor(abs(amplitude) / amplitude_step + 0.5)
+
+
+def _sign(amplitude: float) -> int:
+    return (amplitude > 0) - (amplitude < 0)
 
 
 class Admitted:
@@ -216,6 +260,12 @@ class Guard:
                     f"from now, {(busy_until_ns - start_ns) / 1000:g} us too early: put them in the order of time, "
                     "further apart",
                 )
+            if start_ns < busy_until_ns + round(limits.gap_us * 1000):
+                raise UnsafeStimulus(
+                    "gap_us",
+                    f"expected {limits.gap_us:g} us or more from the end of a stimulus to the start of the next, got "
+                    f"{(start_ns - busy_until_ns) / 1000:g}: put them further apart",
+                )
             event = _Event(start_ns, start_ns + round(stimulus.pulse.duration_us * 1000), stimulus.electrodes)
             # Histories are copied before they are written to: a request that fails must leave no trace.
             for electrode in event.electrodes:
@@ -251,9 +301,14 @@ class Guard:
 
     def _check_pulse(self, pulse: Pulse) -> None:
         limits = self.limits
-        amplitude_unit, charge_unit = limits.units
+        amplitude_unit, _ = limits.units
         if pulse.kind != limits.kind:
             raise UnsafeStimulus("kind", f"expected {limits.kind} pulses, got a {pulse.kind} pulse ({pulse})")
+        if len(pulse.phases) > limits.phases_per_pulse:
+            raise UnsafeStimulus(
+                "phases_per_pulse",
+                f"expected at most {limits.phases_per_pulse} phases in a pulse, got {len(pulse.phases)} ({pulse})",
+            )
         for phase in pulse.phases:
             if abs(phase.amplitude) > limits.amplitude:
                 raise UnsafeStimulus(
@@ -265,17 +320,34 @@ class Guard:
                 raise UnsafeStimulus(
                     "phase_us", f"expected phases of {shortest:g} to {longest:g} us, got {phase.duration_us:g}"
                 )
+            if not _is_multiple(phase.duration_us, limits.phase_step_us):
+                raise UnsafeStimulus(
+                    "phase_step_us",
+                    f"expected phases in steps of {limits.phase_step_us:g} us, got {phase.duration_us:g}: round it",
+                )
+        if limits.alternates:
+            for before, after in pairwise(pulse.phases):
+                if _sign(before.amplitude) == _sign(after.amplitude):
+                    raise UnsafeStimulus("alternates", f"expected neighbouring phases of different signs, got {pulse}")
+        self._check_charge(pulse)
+
+    def _check_charge(self, pulse: Pulse) -> None:
+        """The limits on charge, of the pulse as the device rounds it."""
+        limits, charge_unit = self.limits, self.limits.units[1]
+        pulse, as_asked = delivered_pulse(pulse, limits.amplitude_step), pulse
+        is_rounded = "" if pulse == as_asked else f", which the device makes of {as_asked}"
+        for phase in pulse.phases:
             if abs(phase.charge) > limits.charge_per_phase:
                 raise UnsafeStimulus(
                     "charge_per_phase",
-                    f"expected at most {limits.charge_per_phase:g} {charge_unit} a phase, got {phase.charge:g}: lower "
-                    "the amplitude or shorten the phase",
+                    f"expected at most {limits.charge_per_phase:g} {charge_unit} a phase, got {phase.charge:g}"
+                    f"{is_rounded}: lower the amplitude or shorten the phase",
                 )
         if abs(pulse.net_charge) > limits.net_charge:
             raise UnsafeStimulus(
                 "net_charge",
                 f"expected phases that balance to {limits.net_charge:g} {charge_unit}, got {pulse.net_charge:g} "
-                f"({pulse}): give the phases equal and opposite charge",
+                f"({pulse}{is_rounded}): give the phases equal and opposite charge",
             )
 
     def _check_rates(self, event: _Event, recent: deque[int], recent_on: dict[int, deque[int]]) -> None:
@@ -286,6 +358,13 @@ class Guard:
                 f"expected at most {limits.stimuli_per_s} stimuli in any second, got {len(recent)}: slow down",
             )
         for electrode in event.electrodes:
+            history = recent_on[electrode]
+            if len(history) > 1 and history[-1] - history[-2] < round(limits.interval_us * 1000):
+                raise UnsafeStimulus(
+                    "interval_us",
+                    f"expected {limits.interval_us:g} us or more from stimulus to stimulus on an electrode, got "
+                    f"{(history[-1] - history[-2]) / 1000:g} on electrode {electrode}: slow down",
+                )
             if len(recent_on[electrode]) > limits.stimuli_per_electrode_s:
                 raise UnsafeStimulus(
                     "stimuli_per_electrode_s",

@@ -1,0 +1,58 @@
+"""The limits on pace held on a device's own clock, where what was asked for in time can come late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from animat.cultures.safety import Guard, Limits
+from animat.errors import UnsafeStimulus
+from animat.recordings.stimulus import Stimulus
+
+LATER_S = 0.001
+"""How much later stimuli are tried when they would come too soon after what was delivered before."""
+PATIENCE_S = 2.0
+"""All limits on pace look back a second: what does not fit after two is no matter of pace."""
+_PACE = frozenset({"overlap", "gap_us", "interval_us", "stimuli_per_electrode_s", "stimuli_per_s"})
+
+
+class Pace:
+    """A guard on the device's clock, behind the one on the culture's clock that every request passes.
+
+    A request that begins late comes closer to the next one than was asked for: two that kept a limit apart may break it
+    together. So each is put before a second guard at the time that it will really have, and waits where that is
+    too soon.
+
+    Args:
+        limits: in force.
+        sites: electrodes that can stimulate.
+    """
+
+    def __init__(self, limits: Limits, sites: Iterable[int]) -> None:
+        self._guard = Guard(limits, sites)
+
+    def soonest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
+        """The soonest time from `from_s` on, on the device's clock, at which the stimuli may begin; they then count.
+
+        Args:
+            stimuli: with times counted from their beginning.
+            from_s: when they could begin.
+
+        Raises:
+            UnsafeStimulus: for stimuli that no wait makes safe.
+        """
+        waited_s = 0.0
+        while True:
+            try:
+                self._guard.admit(stimuli, from_s + waited_s)
+            except UnsafeStimulus as error:
+                if error.limit not in _PACE or waited_s >= PATIENCE_S:
+                    raise
+                waited_s += LATER_S
+            else:
+                return from_s + waited_s
+
+
+def from_zero(stimuli: Sequence[Stimulus]) -> list[Stimulus]:
+    """Stimuli with times counted from the first of them."""
+    return [replace(stimulus, time_s=stimulus.time_s - stimuli[0].time_s) for stimulus in stimuli]

@@ -1,0 +1,207 @@
+"""The CL1's driver against a stand-in of the SDK; against the SDK itself in `test_cl1_sdk.py`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from animat.cultures.base import Culture
+from animat.cultures.cl1 import CL1_LIMITS, CL1_PULSE, SITES, CL1Culture
+from animat.cultures.contract import CultureContract
+from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
+from animat.recordings.formats.stimulus_text import said
+from animat.recordings.protocol import Protocol
+from animat.recordings.stimulus import BALANCED_PULSE, Phase, Pulse, Stimulus
+from stand_in_cl import Neurons, install
+
+
+@pytest.fixture(autouse=True)
+def neurons(monkeypatch: pytest.MonkeyPatch) -> Iterator[Neurons]:
+    yield install(monkeypatch)
+
+
+class TestCL1(CultureContract):
+    pulse = CL1_PULSE
+
+    def make_culture(self) -> Culture:
+        # A device's clock goes on from session to session: a new one is a device that was started anew.
+        sys.modules["cl"].neurons.__init__()
+        return CL1Culture()
+
+
+@pytest.mark.parametrize(
+    ("channel", "what"), [(0, "ground"), (4, "reference"), (7, "ground"), (56, "ground"), (63, "ground")]
+)
+def test_a_channel_that_cannot_stimulate_is_refused_by_name(channel: int, what: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"got channel {channel} in number 1, which is {what}"):
+        CL1Culture([[1, 2], [3, channel]])
+    with CL1Culture() as culture, pytest.raises(UnsafeStimulus, match=f"got electrode {channel}") as refused:
+        culture.deliver([Stimulus(0.0, (1, channel), CL1_PULSE)], 0.1)
+    assert refused.value.limit == "sites"
+
+
+def pulse(*numbers: float) -> Pulse:
+    return Pulse(tuple(Phase(us, amplitude_ua=ua) for us, ua in zip(numbers[::2], numbers[1::2], strict=True)))
+
+
+@pytest.mark.parametrize(
+    ("limit", "bad", "words"),
+    [
+        ("net_charge", pulse(160, -1, 180, 1), "expected phases that balance"),
+        ("net_charge", pulse(160, -1), "expected phases that balance"),
+        ("amplitude", pulse(160, -3.01, 160, 3.01), "at most 3 uA"),
+        ("charge_per_phase", pulse(1500, -2.5, 1500, 2.5), "at most 3 nC"),
+        ("phase_step_us", pulse(150, -1, 150, 1), "steps of 20 us, got 150"),
+        ("alternates", pulse(160, -1, 160, -1, 320, 1), "different signs"),
+        ("phases_per_pulse", pulse(20, -1, 20, 1, 20, -1, 20, 1), "at most 3 phases"),
+        ("kind", BALANCED_PULSE, "expected current pulses"),
+    ],
+)
+def test_what_the_sdk_would_refuse_or_not_look_at_is_refused_by_the_guard(limit: str, bad: Pulse, words: str) -> None:
+    with CL1Culture() as culture, pytest.raises(UnsafeStimulus, match=words) as refused:
+        culture.deliver([Stimulus(0.0, (1,), bad)], 0.1)
+    assert refused.value.limit == limit
+
+
+def test_pulses_with_a_gap_of_current_0_and_three_phases_pass(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        culture.deliver([Stimulus(0.0, (1,), pulse(160, -1.1, 40, 0.0, 320, 0.55))], 0.1)
+    assert neurons.pulses[0][2].durations_us == (160, 40, 320)
+
+
+def test_pulses_faster_than_200_hz_are_refused_on_one_channel_and_not_on_two() -> None:
+    with CL1Culture() as culture:
+        with pytest.raises(UnsafeStimulus, match="interval_us: expected 5000 us or more"):
+            culture.deliver([Stimulus(t, (1,), CL1_PULSE) for t in (0.0, 0.00496)], 0.1)
+        with pytest.raises(UnsafeStimulus, match="gap_us: expected 80 us or more"):
+            culture.deliver([Stimulus(0.0, (1,), CL1_PULSE), Stimulus(0.00036, (2,), CL1_PULSE)], 0.1)
+        culture.deliver([Stimulus(t, (1 + i,), CL1_PULSE) for i, t in enumerate((0.0, 0.0004))], 0.1)
+        culture.deliver([Stimulus(t, (1,), CL1_PULSE) for t in (0.0, 0.005)], 0.1)
+
+
+def test_the_five_frequencies_are_delivered_to_a_frame(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        recording = culture.record(Protocol(pulse=CL1_PULSE, presentations=20, setup_s=0.1, pause_s=0.5), seed=2)
+        schedule = culture.schedule(Protocol(pulse=CL1_PULSE, presentations=20, setup_s=0.1, pause_s=0.5), seed=2)
+    delivered = sorted({frame for frame, _, _ in neurons.pulses})
+    asked = np.concatenate([block.stimuli.time_s for block in schedule.blocks])
+    assert len(delivered) == len(asked) == 100
+    for block in range(5):
+        rows = slice(20 * block, 20 * block + 20)
+        # The pause before the first pulse leaves time to be in time.
+        np.testing.assert_array_equal(np.diff(delivered[rows]), np.diff(np.rint(asked[rows] * 25_000)))
+    assert recording.presentation == Protocol().presentation
+    assert len(neurons.pulses) == 500
+    for row, electrodes in enumerate(recording.stimuli.electrodes):
+        assert {c for f, c, _ in neurons.pulses if f == delivered[row]} == set(electrodes.tolist())
+
+
+def test_what_begins_late_keeps_its_distance_from_what_was_before(neurons: Neurons) -> None:
+    with CL1Culture(ticks_per_s=200) as culture:
+        neurons.late_frames = 200
+        culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.0001)
+        neurons.late_frames = 0
+        culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.1)
+    first, second = [frame for frame, _, _ in neurons.pulses]
+    assert second - first >= 125
+
+
+def test_the_time_that_a_pulse_began_at_is_the_devices(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        observed = culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE), Stimulus(0.05, (1, 9), CL1_PULSE)], 0.06)
+        np.testing.assert_array_equal(
+            np.rint((observed.start_s + observed.stimulus_time_s) * 25_000),
+            sorted({frame for frame, _, _ in neurons.pulses}),
+        )
+        assert observed.duration_s >= 0.06 + observed.stimulus_time_s[0] - 1e-9
+
+
+def test_a_pulse_that_never_comes_is_an_error_that_names_it(neurons: Neurons) -> None:
+    neurons.drop = {9}
+    with CL1Culture() as culture, pytest.raises(DeviceFailed, match=r"expected a pulse on channel 9 .* left it out"):
+        culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE)], 0.1)
+
+
+def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        before = neurons.interrupted
+        neurons.fail = TimeoutError("Loop fell behind by 1 frame (40 us)\nwhen entering the 3rd\niteration.")
+        with pytest.raises(DeviceFailed, match="TimeoutError: Loop fell behind by 1 frame") as failed:
+            culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.1)
+        assert "\n" not in str(failed.value)
+        assert neurons.interrupted > before
+        neurons.fail = None
+
+
+def test_an_emergency_stop_half_way_delivers_nothing_more(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        stamp, ticks = neurons.timestamp, [0]
+
+        def count() -> int:
+            ticks[0] += 1
+            if ticks[0] == 20:
+                culture.stop("half way")
+            return stamp()
+
+        neurons.timestamp = count  # type: ignore[method-assign]
+        with pytest.raises(DeviceFailed, match="stopped while delivering"):
+            culture.deliver([Stimulus(0.0125 * i, (1,), CL1_PULSE) for i in range(40)], 1.0)
+        delivered = len(neurons.pulses)
+        assert delivered < 20
+        assert neurons.queue == []
+        culture.advance(0.5)
+        assert len(neurons.pulses) == delivered
+
+
+def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    with CL1Culture(record_to=tmp_path) as culture:
+        culture.present([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)])
+    ((frame, text),) = neurons.stream
+    assert frame == neurons.pulses[0][0]
+    assert said(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 3, "presentation": 7}
+    assert Pulse.from_list(json.loads(text)["phases"]) == CL1_PULSE
+
+
+def test_without_the_sdk_the_error_says_where_it_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cl", None)
+    with pytest.raises(DeviceFailed, match="cl-sdk") as failed:
+        CL1Culture().open()
+    assert "\n" not in str(failed.value)
+
+
+def test_spikes_on_ground_are_counted_and_not_recorded(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        neurons.queue = [(frame, channel, None) for frame in (7, 14) for channel in (4, 8)]  # type: ignore[list-item]
+        spikes = culture.advance(0.1)
+        assert [culture.channels.label[row] for row in spikes.channel] == ["8", "8"]
+        assert culture.spikes_not_on_electrodes == 2
+
+
+def test_patterns_use_every_kind_of_channel_that_can_and_positions_are_a_grid() -> None:
+    culture = CL1Culture(seed=5, pitch_um=200.0)
+    assert culture.patterns.shape == (100, 5)
+    assert set(culture.patterns.ravel().tolist()) <= set(SITES)
+    x_um, y_um = culture.channels.x_um, culture.channels.y_um
+    assert (x_um.max(), y_um.max()) == (1400.0, 1400.0)
+    row = culture.channels.electrode.tolist().index(17)
+    assert (x_um[row], y_um[row]) == (400.0, 200.0)
+    assert not CL1Culture().channels.has_positions
+
+
+def test_limits_that_are_looser_in_a_new_way_are_refused() -> None:
+    for looser in (
+        replace(CL1_LIMITS, alternates=False),
+        replace(CL1_LIMITS, phase_step_us=10.0),
+        replace(CL1_LIMITS, phase_step_us=0.0),
+        replace(CL1_LIMITS, interval_us=0.0),
+        replace(CL1_LIMITS, phases_per_pulse=4),
+    ):
+        with pytest.raises(InvalidArgument, match="tightened, never loosened"):
+            CL1Culture(limits=looser).open()
+    with CL1Culture(limits=replace(CL1_LIMITS, phase_step_us=40.0, interval_us=12_500.0)) as culture:
+        assert culture.is_open
