@@ -70,6 +70,16 @@ def test_the_scan_measures_what_the_neurons_do() -> None:
         assert not np.any(scan.signal_to_noise[silent])
 
 
+def test_the_scan_does_not_age_the_culture() -> None:
+    with small_culture() as scanned:
+        recording = scanned.record(SHORT)
+    with small_culture(selection=scanned.selection) as given:
+        assert given.scan is None
+        again = given.record(SHORT)
+    assert np.array_equal(again.spike_times_s, recording.spike_times_s)
+    assert np.array_equal(again.spike_channels, recording.spike_channels)
+
+
 def test_sites_sit_on_neurons_and_stimulation_sites_on_excitatory_ones(culture: VirtualCulture) -> None:
     selection, tissue = culture.selection, culture.tissue
     pairs = culture.visibility.pairs_of(selection.stimulation)

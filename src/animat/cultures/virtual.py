@@ -33,10 +33,12 @@ WARM_UP_S = 5.0
 class VirtualCulture(Culture):
     """A simulated culture; `docs/virtual-culture.md` says what of.
 
-    Its clock is the tissue's, starting at 0 when it is first opened, after the array was scanned and electrodes were
-    chosen. Time is exact to the nanosecond, however it is cut: the same requests give the same spikes. A pulse acts
-    with a strength in proportion to the charge of its largest cathodic (negative) phase, the published pulse being 1;
-    nothing blinds the electrodes after a pulse (for the artefact of a real one see `animat.cultures.traces`).
+    When it is first opened the array is scanned and electrodes are chosen; then the tissue is put back to where it was,
+    so that the scan does not age it, and a culture with given electrodes is, spike for spike, the one that was scanned.
+    The clock starts at 0 there. Time is exact to the nanosecond, however it is cut: the same requests give the same
+    spikes. A pulse acts with a strength in proportion to the charge of its largest cathodic (negative) phase, the
+    published pulse being 1; nothing blinds the electrodes after a pulse (for the artefact of a real one see
+    `animat.cultures.traces`).
 
     Args:
         seed: which culture: decides the tissue, the spike shapes, and the patterns; zero or more.
@@ -204,8 +206,10 @@ class VirtualCulture(Culture):
             tissue = self.tissue
             tissue.advance(WARM_UP_S)
             if self._selection is None:
+                before = tissue.snapshot()
                 self._scan = self._scan_array()
                 self._selection = select_electrodes(MAXONE, self._scan, self._rule, seed=self.seed)
+                tissue.restore(before)
             self._zero_ns = self._now_ns = round(tissue.now_s * NS)
         self._look()
 
