@@ -12,8 +12,9 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.recordings.formats.csv import read_csv
+from animat.recordings.formats.hdf5 import DAMAGE, first_line
+from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.npz import read_npz
-from animat.recordings.formats.nwb import read_nwb
 from animat.recordings.recording import Recording
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -27,13 +28,18 @@ def read_recording(
     path: str | os.PathLike[str],
     *,
     stimuli_path: str | os.PathLike[str] | None = None,
+    stimuli: str | None = None,
+    part: str | None = None,
     start_min: float | None = None,
 ) -> Recording:
-    """Read one recording: NWB (HDF5), NPZ (zip) or CSV (text, gzipped or not), known by its content.
+    """Read one recording: NWB, MaxWell, CL1 (HDF5), NPZ (zip) or CSV (text, gzipped or not), known by its content.
 
     Args:
         path: the file.
         stimuli_path: the file of stimuli, for CSV only; by default the one beside the spikes.
+        stimuli: which of several things in a file are the stimuli: NWB of other programs, the name; MaxWell, the
+            events' type.
+        part: which recording of a MaxWell file that holds several, such as `well000/rec0000`.
         start_min: when the recording started on the culture's clock, in minutes; by default what the file says.
 
     Returns:
@@ -42,7 +48,8 @@ def read_recording(
 
     Raises:
         InvalidFile: naming the file, what was expected and what came.
-        InvalidArgument: for a `stimuli_path` beside a file that holds its own stimuli, or a `start_min` not finite.
+        InvalidArgument: for a `stimuli_path` beside a file that holds its own stimuli, a choice that the format does
+            not offer, or a `start_min` not finite.
     """
     path = Path(path)
     if start_min is not None and not np.isfinite(start_min):
@@ -53,9 +60,11 @@ def read_recording(
         raise InvalidArgument(
             f"stimuli_path: expected only beside CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
         )
+    if (stimuli is not None or part is not None) and not magic.startswith(HDF5):
+        raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
         if magic.startswith(HDF5):
-            recording = read_nwb(path)
+            recording = read_hdf5(path, part=part, stimuli=stimuli)
         elif magic.startswith(ZIP):
             recording = read_npz(path)
         elif magic.startswith(NPY):
@@ -65,6 +74,9 @@ def read_recording(
     except (UnusableData, InvalidArgument) as error:
         # These name the column at fault but not the file.
         raise InvalidFile(f"{path}: {error}") from error
+    except (*DAMAGE, RecursionError, AssertionError) as error:
+        # What no reader foresaw: still a file that cannot be read, and one line.
+        raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
     return recording if start_min is None else dataclasses.replace(recording, start_min=float(start_min))
 
 
@@ -121,6 +133,8 @@ def _files(path: Path) -> list[Path]:
 
 def _first_bytes(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InvalidFile(f"{path}: expected a file, got a device or a pipe")
         with path.open("rb") as file:
             magic = file.read(len(HDF5))
     except FileNotFoundError as error:

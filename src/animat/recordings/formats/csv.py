@@ -40,7 +40,9 @@ STIMULUS_COLUMNS = {
     "stimulus_presentation": ("stimulus_presentation", "stim_presentation", "presentation"),
     "stimulus_electrodes": ("stimulus_electrodes", "stim_electrodes", "electrodes"),
 }
+MOST_ELECTRODES = 50_000_000
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
+UNPACKED_BYTES, UNPACKED_RATIO = 2**24, 20
 SUFFIXES = (".csv", ".csv.gz")
 
 
@@ -130,7 +132,7 @@ def _text(path: Path) -> str:
     try:
         content = path.read_bytes()
         if content[:2] == b"\x1f\x8b":
-            content = gzip.decompress(content)
+            content = _unpacked(path, content)
         return content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise InvalidFile(f"{path}: no such file") from error
@@ -140,6 +142,16 @@ def _text(path: Path) -> str:
         raise InvalidFile(
             f"{path}: expected a whole file, but it cannot be read or is cut off ({error}); copy it again"
         ) from error
+
+
+def _unpacked(path: Path, content: bytes) -> bytes:
+    """What is in a gzipped file, unless it is far more than text of that size packs."""
+    limit = UNPACKED_BYTES + UNPACKED_RATIO * len(content)
+    with gzip.open(io.BytesIO(content)) as packed:
+        unpacked = packed.read(limit + 1)
+    if len(unpacked) > limit:
+        raise InvalidFile(f"{path}: unpacks to more than {limit:,} bytes, more than text of its size: it is damaged")
+    return unpacked
 
 
 def _column(path: Path, name: str, cells: list[str]) -> Column:
@@ -158,11 +170,14 @@ def _column(path: Path, name: str, cells: list[str]) -> Column:
 def _electrodes(path: Path, cells: list[str]) -> Column:
     try:
         lists = [[int(electrode) for electrode in cell.split()] for cell in cells]
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise InvalidFile(
             f"{path}: stimulus_electrodes: expected whole numbers separated by spaces ({error})"
         ) from error
-    table = np.full((len(lists), max([1, *map(len, lists)])), UNKNOWN)
+    width = max([1, *map(len, lists)])
+    if width * len(lists) > MOST_ELECTRODES or any(abs(e) >= 2**53 for electrodes in lists for e in electrodes):
+        raise InvalidFile(f"{path}: stimulus_electrodes: expected a few electrodes a stimulus, got {width} in one line")
+    table = np.full((len(lists), width), UNKNOWN)
     for row, electrodes in zip(table, lists, strict=True):
         row[: len(electrodes)] = electrodes
     return table

@@ -26,6 +26,7 @@ from animat.recordings.recording import UNKNOWN, Recording
 
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
+UNPACKED_BYTES, UNPACKED_RATIO = 2**26, 20
 WORDS = ("presentation_order",)
 WHOLE = ("presentation_pulses",)
 SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *WORDS)
@@ -53,6 +54,13 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     missing = [key for key in REQUIRED if key not in columns]
     if missing:
         keys = [*columns, *routing, *left_out]
+        counts = [key for key in keys if "spike" in key and key not in KEYS]
+        if counts and "spike_time_s" in missing and "stimulus_time_s" in missing:
+            raise InvalidFile(
+                f"{path}: expected times of spikes and of stimuli (spike_time_s, spike_channel, stimulus_time_s), "
+                f"found none: only counts ({', '.join(counts[:4])}), of which neither a response window nor "
+                "what happens outside it can be seen; bring the times"
+            )
         found = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
         raise InvalidFile(
             f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {found}"
@@ -77,6 +85,7 @@ def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
     left_out = []
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            _check_size(path, archive.zip)
             for key in archive.files:
                 name = OTHER_NAMES.get(key, key)
                 if name in columns:
@@ -106,8 +115,24 @@ def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
     return columns, {key: routing[key] for key in ROUTING if key in routing}, left_out
 
 
+def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
+    """Refuse what unpacks to far more than a recording of that size does."""
+    unpacked, limit = sum(entry.file_size for entry in archive.infolist()), unpacked_limit(path)
+    if unpacked > limit:
+        raise InvalidFile(
+            f"{path}: unpacks to {unpacked:,} bytes, more than a recording of its size does ({limit:,}): it is damaged"
+        )
+
+
+def unpacked_limit(path: Path) -> int:
+    """How many bytes a compressed recording may unpack to; spikes compress to a fifth or so."""
+    return UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
+
+
 def _array(archive: Mapping[str, Column], key: str) -> Column:
     array = archive[key]
+    if array.size and not array.dtype.itemsize:
+        raise ValueError(f"{key} claims {array.size:,} values of no size")
     return np.char.decode(array, "utf-8", "replace") if array.dtype.kind == "S" else array
 
 

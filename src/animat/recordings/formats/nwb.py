@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidFile, UnusableData
+from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
 from animat.writing import written_whole
@@ -40,6 +41,10 @@ PROVENANCE_TABLE = "processing/ecephys/animat_provenance"
 UNITS_TABLE = "units"
 ELECTRODES_TABLE = "general/extracellular_ephys/electrodes"
 STIMULI_TABLE = "stimulus/presentation/stimuli"
+
+WHAT = "NWB recording"
+LARGEST_VALUES = 10_000_000
+"""Of the table of electrodes, rows times columns."""
 
 T = TypeVar("T", int, float, str)
 
@@ -68,115 +73,115 @@ def write_nwb(recording: Recording, path: str | os.PathLike[str]) -> None:
         beside.write_bytes(buffer.getbuffer())
 
 
-def read_nwb(path: str | os.PathLike[str]) -> Recording:
-    """Read a recording that `write_nwb` wrote; it equals the one that was written.
+def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Recording:
+    """Read a recording that `write_nwb` wrote, which equals the one that was written, or that another program wrote.
 
     Args:
         path: the file.
+        stimuli: for another program's file, the name of the stimuli where several could be meant.
 
     Raises:
-        InvalidFile: if the file is missing, damaged, or not an NWB recording of animat.
+        InvalidFile: if the file is missing, damaged, not NWB, or of another program and without spikes.
     """
     path = Path(path)
-    try:
-        with h5py.File(path, "r") as file:
-            return _read(file, path)
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, UnusableData) as error:
-        raise InvalidFile(
-            f"{path}: expected a whole NWB recording, but it is cut off or damaged ({_first_line(error)}); "
-            "copy or record it again"
-        ) from error
+    with hdf5_file(path, WHAT) as file:
+        return read_open_nwb(file, path, stimuli)
 
 
-def _read(file: h5py.File, path: Path) -> Recording:
-    if "nwb_version" not in file.attrs:
+def is_nwb(file: Hdf5File) -> bool:
+    """Whether a file says that it is NWB."""
+    return "nwb_version" in file.file.attrs
+
+
+def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Recording:
+    """Read an open file; see `read_nwb`."""
+    if not is_nwb(file):
         raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {_listed(file)})")
-    if RECORDING_TABLE not in file:
-        raise InvalidFile(
-            f"{path}: expected an NWB recording written by animat (with /{RECORDING_TABLE}), got another program's; "
-            "bring its spikes and stimuli as NPZ or CSV"
-        )
-    table = file[RECORDING_TABLE]
-    version = _cell(table, "format_version", int)
+    if not file.has(RECORDING_TABLE):
+        from animat.recordings.formats.nwb_of_others import read_other_nwb
+
+        return read_other_nwb(file, path, stimuli)
+    if stimuli is not None:
+        raise InvalidFile(f"{path}: expected no choice of stimuli for a file of animat's own, got {stimuli!r}")
+    version = _cell(file, "format_version", int)
     if version > FORMAT_VERSION:
         raise InvalidFile(
             f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat to read it"
         )
-    order, pulses = _cell(table, "presentation_order", str), _cell(table, "presentation_pulses", int)
+    order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
     times, channels = _spikes(file)
     return Recording(
         spike_times_s=times,
         spike_channels=channels,
         channels=_channels(file),
-        stimuli=_stimuli(file[STIMULI_TABLE], _cell(table, "stimulus_electrode_columns", int)),
-        sampling_rate_hz=_cell(table, "sampling_rate_hz", float),
-        start_s=_cell(table, "start_s", float),
-        duration_s=_cell(table, "duration_s", float),
-        start_min=_cell(table, "start_min", float),
+        stimuli=_stimuli(file, _cell(file, "stimulus_electrode_columns", int)),
+        sampling_rate_hz=_cell(file, "sampling_rate_hz", float),
+        start_s=_cell(file, "start_s", float),
+        duration_s=_cell(file, "duration_s", float),
+        start_min=_cell(file, "start_min", float),
         presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
         provenance=_provenance(file),
     )
 
 
-def _cell(table: h5py.Group, name: str, kind: Callable[[Any], T]) -> T:
-    value = table[name][0]
-    return kind(value.decode() if isinstance(value, bytes) else value)
+def _cell(file: Hdf5File, name: str, kind: Callable[[Any], T]) -> T:
+    return kind(file.read(f"{RECORDING_TABLE}/{name}")[0].item())
 
 
-def _spikes(file: h5py.File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-    if UNITS_TABLE not in file:
+def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+    if not file.has(UNITS_TABLE):
         return np.empty(0), np.empty(0, dtype=np.int64)
-    units = file[UNITS_TABLE]
-    times = units["spike_times"][:]
-    counts = np.diff(units["spike_times_index"][:].astype(np.int64), prepend=0)
+    times = file.read(f"{UNITS_TABLE}/spike_times")
+    counts = _counts(file, f"{UNITS_TABLE}/spike_times_index", len(times))
     channels = np.repeat(np.arange(len(counts)), counts)
     # Channel after channel: a stable sort leaves simultaneous spikes in the order of their channels, as Recording does.
     order = np.argsort(times, kind="stable")
     return times[order], channels[order]
 
 
-def _channels(file: h5py.File) -> Channels:
-    if ELECTRODES_TABLE not in file:
+def _counts(file: Hdf5File, index: str, values: int) -> Int64[np.ndarray, " rows"]:
+    """How many of a ragged column's values each row has."""
+    ends = file.read(index).astype(np.int64)
+    counts = np.diff(ends, prepend=0)
+    if np.any(counts < 0) or np.any(counts > values) or int(counts.sum()) != values:
+        raise UnusableData(f"{index} does not divide the {values:,} values beside it")
+    return np.asarray(counts)
+
+
+def _channels(file: Hdf5File) -> Channels:
+    if not file.has(ELECTRODES_TABLE):
         return Channels(label=np.empty(0, np.str_), electrode=np.empty(0, np.int64), x_um=np.empty(0), y_um=np.empty(0))
-    table = file[ELECTRODES_TABLE]
     return Channels(
-        label=np.array(_words(table["label"]), dtype=np.str_),
-        electrode=table["electrode_id"][:],
-        x_um=table["rel_x"][:],
-        y_um=table["rel_y"][:],
+        label=file.read(f"{ELECTRODES_TABLE}/label"),
+        electrode=file.read(f"{ELECTRODES_TABLE}/electrode_id"),
+        x_um=file.read(f"{ELECTRODES_TABLE}/rel_x"),
+        y_um=file.read(f"{ELECTRODES_TABLE}/rel_y"),
     )
 
 
-def _provenance(file: h5py.File) -> dict[str, str]:
-    if PROVENANCE_TABLE not in file:
+def _provenance(file: Hdf5File) -> dict[str, str]:
+    if not file.has(PROVENANCE_TABLE):
         return {}
-    table = file[PROVENANCE_TABLE]
-    return dict(zip(_words(table["key"]), _words(table["words"]), strict=True))
+    keys, words = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
+    return dict(zip(keys, words, strict=True))
 
 
-def _words(column: h5py.Dataset) -> list[str]:
-    return [text.decode() for text in column[:]]
-
-
-def _stimuli(table: h5py.Group, columns: int) -> Stimuli:
-    lengths = np.diff(table["electrode_ids_index"][:].astype(np.int64), prepend=0)
+def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
+    flat = file.read(f"{STIMULI_TABLE}/electrode_ids")
+    lengths = _counts(file, f"{STIMULI_TABLE}/electrode_ids_index", len(flat))
+    if not 0 <= columns <= LARGEST_VALUES // max(len(lengths), 1):
+        raise UnusableData(f"stimulus_electrode_columns: expected the width of a table, got {columns}")
     electrodes = np.full((len(lengths), columns), UNKNOWN, dtype=np.int64)
-    electrodes[np.arange(columns)[None, :] < lengths[:, None]] = table["electrode_ids"][:]
+    electrodes[np.arange(columns)[None, :] < lengths[:, None]] = flat
     return Stimuli(
-        time_s=table["start_time"][:],
-        frequency_hz=table["frequency_hz"][:],
-        pattern=table["pattern"][:],
+        time_s=file.read(f"{STIMULI_TABLE}/start_time"),
+        frequency_hz=file.read(f"{STIMULI_TABLE}/frequency_hz"),
+        pattern=file.read(f"{STIMULI_TABLE}/pattern"),
         electrodes=electrodes,
-        presentation=table["presentation"][:],
+        presentation=file.read(f"{STIMULI_TABLE}/presentation"),
     )
 
 
-def _listed(group: h5py.Group) -> str:
-    names = list(group)
+def _listed(file: Hdf5File) -> str:
+    names = file.names("/")
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().partition("\n")[0] or type(error).__name__

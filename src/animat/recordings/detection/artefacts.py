@@ -1,0 +1,196 @@
+"""What a stimulus leaves in raw traces, and its removal, so that as little of the response as possible goes with it.
+
+Around a stimulus, three things are done to each channel, in this order:
+
+1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse the trace is a straight line, and nothing is looked for.
+2. *Saturation*: a channel whose amplifier saturates, as those near a stimulated electrode do, is blanked on until it
+   comes out of it: at the rail if that is known, else while the trace does not move and is far from where it was.
+3. *Recovery*: what decays afterwards is fitted by a exp(-t / tau) + b, tau from some 0.2 to 16 ms, and the
+   exponential is taken away; what is far off the fit (spikes) hardly counts in it. Nothing is blanked.
+
+Amplifiers recover in more ways than one exponential. What is left where they do is seen in the recording as spikes at
+one time after stimuli, and said there (`animat.neurons.timing_quality`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from animat.recordings.detection.settings import Detection
+
+TAUS_MS = (0.3, 0.5, 0.8, 1.2, 2.0, 3.5, 5.0, 8.0)
+GAUSS_NEWTON_STEPS = 8
+FAR = 20.0
+"""Noises from where the trace was, beyond which it may be saturated where it does not move."""
+UNSETTLED = 2.0
+"""Noises off, on average over half a millisecond after blanking, beyond which recovery is fitted."""
+FLAT_SAMPLES = 3
+SETTLE_MS = 0.25
+"""After an amplifier came out of saturation, as its first samples lie on no exponential."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """A stretch of traces without artefacts.
+
+    Attributes:
+        voltage_uv: shape (channels, samples).
+        is_blank: where nothing is to be looked for, shape (channels, samples); None where nothing is blanked.
+        saturated: channels that were blanked longer, for each stimulus in the stretch, shape (stimuli,).
+        longest_ms: how long after its stimulus the longest of them was blanked, shape (stimuli,).
+    """
+
+    voltage_uv: Float32[np.ndarray, "channels samples"]
+    is_blank: Bool[np.ndarray, "channels samples"] | None
+    saturated: Int64[np.ndarray, " stimuli"]
+    longest_ms: Float32[np.ndarray, " stimuli"]
+
+
+def without_artefacts(
+    voltage_uv: Float32[np.ndarray, "channels samples"],
+    stimulus: Int64[np.ndarray, " stimuli"],
+    noise_uv: Float32[np.ndarray, " channels"],
+    rate_hz: float,
+    settings: Detection,
+) -> Cleaned:
+    """Remove artefacts from a stretch of traces, in place.
+
+    Args:
+        voltage_uv: as recorded, one row a channel; changed.
+        stimulus: sample of each pulse in the stretch, rising; may be outside it, by as much as is blanked or followed.
+        noise_uv: of each channel, to tell a large deviation from a small one.
+        rate_hz: of the samples.
+        settings: how long to blank.
+    """
+    samples = voltage_uv.shape[1]
+    saturated, longest_ms = np.zeros(len(stimulus), np.int64), np.zeros(len(stimulus), np.float32)
+    if not len(stimulus):
+        return Cleaned(voltage_uv, None, saturated, longest_ms)
+    per_ms = rate_hz * 1e-3
+    before, after = (round(ms * per_ms) for ms in settings.blank_ms)
+    follow = round(settings.recovery_ms * per_ms)
+    is_blank = np.zeros(voltage_uv.shape, dtype=bool)
+    following = np.append(stimulus[1:], samples + follow)
+    for i, (at, next_at) in enumerate(zip(stimulus.tolist(), following.tolist(), strict=True)):
+        start, end = max(at - before, 0), min(at + after, samples)
+        stop = min(at + follow, next_at - before, samples)
+        if end <= 0 or start >= samples:
+            continue
+        if stop <= end:
+            # The next pulse comes before this one is over: nothing but blanking can be done.
+            _bridge(voltage_uv, is_blank, np.arange(len(voltage_uv)), start, np.full(len(voltage_uv), end))
+            continue
+        rest_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
+        tail = voltage_uv[:, end:stop] - rest_uv[:, None]
+        until = end + _saturated_until(tail, noise_uv, settings.saturation_uv)
+        late = until > end
+        until[late] = np.minimum(until[late] + round(SETTLE_MS * per_ms), stop)
+        saturated[i] = np.count_nonzero(late)
+        longest_ms[i] = (int(until.max()) - at) / per_ms if saturated[i] else 0.0
+        _take_away_recovery(voltage_uv, until, stop, rest_uv, noise_uv, per_ms)
+        _bridge(voltage_uv, is_blank, np.arange(len(voltage_uv)), start, until)
+    return Cleaned(voltage_uv, is_blank, saturated, longest_ms)
+
+
+def _saturated_until(
+    tail_uv: Float32[np.ndarray, "channels samples"],
+    noise_uv: Float32[np.ndarray, " channels"],
+    saturation_uv: float | None,
+) -> Int64[np.ndarray, " channels"]:
+    """How many samples of each channel's tail go by until its amplifier has come out of saturation."""
+    if saturation_uv is not None:
+        is_saturated = np.abs(tail_uv) >= saturation_uv
+    else:
+        far = np.abs(tail_uv) > FAR * np.maximum(noise_uv, 1e-6)[:, None]
+        still = np.zeros(tail_uv.shape, dtype=bool)
+        if tail_uv.shape[1] >= FLAT_SAMPLES:
+            same = tail_uv[:, 1:] == tail_uv[:, :-1]
+            run = same[:, 1:] & same[:, :-1]
+            still[:, 2:] |= run
+        is_saturated = far & still
+    last = tail_uv.shape[1] - np.argmax(is_saturated[:, ::-1], axis=1)
+    return np.where(is_saturated.any(axis=1), last, 0).astype(np.int64)
+
+
+def _bridge(
+    voltage_uv: Float32[np.ndarray, "channels samples"],
+    is_blank: Bool[np.ndarray, "channels samples"],
+    rows: Int64[np.ndarray, " rows"],
+    start: int,
+    until: Int64[np.ndarray, " rows"],
+) -> None:
+    """A straight line over the blanked stretch of each row, between the means of half a millisecond or so beside it."""
+    for stop in np.unique(until).tolist():
+        chosen = rows[until == stop]
+        if stop <= start:
+            continue
+        left = voltage_uv[chosen, max(start - 10, 0) : start]
+        right = voltage_uv[chosen, stop : stop + 10]
+        ends = [side.mean(axis=1) if side.shape[1] else None for side in (left, right)]
+        from_uv = ends[0] if ends[0] is not None else ends[1]
+        to_uv = ends[1] if ends[1] is not None else ends[0]
+        if from_uv is None or to_uv is None:
+            from_uv = to_uv = np.zeros(len(chosen), np.float32)
+        share = ((np.arange(stop - start) + 1) / (stop - start + 1)).astype(np.float32)
+        voltage_uv[chosen, start:stop] = from_uv[:, None] * (1 - share) + to_uv[:, None] * share
+        is_blank[chosen, start:stop] = True
+
+
+def _take_away_recovery(
+    voltage_uv: Float32[np.ndarray, "channels samples"],
+    until: Int64[np.ndarray, " channels"],
+    stop: int,
+    rest_uv: Float32[np.ndarray, " channels"],
+    noise_uv: Float32[np.ndarray, " channels"],
+    per_ms: float,
+) -> None:
+    """Fit a exp(-t / tau) + b to what follows on each unsettled channel, and take the exponential away."""
+    for start in np.unique(until).tolist():
+        length = stop - start
+        if length < round(2 * per_ms):
+            continue
+        rows = np.flatnonzero(until == start)
+        early = voltage_uv[rows, start : start + max(round(0.5 * per_ms), 1)].mean(axis=1) - rest_uv[rows]
+        rows = rows[np.abs(early) > UNSETTLED * noise_uv[rows]]
+        if not len(rows):
+            continue
+        trace = voltage_uv[rows, start:stop].astype(np.float64)
+        exponential = _fitted(trace, np.arange(length) / per_ms, np.maximum(noise_uv[rows], 1e-6))
+        voltage_uv[rows, start:stop] -= exponential.astype(np.float32)
+
+
+def _fitted(
+    trace_uv: Float64[np.ndarray, "rows samples"],
+    t_ms: Float64[np.ndarray, " samples"],
+    noise_uv: Float32[np.ndarray, " rows"],
+) -> Float64[np.ndarray, "rows samples"]:
+    """The exponential a exp(-k t) of the robust least-squares fit a exp(-k t) + b of each row.
+
+    The best of a few k is the start of Gauss-Newton steps on a, k and b. Residuals are clipped, at four noises or at
+    three times their own median if that is more, so that spikes do not draw the fit.
+    """
+    best = np.full(len(trace_uv), np.inf)
+    a, b, k = (np.zeros(len(trace_uv)) for _ in range(3))
+    for rate in 1 / np.array(TAUS_MS):
+        basis = np.column_stack([np.exp(-rate * t_ms), np.ones(len(t_ms))])
+        of_rate = np.linalg.pinv(basis) @ trace_uv.T
+        error = np.median(np.abs(trace_uv - (basis @ of_rate).T), axis=1)
+        better = error < best
+        best[better], a[better], b[better], k[better] = error[better], of_rate[0, better], of_rate[1, better], rate
+    slowest, fastest = 0.5 / max(TAUS_MS), 2 / min(TAUS_MS)
+    for _ in range(GAUSS_NEWTON_STEPS):
+        shape = np.exp(-k[:, None] * t_ms)
+        residual = trace_uv - a[:, None] * shape - b[:, None]
+        limit = np.maximum(4 * noise_uv, 3 * np.median(np.abs(residual), axis=1))[:, None]
+        residual = np.clip(residual, -limit, limit)
+        jacobian = np.stack([shape, -a[:, None] * t_ms * shape, np.ones_like(shape)], axis=2)
+        normal = np.einsum("rsi,rsj->rij", jacobian, jacobian)
+        # A little of the diagonal keeps it solvable where a row has no exponential at all.
+        normal += 1e-9 * np.einsum("rii->ri", normal)[:, :, None] * np.eye(3) + 1e-12 * np.eye(3)
+        step = np.linalg.solve(normal, np.einsum("rsi,rs->ri", jacobian, residual)[:, :, None])[:, :, 0]
+        a, b = a + step[:, 0], b + step[:, 2]
+        k = np.clip(k + np.clip(step[:, 1], -0.5 * k, 0.5 * k), slowest, fastest)
+    return np.asarray(a[:, None] * np.exp(-k[:, None] * t_ms))

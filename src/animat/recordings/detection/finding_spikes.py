@@ -1,0 +1,266 @@
+"""Find the spikes in raw traces: noise first, then piece after piece on all cores, in bounded memory."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from animat.errors import InvalidArgument
+from animat.progress import Progress, Silent
+from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
+from animat.recordings.detection.noise import median_noise_uv
+from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
+from animat.recordings.detection.settings import Detection
+from animat.recordings.detection.troughs import find_troughs
+from animat.recordings.findings import Finding
+from animat.recordings.raw import RawTraces
+
+BLOCK = 64
+"""Channels that are filtered at a time: few enough to stay near the processor."""
+NOISE_PIECES, NOISE_PIECE_S = 20, 0.25
+DEAD, NOISY = 0.1, 5.0
+"""Of the median channel's noise: a channel below is dead, one above is noisy."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSpikes:
+    """Spikes that were found, in the order of time.
+
+    Attributes:
+        time_s: at their troughs, on the recording's clock, shape (spikes,).
+        channel: row of the channel table, shape (spikes,).
+        noise_uv: standard deviation of each channel's noise, shape (channels,).
+        engine: what filtered and found them.
+        findings: what was noticed.
+    """
+
+    time_s: Float64[np.ndarray, " spikes"]
+    channel: Int64[np.ndarray, " spikes"]
+    noise_uv: Float32[np.ndarray, " channels"]
+    engine: str
+    findings: tuple[Finding, ...]
+
+
+def find_spikes(
+    traces: RawTraces,
+    stimulus_time_s: Float64[np.ndarray, " stimuli"] | None = None,
+    settings: Detection | None = None,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> FoundSpikes:
+    """Find spikes in raw traces.
+
+    A spike is a trough of the band-passed trace deeper than `threshold` standard deviations of its channel's noise, the
+    deepest within the dead time on both sides (`find_troughs`), outside what is blanked around stimuli (`artefacts`).
+
+    Args:
+        traces: where the voltage is.
+        stimulus_time_s: starts of the pulses on the recording's clock.
+        settings: how; by default as in `Detection`.
+        workers: threads; by default one a core. Memory grows with them, by some 200 MB each for 1,024 channels.
+        progress: told after each piece.
+
+    Raises:
+        InvalidArgument: for a band that the sampling rate does not hold, or SpikeInterface where it is not installed.
+        InvalidFile: if samples cannot be read.
+    """
+    settings, progress = settings or Detection(), progress or Silent()
+    if settings.band_hz is not None:
+        check_band(settings.band_hz, traces.sampling_rate_hz)
+    installed = importlib.util.find_spec("spikeinterface") is not None
+    if settings.engine == "spikeinterface" and not installed:
+        raise InvalidArgument("engine: expected an installed package, got spikeinterface: pip install 'animat[raw]'")
+    stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
+    workers = workers or len(os.sched_getaffinity(0))
+    noise_uv = _noise_uv(traces, stimulus, settings)
+    use_spikeinterface = settings.engine == "spikeinterface" or (settings.engine == "auto" and installed)
+    if use_spikeinterface:
+        from animat.recordings.detection.with_spikeinterface import detect
+
+        sample, channel, saturation = detect(traces, stimulus, noise_uv, settings, workers, progress)
+    else:
+        sample, channel, saturation = _detect(traces, stimulus, noise_uv, settings, workers, progress)
+    order = np.lexsort((channel, sample))
+    return FoundSpikes(
+        time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
+        channel=channel[order],
+        noise_uv=noise_uv,
+        engine="SpikeInterface" if use_spikeinterface else "scipy",
+        findings=tuple(_findings(noise_uv, len(stimulus), saturation, settings)),
+    )
+
+
+def depths_uv(noise_uv: Float32[np.ndarray, " channels"], threshold: float) -> Float32[np.ndarray, " channels"]:
+    """The depth that a trough must have on each channel; infinite on dead ones."""
+    depth_uv = np.asarray(threshold * noise_uv, dtype=np.float32)
+    depth_uv[is_dead(noise_uv)] = np.inf
+    return depth_uv
+
+
+def is_dead(noise_uv: Float32[np.ndarray, " channels"]) -> np.ndarray:
+    """Whether a channel has no noise to speak of, so that nothing reaches it; shape (channels,)."""
+    return np.asarray(noise_uv <= DEAD * np.median(noise_uv)) if len(noise_uv) else np.zeros(0, dtype=bool)
+
+
+def blocks(channels: int) -> Iterator[slice]:
+    """The columns in blocks."""
+    for first in range(0, channels, BLOCK):
+        yield slice(first, min(first + BLOCK, channels))
+
+
+def _noise_uv(
+    traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection
+) -> Float32[np.ndarray, " channels"]:
+    """The noise of each channel: the median over pieces from all over the recording."""
+    rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
+    length, margin = round(NOISE_PIECE_S * rate_hz), round(MARGIN_S * rate_hz)
+    n = max(1, min(NOISE_PIECES, traces.samples // max(length, 1)))
+    starts = np.linspace(0, max(traces.samples - length, 0), n).astype(np.int64)
+    found = np.zeros((n, channels), np.float32)
+    for i, start in enumerate(starts.tolist()):
+        piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
+        for columns in blocks(channels):
+            rows = np.ascontiguousarray(piece.voltage_uv[:, columns].T)
+            first = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin])
+            if len(piece.stimulus):
+                rough = np.zeros(channels, np.float32)
+                rough[columns] = first
+                cleaned = piece.cleaned(columns, rough, rate_hz, settings)
+                blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
+                first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
+            found[i, columns] = first
+    return np.asarray(np.median(found, axis=0), dtype=np.float32)
+
+
+def _filtered(
+    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float
+) -> Float32[np.ndarray, "channels samples"]:
+    if settings.band_hz is None:
+        return np.asarray(rows - np.median(rows, axis=1, keepdims=True), dtype=np.float32)
+    return band_pass(rows, settings.band_hz, rate_hz)
+
+
+def _detect(
+    traces: RawTraces,
+    stimulus: Int64[np.ndarray, " stimuli"],
+    noise_uv: Float32[np.ndarray, " channels"],
+    settings: Detection,
+    workers: int,
+    progress: Progress,
+) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray]:
+    """Samples and channels of the spikes; and of each stimulus how many channels saturate, and how long in ms."""
+    rate_hz = traces.sampling_rate_hz
+    margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
+    apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
+    depth_uv = depths_uv(noise_uv, settings.threshold)
+
+    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
+        found = [
+            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings) for columns in blocks(len(noise_uv))
+        ]
+        saturation = np.zeros((np.count_nonzero(piece.owned), 2))
+        for _, _, of_block in found:
+            saturation[:, 0] += of_block[:, 0]
+            saturation[:, 1] = np.maximum(saturation[:, 1], of_block[:, 1])
+        return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found]), saturation
+
+    samples, channels, saturations = [], [], []
+    starts = deque(range(0, traces.samples, length))
+    n, done = len(starts), 0
+    with ThreadPoolExecutor(workers) as pool:
+        # No more pieces are under way than there are threads: what waits takes memory.
+        running: deque[Future[tuple[np.ndarray, np.ndarray, np.ndarray]]] = deque()
+        while starts or running:
+            while starts and len(running) < workers:
+                running.append(pool.submit(of_piece, starts.popleft()))
+            sample, channel, saturation = running.popleft().result()
+            samples.append(sample)
+            channels.append(channel)
+            saturations.append(saturation)
+            done += 1
+            progress.update(done, n, f"{sum(map(len, samples)):,} spikes")
+    empty = np.empty(0, np.int64)
+    return (
+        np.concatenate([empty, *samples]),
+        np.concatenate([empty, *channels]),
+        np.concatenate([np.zeros((0, 2)), *saturations]),
+    )
+
+
+def _of_block(
+    piece: Piece,
+    columns: slice,
+    noise_uv: Float32[np.ndarray, " channels"],
+    depth_uv: Float32[np.ndarray, " channels"],
+    apart: int,
+    rate_hz: float,
+    settings: Detection,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    cleaned = piece.cleaned(columns, noise_uv, rate_hz, settings)
+    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+    if cleaned.is_blank is not None:
+        filtered[cleaned.is_blank] = 0.0
+    row, sample = find_troughs(
+        filtered, depth_uv[columns], apart, piece.margin, piece.margin + piece.stop - piece.start
+    )
+    saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]
+    return sample - piece.margin + piece.start, row + columns.start, saturation
+
+
+def _findings(
+    noise_uv: Float32[np.ndarray, " channels"], n_stimuli: int, saturation: np.ndarray, settings: Detection
+) -> Iterator[Finding]:
+    n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
+    yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are troughs of "
+                  f"{settings.threshold:g} times it and more", middle)  # fmt: skip
+    dead = int(np.count_nonzero(is_dead(noise_uv)))
+    if dead:
+        yield Finding(
+            "dead-channels",
+            "note" if dead < 0.1 * n else "warning",
+            f"{dead:,} of {n:,} channels are dead (less than {DEAD:g} of the median noise): no spike can be found on "
+            "them, and they count in rates per channel; leave them out of the routing next time",
+            float(dead),
+        )
+    noisy = int(np.count_nonzero(noise_uv > NOISY * middle)) if middle > 0 else 0
+    if noisy:
+        yield Finding(
+            "noisy-channels",
+            "note" if noisy < 0.1 * n else "warning",
+            f"{noisy:,} of {n:,} channels have more than {NOISY:g} times the median noise: only large spikes are found "
+            "on them; look for loose contacts or air bubbles",
+            float(noisy),
+        )
+    if n_stimuli:
+        before, after = settings.blank_ms
+        yield Finding(
+            "blanked",
+            "note" if after <= 2.0 else "warning",
+            f"from {before:g} ms before to {after:g} ms after each of {n_stimuli:,} stimuli nothing is looked for"
+            + ("" if after <= 2.0 else "; the response window usually begins at 2 ms, so part of it is lost"),
+            after,
+        )
+    if len(saturation) and saturation[:, 0].any():
+        mean, longest = float(saturation[:, 0].mean()), float(np.median(saturation[saturation[:, 0] > 0, 1]))
+        share = mean / max(n, 1)
+        yield Finding(
+            "saturated-channels",
+            "note" if share < 0.05 or longest <= 2.0 else "warning",
+            f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
+            f"{longest:.1f} ms; they are blanked until then"
+            + (
+                ": rates in an earlier window are too low, use one that begins later"
+                if share >= 0.05 and longest > 2
+                else ""
+            ),
+            share,
+        )

@@ -1,0 +1,159 @@
+"""Cortical Labs CL1 recordings (H5), read for spikes and stimuli. Raw traces: `traces`.
+
+    /spikes(timestamp, channel, samples), /stims(timestamp, channel)      frames from the start of the recording
+    attributes of /: frames_per_second, channel_count, duration_frames, start_timestamp, created_utc
+    /samples (frames, channels), int16, where raw is kept
+    /data_stream/animat_stimuli/{index(timestamp, start_index, end_index), data}      what animat says of the stimuli
+
+The rig keeps no amplitude, frequency or pattern: animat's driver puts them into a data stream of its own, one text a
+request (`animat.recordings.formats.stimulus_text`), which holds for the pulses from its timestamp on until the next.
+Pulses of one timestamp on several channels are one stimulus. Attributes that are dictionaries are pickles: they are
+never opened. A channel is an electrode on this rig, so its number stands for both.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.findings import Finding
+from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
+from animat.recordings.formats.stimulus_text import LONGEST, padded, stimulus_columns
+from animat.recordings.recording import Recording
+
+WHAT = "CL1 recording"
+USUAL_RATE_HZ = 25_000.0
+USUAL_CHANNELS = 64
+STIMULUS_STREAM = "animat_stimuli"
+"""Name of the data stream that animat's driver keeps the stimuli's parameters in."""
+
+_TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
+_LARGEST_CHANNEL_COUNT = 4096
+
+
+def is_cl1(file: Hdf5File) -> bool:
+    """Whether a file is laid out as the CL1's are."""
+    if {"timestamp", "channel"} <= set(file.fields("spikes")) or {"timestamp", "channel"} <= set(file.fields("stims")):
+        return True
+    return file.attribute("/", "uV_per_sample_unit") is not None and file.has("samples")
+
+
+def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
+    """Read spikes and stimuli of a CL1 recording.
+
+    Args:
+        path: the file.
+        spikes: whether spikes must be there; without, stimuli are read, for raw traces beside them.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged or lacks spikes.
+        UnusableData: if a column is not what it should be.
+    """
+    path = Path(path)
+    findings: list[Finding] = []
+    with hdf5_file(path, WHAT) as file:
+        if spikes and not file.has("spikes"):
+            raise InvalidFile(
+                f"{path}: expected spikes at /spikes, found none: it was recorded without (include_spikes=False); find "
+                "them in its raw traces with animat convert"
+            )
+        rate_hz = _rate_hz(file, findings)
+        frame = file.read("spikes", "timestamp") if spikes else np.empty(0, np.int64)
+        channel = file.read("spikes", "channel") if spikes else np.empty(0, np.int64)
+        n_channels = file.attribute("/", "channel_count")
+        if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
+            findings.append(
+                Finding("channel-count-missing", "note", f"the number of channels is not in the file: {USUAL_CHANNELS}")
+            )
+            n_channels = USUAL_CHANNELS
+        stimulus_frame, columns = _stimuli(file)
+        start = _first_frame(file, frame, stimulus_frame)
+        columns |= _parameters(file, stimulus_frame)
+        frames = file.attribute("/", "duration_frames")
+        created = file.attribute("/", "created_utc")
+    if len(channel) and int(channel.max()) >= n_channels:
+        n_channels = int(channel.max()) + 1
+    spike_time_s, stimulus_time_s = (frame - start) / rate_hz, (stimulus_frame - start) / rate_hz
+    times = np.concatenate([spike_time_s, stimulus_time_s])
+    if isinstance(frames, int) and frames > 0:
+        start_s = float(min(0.0, times.min(initial=0.0)))
+        stop_s = max(frames / rate_hz, float(times.max(initial=0.0)) + 0.5 / rate_hz)
+        columns |= {"start_s": start_s, "duration_s": stop_s - start_s}
+    provenance = {"source": path.name, "format": "CL1"}
+    if isinstance(created, str) and created and created.isprintable():
+        provenance["recorded_at"] = created
+    return PlainColumns(
+        spike_time_s=spike_time_s,
+        spike_channel=channel,
+        stimulus_time_s=stimulus_time_s,
+        channel_label=np.arange(n_channels),
+        channel_electrode=np.arange(n_channels),
+        sampling_rate_hz=rate_hz,
+        **columns,
+    ).to_recording(provenance, tuple(findings))
+
+
+def _rate_hz(file: Hdf5File, findings: list[Finding]) -> float:
+    for name in ("frames_per_second", "sampling_frequency"):
+        rate = file.attribute("/", name)
+        if isinstance(rate, int | float) and 0 < rate < 1e9:
+            return float(rate)
+    findings.append(Finding("sampling-missing", "warning", "the sampling rate is not in the file: taken for 25 kHz"))
+    return USUAL_RATE_HZ
+
+
+def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:
+    """The frame that time 0 is: 0, or where the file counts from the start of the rig, its first frame.
+
+    Whether it does is told by a pickle, which is not opened; so it is told by the numbers: none is before the start.
+    """
+    start, frames = file.attribute("/", "start_timestamp"), file.attribute("/", "duration_frames")
+    if not isinstance(start, int) or not isinstance(frames, int) or not 0 < frames < start:
+        return 0
+    lowest = min((int(f.min()) for f in (spike, stimulus) if len(f)), default=0)
+    return start if lowest >= start else 0
+
+
+def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
+    """First frame of each stimulus, and its electrodes."""
+    if not file.has("stims"):
+        return np.empty(0, np.int64), {}
+    frame = file.read("stims", "timestamp").astype(np.int64)
+    channel = file.read("stims", "channel").astype(np.int64)
+    frames, which = np.unique(frame, return_inverse=True)
+    lists: list[list[int]] = [[] for _ in frames]
+    for stimulus, electrode in zip(which.reshape(-1).tolist(), channel.tolist(), strict=True):
+        if electrode not in lists[stimulus]:
+            lists[stimulus].append(electrode)
+    return frames, {"stimulus_electrodes": padded([sorted(electrodes) for electrodes in lists])}
+
+
+def _parameters(file: Hdf5File, stimulus: Column) -> dict[str, Any]:
+    """What animat's data stream says of the stimuli; electrodes are known from the stimuli themselves."""
+    at = f"data_stream/{STIMULUS_STREAM}"
+    if not len(stimulus) or not file.has(f"{at}/index") or not file.has(f"{at}/data"):
+        return {}
+    frame = file.read(f"{at}/index", "timestamp").astype(np.int64)
+    starts = file.read(f"{at}/index", "start_index").astype(np.int64)
+    ends = file.read(f"{at}/index", "end_index").astype(np.int64)
+    data = file.read(f"{at}/data").astype(np.uint8).tobytes()
+    order = np.argsort(frame, kind="stable")
+    texts = [_text(data, int(starts[i]), int(ends[i])) for i in order]
+    entry = np.searchsorted(frame[order], stimulus, side="right") - 1
+    columns = stimulus_columns([texts[i] if i >= 0 else "" for i in entry])
+    columns.pop("stimulus_electrodes", None)
+    return columns
+
+
+def _text(data: bytes, start: int, end: int) -> str:
+    """The text of an entry: msgpack's header of a text, then UTF-8."""
+    entry = data[start:end] if 0 <= start < end <= start + LONGEST + 5 else b""
+    if not entry:
+        return ""
+    header = 1 if 0xA0 <= entry[0] <= 0xBF else _TEXT_HEADERS.get(entry[0], 0)
+    return entry[header:].decode("utf-8", "replace")

@@ -1,0 +1,233 @@
+"""HDF5 files of strangers, read so that a damaged or hostile one costs an error and nothing else.
+
+A file is data, never instructions: links to other files are not followed (external links, external storage, virtual
+datasets), pickles are bytes that nobody opens, and what claims to be larger than the file can hold is refused before
+memory is asked for. Links inside a file are followed, as MaxWell's files need them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from animat.errors import AnimatError, InvalidFile
+
+Column = np.ndarray[Any, Any]
+
+SOFT_LINKS = 16
+"""Followed in a row; more are a circle."""
+SPARE_VALUES = 1_000_000
+"""Values that any file may hold, however small it is; beyond them each takes a byte of it, in any compression."""
+LARGEST_VALUES = 200_000_000
+LARGEST_ITEM_BYTES = 2**16
+LARGEST_CHUNK_BYTES = 2**28
+DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError, AttributeError)
+"""What h5py and numpy raise on damaged files."""
+
+
+class Hdf5File:
+    """An open file whose every access is checked.
+
+    Attributes:
+        path: of the file, for messages.
+        file: the open file; for what is checked elsewhere.
+    """
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self.file = file
+        self._bytes = path.stat().st_size
+
+    def node(self, where: str) -> h5py.Group | h5py.Dataset | None:
+        """What stands at a place, None if nothing does; links inside the file are followed, others refused.
+
+        Raises:
+            InvalidFile: for a link to another file, or links in a circle.
+        """
+        parts = deque(part for part in where.split("/") if part)
+        node: Any = self.file["/"]
+        hops = 0
+        while parts:
+            name = parts.popleft()
+            if not isinstance(node, h5py.Group):
+                return None
+            link = node.get(name, getlink=True)
+            if link is None:
+                return None
+            if isinstance(link, h5py.ExternalLink):
+                raise InvalidFile(
+                    f"{self.path}: expected data in the file itself, but {where} is a link to another file, which is "
+                    "never followed; copy the data into one file"
+                )
+            if isinstance(link, h5py.SoftLink):
+                hops += 1
+                if hops > SOFT_LINKS:
+                    raise InvalidFile(f"{self.path}: expected data at {where}, got links in a circle")
+                if link.path.startswith("/"):
+                    node = self.file["/"]
+                parts.extendleft(reversed([part for part in link.path.split("/") if part]))
+                continue
+            node = node.get(name)
+        return node if isinstance(node, h5py.Group | h5py.Dataset) else None
+
+    def names(self, where: str) -> list[str]:
+        """Names of what a group holds, in alphabetical order; none where there is no group."""
+        node = self.node(where)
+        return sorted(node) if isinstance(node, h5py.Group) else []
+
+    def has(self, where: str) -> bool:
+        """Whether something stands at a place."""
+        return self.node(where) is not None
+
+    def fields(self, where: str) -> tuple[str, ...]:
+        """Names of a table's columns; none for other datasets, or where there is none."""
+        node = self.node(where)
+        return tuple(node.dtype.names or ()) if isinstance(node, h5py.Dataset) else ()
+
+    def dataset(self, where: str) -> h5py.Dataset:
+        """A dataset whose values lie in the file itself.
+
+        Raises:
+            InvalidFile: if there is none, or its values lie in other files.
+        """
+        node = self.node(where)
+        if not isinstance(node, h5py.Dataset):
+            raise InvalidFile(f"{self.path}: expected a dataset at {where}, found {'a group' if node else 'nothing'}")
+        created = node.id.get_create_plist()
+        if created.get_external_count() > 0 or created.get_layout() == h5py.h5d.VIRTUAL:
+            raise InvalidFile(
+                f"{self.path}: expected the values of {where} in the file itself, but they lie in other files, which "
+                "are never opened; copy the data into one file"
+            )
+        chunk = node.chunks
+        if node.dtype.itemsize > LARGEST_ITEM_BYTES or (
+            chunk is not None and math.prod(chunk) * max(node.dtype.itemsize, 1) > LARGEST_CHUNK_BYTES
+        ):
+            raise InvalidFile(f"{self.path}: {where} is stored in pieces of an absurd size: the file is damaged")
+        return node
+
+    def read(self, where: str, field: str | None = None) -> Column:
+        """All values of a dataset, or of one column of a table; text comes as `str`.
+
+        Raises:
+            InvalidFile: if there is none, it holds no numbers or text, or claims more values than the file can hold.
+        """
+        dataset = self.dataset(where)
+        dtype = dataset.dtype
+        name = where if field is None else f"{where}/{field}"
+        if field is not None:
+            if dtype.names is None or field not in dtype.names:
+                raise InvalidFile(f"{self.path}: expected a column {field} in {where}, found {dtype.names or dtype}")
+            dtype = dtype[field]
+        text = h5py.check_string_dtype(dtype) is not None
+        if not text and (dtype.kind not in "iufb" or dtype.shape):
+            raise InvalidFile(f"{self.path}: expected numbers or text at {name}, got {dtype}")
+        self._check_size(name, dataset, dtype)
+        missing = unavailable_filters(dataset)
+        if missing:
+            raise InvalidFile(f"{self.path}: {name} is compressed by {missing}: {PLUGIN_ADVICE}")
+        values = np.asarray(dataset[()] if field is None else dataset.fields(field)[()])
+        return _as_text(values) if text else values
+
+    def first(self, where: str) -> Any:
+        """The first value of a dataset, a number or text; None where there is no such dataset or it is empty."""
+        if not isinstance(self.node(where), h5py.Dataset):
+            return None
+        values = self.read(where).reshape(-1)
+        return values[0].item() if len(values) else None
+
+    def ends(self, where: str) -> tuple[int, int, int] | None:
+        """First and last value of a dataset of whole numbers and how many there are; None where there are none."""
+        node = self.node(where)
+        if not isinstance(node, h5py.Dataset) or node.ndim != 1 or not node.shape[0] or node.dtype.kind not in "iu":
+            return None
+        dataset = self.dataset(where)
+        if unavailable_filters(dataset):
+            return None
+        return int(dataset[0]), int(dataset[-1]), int(dataset.shape[0])
+
+    def attribute(self, where: str, name: str) -> Any:
+        """An attribute that is one number or text; None where it is missing or anything else. Nothing is unpickled."""
+        node = self.node(where)
+        if node is None or name not in node.attrs:
+            return None
+        stored = node.attrs.get_id(name)
+        if stored.shape not in ((), (1,)) or stored.dtype.itemsize > LARGEST_ITEM_BYTES:
+            return None
+        if h5py.check_string_dtype(stored.dtype) is None and stored.dtype.kind not in "iufb":
+            return None
+        value = node.attrs[name]
+        value = value.reshape(-1)[0] if isinstance(value, np.ndarray) else value
+        value = value.item() if isinstance(value, np.generic) else value
+        return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+    def _check_size(self, name: str, dataset: h5py.Dataset, dtype: np.dtype[Any]) -> None:
+        if dataset.shape is None:
+            raise InvalidFile(f"{self.path}: expected values at {name}, got an empty dataspace")
+        values = math.prod(dataset.shape)
+        filtered = dataset.id.get_create_plist().get_nfilters() > 0
+        possible = SPARE_VALUES + (self._bytes if filtered else self._bytes // max(dtype.itemsize, 1))
+        if values > min(possible, LARGEST_VALUES) or values * dtype.itemsize > 8 * LARGEST_VALUES:
+            raise InvalidFile(
+                f"{self.path}: {name} claims {values:,} values, more than a file of {self._bytes:,} bytes can hold: "
+                "it is damaged, or not a recording"
+            )
+
+
+PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) and name its folder in HDF5_PLUGIN_PATH"
+
+
+def unavailable_filters(dataset: h5py.Dataset) -> str:
+    """The compression filters of a dataset that are not installed here, in words; empty where all are."""
+    created = dataset.id.get_create_plist()
+    filters = [created.get_filter(i) for i in range(created.get_nfilters())]
+    names = []
+    for code, _, _, name in filters:
+        if not h5py.h5z.filter_avail(code):
+            words = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
+            words = words.partition("\0")[0].strip()
+            names.append(f"filter {code}" + (f" ({words})" if words.isprintable() and words else ""))
+    return ", ".join(names)
+
+
+@contextmanager
+def hdf5_file(path: Path, what: str) -> Iterator[Hdf5File]:
+    """Open a file for checked reading; whatever goes wrong inside is one `InvalidFile` that names it.
+
+    Args:
+        path: the file.
+        what: the kind of file in words, such as "NWB recording".
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            yield Hdf5File(path, file)
+    except InvalidFile:
+        raise
+    except FileNotFoundError as error:
+        raise InvalidFile(f"{path}: no such file") from error
+    except (*DAMAGE, AnimatError) as error:
+        raise InvalidFile(
+            f"{path}: expected a whole {what}, but it is cut off or damaged ({first_line(error)}); "
+            "copy or record it again"
+        ) from error
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says, or its kind where it says nothing."""
+    line = str(error).strip().partition("\n")[0]
+    return (line if line.isprintable() else "".join(c for c in line if c.isprintable()))[:200] or type(error).__name__
+
+
+def _as_text(values: Column) -> Column:
+    flat = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.reshape(-1).tolist()]
+    if sum(map(len, flat)) > LARGEST_VALUES or max(map(len, flat), default=0) * len(flat) > LARGEST_VALUES:
+        # numpy gives every text the room of the longest.
+        flat = [text[:256] for text in flat]
+    return np.array(flat, dtype=np.str_).reshape(values.shape)

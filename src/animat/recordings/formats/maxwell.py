@@ -1,0 +1,308 @@
+"""MaxWell MaxOne and MaxTwo files, new and old layout, read for spikes, stimuli and electrodes. Raw traces: `traces`.
+
+    new    wells/wellNNN/recNNNN (also as recordings/recNNNN/wellNNN or data_store/dataNNNN), and there
+             settings/mapping(channel, electrode, x, y), settings/sampling, settings/lsb
+             spikes(frameno, channel, amplitude)
+             events(frameno, eventtype, eventid, eventmessage)                        stimuli
+             groups/NAME/{raw, channels, frame_nos}; start_time, stop_time (ms since 1970)
+    old    (version 20160704) mapping, settings/lsb, proc0/spikeTimes(frameno, channel, amplitude), sig,
+             bits(frameno, bits)                                                      stimuli
+
+Frames are counted from when the system started: the first of `frame_nos` (old: the last two rows of `sig`) is time 0.
+A channel can be named twice in `mapping`; what was recorded is in `groups/NAME/channels`. `spikes` and `events` are
+plain tables: they are read without the vendor's compression filter, which the raw traces may need.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.findings import Finding
+from animat.recordings.formats.choice import choose
+from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file, unavailable_filters
+from animat.recordings.formats.stimulus_text import stimulus_columns
+from animat.recordings.recording import UNKNOWN, Recording
+
+WHAT = "MaxWell recording"
+OLD_VERSION = 20160704
+USUAL_RATE_HZ = 20_000.0
+ROOTS = ("wells", "recordings", "data_store")
+OLD_CHANNELS = 1024
+"""Rows of `sig` that are channels; the last two of its rows hold the frame number, low half first."""
+
+
+def is_maxwell(file: Hdf5File) -> bool:
+    """Whether a file is laid out as MaxWell's are."""
+    return is_old(file) or any(file.names(root) for root in ROOTS)
+
+
+def is_old(file: Hdf5File) -> bool:
+    """Whether a file is in the layout of version 20160704."""
+    return "channel" in file.fields("mapping") and (file.has("sig") or file.has("proc0/spikeTimes"))
+
+
+def read_maxwell(
+    path: str | os.PathLike[str], *, part: str | None = None, stimuli: str | None = None, spikes: bool = True
+) -> Recording:
+    """Read spikes, stimuli and electrodes of one recording of a MaxWell file.
+
+    Args:
+        path: the file.
+        part: which recording, such as `well000/rec0000`, where the file holds several.
+        stimuli: the type of the events that are stimuli, as a number, where there are several types.
+        spikes: whether spikes must be there; without, channels and stimuli are read, for raw traces beside them.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged, lacks spikes, or holds several recordings and none is chosen.
+        UnusableData: if a column is not what it should be.
+    """
+    path = Path(path)
+    with hdf5_file(path, WHAT) as file:
+        found = _old(file) if is_old(file) else _new(file, part)
+        found.read(file, stimuli, spikes)
+    return found.recording(path)
+
+
+def parts(file: Hdf5File) -> dict[str, str]:
+    """Name of each recording in a file of the new layout, and where it is."""
+    for root in ROOTS:
+        outer = file.names(root)
+        if root == "data_store" and outer:
+            return {name: f"{root}/{name}" for name in outer}
+        found = {f"{a}/{b}": f"{root}/{a}/{b}" for a in outer for b in file.names(f"{root}/{a}")}
+        if found:
+            return found
+    return {}
+
+
+@dataclass
+class _Found:
+    """Where things are in one layout, and what was read there."""
+
+    spikes_at: str
+    events_at: str
+    event_kind: str
+    mapping_at: str
+    rate_hz: float
+    first_frame: int | None
+    frames: int | None = None
+    recorded_channels: Column | None = None
+    provenance: dict[str, str] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    columns: dict[str, Any] = field(default_factory=dict)
+
+    def read(self, file: Hdf5File, stimuli: str | None, spikes: bool) -> None:
+        """Fill `columns`."""
+        if spikes and not file.has(self.spikes_at):
+            raise InvalidFile(
+                f"{file.path}: expected spikes at /{self.spikes_at}, found none: the rig kept raw traces only, or "
+                "nothing; find spikes in them with animat convert"
+            )
+        spike_frame = file.read(self.spikes_at, "frameno") if spikes else np.empty(0, np.int64)
+        spike_channel = file.read(self.spikes_at, "channel") if spikes else np.empty(0, np.int64)
+        event_frame, event_columns = self._events(file, stimuli)
+        if self.first_frame is None:
+            frames = [int(np.min(f)) for f in (spike_frame, event_frame) if len(f)]
+            self.first_frame = min(frames, default=0)
+            self._note(
+                "clock-from-first-event",
+                "the first frame's number is not in the file: the clock starts at the first spike or stimulus",
+                "note",
+            )
+        labels, electrode, xy_um = self._channels(file, spike_channel)
+        routed = np.isin(spike_channel, labels)
+        if not np.all(routed):
+            lost = int(np.count_nonzero(~routed))
+            self._note(
+                "spikes-not-routed",
+                f"{lost:,} of {len(routed):,} spikes are on channels that no electrode is routed to, and are left out",
+                "note" if lost < 0.01 * len(routed) else "warning",
+                float(lost),
+            )
+        self.columns |= {
+            "spike_time_s": self._seconds(spike_frame[routed]),
+            "spike_channel": spike_channel[routed],
+            "stimulus_time_s": self._seconds(event_frame),
+            "channel_label": labels,
+            "channel_electrode": electrode,
+            "channel_xy_um": xy_um,
+            "sampling_rate_hz": self.rate_hz,
+            **event_columns,
+        }
+        if self.frames is not None:
+            latest = [t.max() for t in (self.columns["spike_time_s"], self.columns["stimulus_time_s"]) if len(t)]
+            earliest = [t.min() for t in (self.columns["spike_time_s"], self.columns["stimulus_time_s"]) if len(t)]
+            start_s = float(min([0.0, *earliest]))
+            self.columns["start_s"] = start_s
+            # Half a frame more than the last event, so that no rounding puts it outside.
+            stop_s = max([self.frames / self.rate_hz, *(t + 0.5 / self.rate_hz for t in latest)])
+            self.columns["duration_s"] = float(stop_s - start_s)
+
+    def recording(self, path: Path) -> Recording:
+        """What was read as a recording."""
+        provenance = {"source": path.name, "format": "MaxWell", **self.provenance}
+        return PlainColumns(**self.columns).to_recording(provenance, tuple(self.findings))
+
+    def _events(self, file: Hdf5File, stimuli: str | None) -> tuple[Column, dict[str, Any]]:
+        if not file.has(self.events_at):
+            return np.empty(0, np.int64), {}
+        frame = file.read(self.events_at, "frameno")
+        if self.event_kind == "bits":
+            bits = file.read(self.events_at, "bits").astype(np.int64)
+            rises = (bits != 0) & (bits != np.concatenate([[0], bits[:-1]]))
+            chosen = frame[rises]
+            n_falls = int(np.count_nonzero(~rises))
+            if n_falls:
+                self._note(
+                    "bits-not-rising",
+                    f"{n_falls:,} of {len(bits):,} entries of /bits end a pulse and are no stimuli",
+                    "note",
+                    float(n_falls),
+                )
+            columns = {"stimulus_pattern": bits[rises]} if len(np.unique(bits[rises])) > 1 else {}
+            return chosen, columns
+        names = file.fields(self.events_at)
+        is_stimulus = np.ones(len(frame), dtype=bool)
+        if "eventtype" in names and len(frame):
+            types = file.read(self.events_at, "eventtype")
+            counts = {str(t): int(np.count_nonzero(types == t)) for t in np.unique(types)}
+            which = choose(
+                f"{file.path}: stimuli", "--stimuli", counts, stimuli, lambda name: f"{name} ({counts[name]:,} events)"
+            )
+            is_stimulus = types.astype(np.str_) == which
+            if len(counts) > 1:
+                left = int(np.count_nonzero(~is_stimulus))
+                self._note(
+                    "events-left-out", f"{left:,} events of other types than {which} are left out", "note", float(left)
+                )
+        columns = {}
+        if "eventmessage" in names:
+            columns = stimulus_columns(file.read(self.events_at, "eventmessage")[is_stimulus].tolist())
+        if "eventid" in names and "stimulus_pattern" not in columns:
+            identity = file.read(self.events_at, "eventid")[is_stimulus].astype(np.int64)
+            if len(np.unique(identity)) > 1 and np.all(identity >= 0):
+                columns["stimulus_pattern"] = identity
+                self.provenance["stimulus_pattern"] = "the events' eventid"
+        return frame[is_stimulus], columns
+
+    def _channels(self, file: Hdf5File, spike_channel: Column) -> tuple[Column, Column, Column]:
+        """Label, electrode and position of every channel that was recorded."""
+        if not file.has(self.mapping_at):
+            labels = np.unique(spike_channel if self.recorded_channels is None else self.recorded_channels)
+            severity = "warning" if self.recorded_channels is None else "note"
+            self._note(
+                "mapping-missing",
+                f"the file has no /{self.mapping_at}: which electrode a channel reads is not "
+                f"known; {len(labels):,} channels are taken from "
+                + ("those that fired" if self.recorded_channels is None else "its groups"),
+                severity,
+            )
+            return labels, np.full(len(labels), UNKNOWN), np.full((len(labels), 2), np.nan)
+        channel = file.read(self.mapping_at, "channel").astype(np.int64)
+        electrode = file.read(self.mapping_at, "electrode").astype(np.int64)
+        xy_um = np.column_stack([file.read(self.mapping_at, axis).astype(np.float64) for axis in ("x", "y")])
+        used = (channel >= 0) & (electrode >= 0)
+        if self.recorded_channels is not None:
+            used &= np.isin(channel, self.recorded_channels)
+        labels, first = np.unique(channel[used], return_index=True)
+        repeated = int(np.count_nonzero(used)) - len(labels)
+        if repeated:
+            rows = np.unique(np.column_stack([channel[used], electrode[used]]), axis=0)
+            twice = len(rows) - len(labels)
+            self._note(
+                "duplicate-channels",
+                f"the file's mapping names {repeated:,} channels again; each is one channel here"
+                + (
+                    f", and where it names another electrode ({twice:,} times) the first named is taken"
+                    if twice
+                    else ""
+                ),
+                "note",
+                float(repeated),
+            )
+        if self.recorded_channels is not None:
+            unmapped = np.setdiff1d(self.recorded_channels, labels)
+            if len(unmapped):
+                self._note(
+                    "channels-not-routed",
+                    f"{len(unmapped):,} recorded channels have no electrode in the mapping and are left out",
+                    "note",
+                    float(len(unmapped)),
+                )
+        return labels, electrode[used][first], xy_um[used][first]
+
+    def _seconds(self, frame: Column) -> Column:
+        return np.asarray((frame.astype(np.int64) - int(self.first_frame or 0)) / self.rate_hz)
+
+    def _note(self, name: str, sentence: str, severity: Any, value: float | None = None) -> None:
+        self.findings.append(Finding(name, severity, sentence, value))
+
+
+def _new(file: Hdf5File, part: str | None) -> _Found:
+    found_parts = parts(file)
+    if not found_parts:
+        raise InvalidFile(f"{file.path}: expected a MaxWell recording in one of {', '.join(ROOTS)}, found none")
+    name = choose(f"{file.path}: part", "--part", found_parts, part)
+    at = found_parts[name]
+    findings = []
+    rate = file.first(f"{at}/settings/sampling")
+    if not isinstance(rate, int | float) or not rate > 0:
+        findings.append(
+            Finding("sampling-missing", "warning", "the sampling rate is not in the file: taken for 20 kHz")
+        )
+        rate = USUAL_RATE_HZ
+    groups = file.names(f"{at}/groups")
+    recorded = [file.read(f"{at}/groups/{g}/channels") for g in groups if file.has(f"{at}/groups/{g}/channels")]
+    ends = [e for g in groups if (e := file.ends(f"{at}/groups/{g}/frame_nos")) is not None]
+    found = _Found(
+        f"{at}/spikes",
+        f"{at}/events",
+        "events",
+        f"{at}/settings/mapping",
+        float(rate),
+        first_frame=min((e[0] for e in ends), default=None),
+        frames=max((e[1] - min(x[0] for x in ends) + 1 for e in ends), default=None),
+        recorded_channels=np.unique(np.concatenate(recorded).astype(np.int64)) if recorded else None,
+        findings=findings,
+    )
+    lost = max((e[1] - e[0] + 1 - e[2] for e in ends), default=0)
+    if lost > 0:
+        found.findings.append(
+            Finding(
+                "frames-lost",
+                "warning" if lost > 0.001 * max(e[2] for e in ends) else "note",
+                f"{lost:,} frames ({lost / float(rate):.3g} s) are missing from the recording: what happened in them "
+                "is not known",
+                float(lost),
+            )
+        )
+    if found.frames is not None and found.frames <= 0:
+        found.frames = None
+    if len(found_parts) > 1:
+        found.provenance["part"] = name
+    started = file.first(f"{at}/start_time")
+    if isinstance(started, int | float) and 0 < started < 4e12:
+        found.provenance["recorded_at"] = datetime.fromtimestamp(started / 1e3, UTC).isoformat(timespec="milliseconds")
+    return found
+
+
+def _old(file: Hdf5File) -> _Found:
+    rate = USUAL_RATE_HZ
+    found = _Found("proc0/spikeTimes", "bits", "bits", "mapping", rate, first_frame=None)
+    sig = file.node("sig")
+    if sig is not None and len(getattr(sig, "shape", ())) == 2 and sig.shape[0] > OLD_CHANNELS and sig.shape[1]:
+        dataset = file.dataset("sig")
+        if not unavailable_filters(dataset):
+            low, high = (int(value) for value in dataset[-2:, 0])
+            found.first_frame = high << 16 | low
+        found.frames = int(dataset.shape[1])
+    found.provenance["layout"] = f"version {OLD_VERSION}"
+    return found

@@ -1,0 +1,144 @@
+"""Where an NWB file of another program keeps its stimuli: one place is taken, several are listed to choose from.
+
+What can be stimuli, and which rows or samples are pulses:
+
+    TimeIntervals          every row, at start_time
+    IntervalSeries         every positive entry, at its timestamp
+    other series           with timestamps: every entry that is not 0 (or all, if none is); text: every entry
+                           sampled at a rate: wherever it leaves 0 by more than half of its largest size, for the
+                           first time in 1 ms
+
+Looked for in /stimulus/presentation first; where that is empty, in /intervals, /acquisition and /processing, and there
+only under names that speak of stimuli, pulses or triggers. A name that the user gives is looked for in all of them.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import h5py
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.recordings.columns import Column
+from animat.recordings.findings import Finding
+from animat.recordings.formats.choice import choose
+from animat.recordings.formats.hdf5 import Hdf5File
+from animat.recordings.formats.stimulus_text import padded
+
+FIRST = "stimulus/presentation"
+ELSEWHERE = ("intervals", "acquisition")
+SPEAKS_OF_STIMULI = re.compile(r"stim|pulse|trigger|ttl", re.IGNORECASE)
+NEWER_EVENTS = "EventsTable"
+COLUMNS = {
+    "stimulus_frequency_hz": ("frequency_hz", "frequency", "stimulus_frequency", "stim_frequency"),
+    "stimulus_pattern": ("pattern", "stimulus_pattern", "stimulus_type", "stimulus_name", "condition", "label"),
+    "stimulus_presentation": ("presentation",),
+}
+ELECTRODES = ("electrode_ids", "electrode_id", "electrodes", "electrode")
+APART_S = 0.001
+_BLOCK = 2**20
+
+
+def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> dict[str, Any]:
+    """The stimulus columns of `PlainColumns`; an empty column of times where the file keeps no stimuli.
+
+    Args:
+        file: open.
+        asked: the name of the stimuli, where the user gave one: a place, or its last part.
+        findings: what is noticed is added.
+
+    Raises:
+        InvalidFile: if several places could be meant and none is named, or the named one is not there.
+    """
+    at = _place(file, asked)
+    if at is None:
+        return {"stimulus_time_s": np.empty(0)}
+    columns = _of_intervals(file, at) if file.has(f"{at}/start_time") else {"stimulus_time_s": _of_series(file, at)}
+    n = len(columns["stimulus_time_s"])
+    findings.append(Finding("stimuli-from", "note", f"{n:,} stimuli are taken from /{at}", float(n)))
+    return columns
+
+
+def _place(file: Hdf5File, asked: str | None) -> str | None:
+    first = [f"{FIRST}/{name}" for name in file.names(FIRST)]
+    elsewhere = [f"{room}/{name}" for room in ELSEWHERE for name in file.names(room)]
+    elsewhere += [f"processing/{m}/{name}" for m in file.names("processing") for name in file.names(f"processing/{m}")]
+    first, elsewhere = ([at for at in places if _can_be_stimuli(file, at)] for places in (first, elsewhere))
+    if asked is not None:
+        every = [*first, *elsewhere]
+        named = [at for at in every if asked.strip("/") in (at, at.rpartition("/")[2])]
+        if not named:
+            choose(f"{file.path}: stimuli", "--stimuli", every or ["none (nothing in the file can be stimuli)"], asked)
+        return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
+    candidates = first or [at for at in elsewhere if SPEAKS_OF_STIMULI.search(at.rpartition("/")[2])]
+    return choose(f"{file.path}: stimuli", "--stimuli", candidates, None) if candidates else None
+
+
+def _can_be_stimuli(file: Hdf5File, at: str) -> bool:
+    if file.attribute(at, "neurodata_type") in ("ElectricalSeries", "LFP", "SpikeEventSeries"):
+        return False
+    return any(file.has(f"{at}/{name}") for name in ("start_time", "timestamps", "starting_time"))
+
+
+def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
+    time_s = file.read(f"{at}/start_time").reshape(-1)
+    columns: dict[str, Any] = {"stimulus_time_s": time_s}
+    for column, names in COLUMNS.items():
+        for name in names:
+            node = file.node(f"{at}/{name}")
+            if isinstance(node, h5py.Dataset) and node.shape == time_s.shape and node.dtype.kind in "iufSO":
+                values = file.read(f"{at}/{name}")
+                if (values.dtype.kind == "U") <= (column == "stimulus_pattern"):
+                    columns[column] = values
+                    break
+    for name in ELECTRODES:
+        node = file.node(f"{at}/{name}")
+        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iu":
+            continue
+        values = file.read(f"{at}/{name}").astype(np.int64)
+        if file.has(f"{at}/{name}_index"):
+            ends = file.read(f"{at}/{name}_index").astype(np.int64).reshape(-1).tolist()
+            if len(ends) == len(time_s) and all(a <= b for a, b in zip([0, *ends], ends, strict=False)):
+                flat = values.reshape(-1).tolist()
+                columns["stimulus_electrodes"] = padded([flat[a:b] for a, b in zip([0, *ends], ends, strict=False)])
+        elif values.shape[:1] == time_s.shape and values.ndim <= 2:
+            columns["stimulus_electrodes"] = values
+        break
+    if "stimulus_frequency_hz" in columns:
+        frequency = columns["stimulus_frequency_hz"].astype(np.float64)
+        columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
+    return columns
+
+
+def _of_series(file: Hdf5File, at: str) -> Column:
+    """Start of every pulse of a series."""
+    if file.has(f"{at}/timestamps"):
+        time_s = file.read(f"{at}/timestamps").reshape(-1)
+        node = file.node(f"{at}/data")
+        if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape:
+            return time_s
+        data = file.read(f"{at}/data")
+        if data.dtype.kind == "U":
+            return time_s
+        is_pulse = data > 0 if file.attribute(at, "neurodata_type") == "IntervalSeries" else data != 0
+        return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
+    rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
+    if not isinstance(rate_hz, int | float) or not rate_hz > 0 or not isinstance(start_s, int | float):
+        raise InvalidFile(f"{file.path}: expected the rate of /{at} in Hz at its starting_time, got {rate_hz}")
+    return start_s + _onsets(file, f"{at}/data", float(rate_hz)) / rate_hz
+
+
+def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
+    """Samples at which a sampled stimulus leaves 0; read in blocks, as it may be as long as the recording."""
+    dataset = file.dataset(at)
+    if dataset.ndim != 1 or dataset.dtype.kind not in "iuf" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
+        raise InvalidFile(f"{file.path}: expected one column of numbers at /{at}, got {dataset.dtype} {dataset.shape}")
+    blocks = range(0, len(dataset), _BLOCK)
+    half = max((float(np.max(np.abs(dataset[b : b + _BLOCK].astype(np.float64)))) for b in blocks), default=0.0) / 2
+    if not half > 0:
+        return np.empty(0)
+    away = [np.flatnonzero(np.abs(dataset[b : b + _BLOCK].astype(np.float64)) > half) + b for b in blocks]
+    samples = np.concatenate(away)
+    return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > APART_S * rate_hz])
