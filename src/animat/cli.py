@@ -266,8 +266,8 @@ class Evaluate(Fitting):
     """Episodes of each policy and control"""
     robot: Literal["cartpole", "navigation"] | None = None
     """The robot that is expected; default: the one the policies were trained on"""
-    greedy: bool = False
-    """Take the most probable action instead of drawing from the policy"""
+    drawn: bool = False
+    """Draw actions from the policy, as in training, instead of taking the most probable one"""
     seed: int = 1
     """Decides every random draw"""
     json: bool = False
@@ -291,7 +291,7 @@ class Evaluate(Fitting):
 
         keep_compilations()
         evaluation = evaluate(
-            policies, timeline, at_min=self.at_min, episodes=self.episodes, seed=self.seed, greedy=self.greedy
+            policies, timeline, at_min=self.at_min, episodes=self.episodes, seed=self.seed, greedy=not self.drawn
         )
         _say_findings(evaluation.findings)
         print(evaluation.to_text())

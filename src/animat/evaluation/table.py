@@ -113,7 +113,7 @@ def evaluate(
     at_min: float | None = None,
     episodes: int = 100,
     seed: int = 1,
-    greedy: bool = False,
+    greedy: bool = True,
     robot: Robot[Any] | None = None,
 ) -> Evaluation:
     """Run policies and the controls beside them on the simulator of one minute.
@@ -128,7 +128,7 @@ def evaluate(
         at_min: minute on the culture's clock whose newest simulator is used; None: the last recording.
         episodes: of each policy and control.
         seed: decides every random draw.
-        greedy: whether the most probable action is taken, not drawn from the policy.
+        greedy: whether the most probable action is taken, or one drawn from the policy as in training.
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
 
     Raises:
