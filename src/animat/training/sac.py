@@ -56,7 +56,7 @@ class SAC:
     replay: int = 131_072
     hidden: int = 64
     learning_rate: float = 1e-3
-    discount: float = 0.99
+    discount: float = 0.98
     follow: float = 0.005
     reward_scale: float = 0.1
     averaging: int = 8
