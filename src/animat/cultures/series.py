@@ -6,12 +6,15 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.schedule import make_schedule
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
@@ -58,6 +61,7 @@ def record_virtual_series(
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
     if not 0 < interval_min < float("inf"):
         raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
+    _check_interval(protocol, sessions, interval_min)
     folder, progress = Path(folder), progress or Silent()
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
     there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
@@ -71,7 +75,6 @@ def record_virtual_series(
     _remove_leftovers(folder)
     culture, recorded = _resume(make_culture, folder / STATE_FILE, there)
     with culture:
-        _check_interval(culture, protocol, sessions, interval_min)
         if not recorded or not (folder / SELECTION_FILE).exists():
             culture.selection.save(folder / SELECTION_FILE)
         if not recorded:
@@ -114,8 +117,9 @@ def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int)
     return culture, 0
 
 
-def _check_interval(culture: VirtualCulture, protocol: Protocol, sessions: int, interval_min: float) -> None:
-    takes_min = culture.schedule(protocol).duration_s / 60
+def _check_interval(protocol: Protocol, sessions: int, interval_min: float) -> None:
+    # How long a schedule takes does not depend on the electrodes: no culture need be opened to refuse.
+    takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), seed=0).duration_s / 60
     if sessions > 1 and interval_min < takes_min:
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"
