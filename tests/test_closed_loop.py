@@ -252,7 +252,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"conditions": ()}, "at least one"),
         ({"conditions": (Condition("electrode 5", 0.0),)}, "expected a frequency"),
         ({"on_burst": "panic"}, "use, repeat, skip"),
-        ({"on_late": "panic"}, "go on, stop"),
+        ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),
         ({"patience_s": float("nan")}, "patience_s"),
         ({"patterns": 0}, "patterns"),

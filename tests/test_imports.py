@@ -28,6 +28,8 @@ MAY_IMPORT = {
     "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
     "cultures": {"recordings"},
     "closed_loop": {"cultures", "neurons", "mapping", "robots", "recordings"},
+    "reality_gap": {"closed_loop", "cultures", "evaluation", "training", "animat", "neurons", "recordings"},
+    "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
     "gym": {"animat", "neurons", "mapping", "robots", "recordings", "report"},
 }

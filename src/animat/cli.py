@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcommand
 
+from animat.cli_convert import Convert
+from animat.cli_loop import Recover, Run
 from animat.errors import AnimatError, InvalidArgument, Mismatch
 from animat.recordings.findings import Finding
 
@@ -133,7 +135,11 @@ class Inspect(Responding):
     """Say what is in recordings, whether an Animat can be made of them, and what is wrong with them."""
 
     recordings: Positional[tuple[Path, ...]] = ()
-    """Files, or folders of them: NWB, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv beside it)"""
+    """Files, or folders of them: NWB, MaxWell, CL1, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv beside it)"""
+    stimuli: str | None = None
+    """Which of several things in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
+    part: str | None = None
+    """Which of several recordings in a MaxWell file, such as well000/rec0000"""
     out: Path | None = None
     """Folder for figures; default: none are drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
@@ -155,7 +161,7 @@ class Inspect(Responding):
             raise InvalidArgument("--out: expected recordings of different names, got two alike; inspect them apart")
         inspected, series = [], []
         for file in files:
-            recording = read_recording(file)
+            recording = read_recording(file, stimuli=self.stimuli, part=self.part)
             inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
@@ -301,8 +307,11 @@ class Evaluate(Fitting):
 Command = (
     Annotated[Record, subcommand("record")]
     | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Convert, subcommand("convert")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Run, subcommand("run")]
+    | Annotated[Recover, subcommand("recover")]
 )
 
 
@@ -330,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(arguments: list[str]) -> Record | Inspect | Train | Evaluate:
+def _parse(arguments: list[str]) -> Record | Inspect | Convert | Train | Evaluate | Run | Recover:
     """Read the command line; usage errors come in one line, not in a box."""
     said = io.StringIO()
     try:

@@ -140,7 +140,8 @@ class Driver:
         """Present a condition and move the robot by the answer; returns whether to present it once more instead."""
         loop, culture = self._loop, self._culture
         frequency_hz = loop.conditions[delivered].value
-        times_s, late_s = self._times(frequency_hz)
+        due_s = self._last_pulse_s + 1 / frequency_hz
+        times_s = self._times(due_s, frequency_hz)
         stimuli: list[Stimulus] = []
         if contender.delivery != "silent":
             stimuli = [
@@ -156,6 +157,9 @@ class Driver:
         if not stimuli:
             pulse_time_s = self._on_samples(began_s - self._zero_s + times_s)
         after_s = pulse_time_s[-1:]
+        # From when it really came; a grid step is the grid's, and a sample's rounding, and not lateness.
+        late_s = float(pulse_time_s[0]) + self._zero_s - due_s
+        late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
         rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
         self._last_pulse_s = self._zero_s + float(after_s[0])
         is_burst = bool(active_ratio[0] > loop.burst_threshold)
@@ -188,7 +192,7 @@ class Driver:
         self._data_at_s = self._clock.now_s()
         tick["wall_s"] = self._data_at_s - self._wall_zero_s
         try:
-            if late_s > TICK_S and loop.on_late == "stop":
+            if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
             if not again:
                 tick |= self._move(tick["rate_hz"], is_burst, iteration)
@@ -225,18 +229,15 @@ class Driver:
             "truncated": iteration + 1 >= loop.robot.episode_limit and not moved.terminated,
         }
 
-    def _times(self, frequency_hz: float) -> tuple[Float64[np.ndarray, " pulses"], float]:
-        """When the pulses of a presentation come, from now, and how late the first one is."""
+    def _times(self, due_s: float, frequency_hz: float) -> Float64[np.ndarray, " pulses"]:
+        """When the pulses of a presentation come, counted from now; its first one is due at a time of the culture's."""
         now_s = self._culture.now_s
-        wanted_s = self._last_pulse_s + 1 / frequency_hz - now_s
-        first_s = max(wanted_s, 0.0)
+        first_s = max(due_s - now_s, 0.0)
         if self._loop.real_time:
+            # A culture that is held back to real time stands still meanwhile: what is missed has to be made up.
             behind_s = self._clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
             first_s = max(first_s, behind_s)
-        times_s = on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
-        # Half a grid step is the grid's and not lateness.
-        late_s = float(times_s[0]) - wanted_s
-        return times_s, late_s if late_s > TICK_S / 2 + 1e-9 else 0.0
+        return on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
 
     def _deal(self) -> list[int]:
         """A pattern for each pulse, all different where there are enough, from a deck that is shuffled when empty."""

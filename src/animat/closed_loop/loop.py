@@ -21,7 +21,7 @@ from animat.robots.base import Robot
 from animat.robots.registry import robot_to_dict
 
 OnBurst = Literal["use", "repeat", "skip"]
-OnLate = Literal["go on", "stop"]
+OnLate = Literal["continue", "stop"]
 
 
 class Trained(Protocol):
@@ -68,7 +68,7 @@ class Loop:
         on_burst: `"use"` the response as any other; `"repeat"` the stimulus, at most `most_repeats` times; `"skip"`
             it, and move the robot by the command before it (0 where there was none).
         most_repeats: of one action; the response after that is used.
-        on_late: when a pulse comes later than it should: `"go on"`, or `"stop"` the session. It is logged either way.
+        on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session. It is logged either way.
         pause_s: observed without a stimulus before each episode.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung.
         real_time: whether a culture that is faster is held back to real time.
@@ -89,7 +89,7 @@ class Loop:
     patterns: int | None = None
     on_burst: OnBurst = "use"
     most_repeats: int = 3
-    on_late: OnLate = "go on"
+    on_late: OnLate = "continue"
     pause_s: float = 2.0
     patience_s: float = 10.0
     real_time: bool = False

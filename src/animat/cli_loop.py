@@ -1,0 +1,205 @@
+"""The commands of the living loop: `run`, `live`, `recover`; part of the command line, thin like the rest of it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from animat.errors import InvalidArgument, LoopEnded
+
+if TYPE_CHECKING:
+    from animat.closed_loop.tick import Ending
+    from animat.cultures.base import Culture
+    from animat.progress import Progress
+    from animat.reality_gap import Calibration
+    from animat.recordings.findings import Finding
+    from animat.recordings.recording import Recording
+    from animat.recordings.stimulus import Pulse
+    from animat.training.policy import Policy
+
+
+@dataclass(frozen=True)
+class Stimulating:
+    """On which culture, and how much it may be stimulated; the same in every command that does."""
+
+    culture: Literal["virtual", "replay", "cl1"] = "virtual"
+    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1: a CL1 (needs cl-sdk)"""
+    culture_seed: int | None = None
+    """Which virtual culture; default: the one of the recordings, else 1"""
+    budget_pulses: int | None = None
+    """Most pulses in all, recordings included; default: no end, but the culture's limits"""
+    budget_per_electrode: int | None = None
+    """Most pulses on any one electrode"""
+    on_burst: Literal["use", "repeat", "skip"] = "use"
+    """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
+    on_late: Literal["continue", "stop"] = "continue"
+    """A pulse that comes late: continue and log it, or stop"""
+    pause_s: float = 2.0
+    """Without stimulation before each episode"""
+    patience_s: float = 10.0
+    """How much longer than it should a culture may take to answer before the session is ended"""
+
+
+@dataclass(frozen=True)
+class Run(Stimulating):
+    """Run policies in closed loop on a culture, with controls between them: predicted against lived return."""
+
+    policies: Positional[Path] = Path("policies")
+    """A policy file or a folder of them"""
+    recordings: tuple[Path, ...] = ()
+    """Recordings the policies were trained on: their percentiles and prediction; default: the culture is recorded"""
+    at_min: float | None = None
+    """Minute whose newest recording is taken; default: the last that the policies were trained on"""
+    state: Path | None = None
+    """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
+    episodes: int = 5
+    """Of each policy and control, interleaved in random order"""
+    controls: Literal["all", "random"] = "all"
+    """all: random, constant, silent, shuffled and hand-made; random: only that one"""
+    pulses: int | None = None
+    """Pulses a presentation; default: as the policies' recordings had"""
+    real_time: bool = False
+    """Hold a simulated culture back to real time; a living one always runs in it"""
+    drawn: bool = False
+    """Draw actions from the policies, as in training, instead of taking the most probable one"""
+    seed: int = 1
+    """Decides every random draw, but what a living culture does"""
+    out: Path = Path("session")
+    """Folder for the session's log and recording"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Run."""
+        from animat.compilation import keep_compilations
+        from animat.cultures.budget import Account, Budget
+        from animat.progress import Bar
+        from animat.reality_gap import run_policies
+        from animat.recordings.reading import read_recordings
+        from animat.training.policy import load_policies
+
+        if self.episodes < 1:
+            raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
+        keep_compilations()
+        policies = load_policies(self.policies)
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        with Bar("closed loop") as progress, self._culture(recordings, progress) as culture:
+            calibration, pulse, patterns = self._calibrate(culture, recordings, policies, account, progress)
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                self.out,
+                episodes=self.episodes,
+                with_controls=self.controls == "all",
+                greedy=not self.drawn,
+                seed=self.seed,
+                pulses=self.pulses,
+                account=account,
+                progress=progress,
+                pulse=pulse,
+                patterns=patterns,
+                on_burst=self.on_burst,
+                on_late=self.on_late,
+                pause_s=self.pause_s,
+                patience_s=self.patience_s,
+                real_time=self.real_time,
+            )
+        _say(gap.findings)
+        print(gap.to_text())
+        print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
+        _expect_no_fault(gap.session.ending, self.out)
+        return gap.to_dict()
+
+    def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
+        from animat.cultures.kinds import culture_of, recorded_culture
+
+        if self.culture == "replay" and not recordings:
+            raise InvalidArgument("--recordings: expected some for a replay to answer from, got none")
+        known = recorded_culture(recordings, self.recordings) if self.culture == "virtual" else {}
+        state = self.state or (known.get("state") if self.culture_seed is None else None)
+        seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
+        if state is not None:
+            print(f"the culture goes on from {state}", file=sys.stderr)
+        return culture_of(self.culture, seed=seed, state=state, recordings=recordings, progress=progress)
+
+    def _calibrate(
+        self,
+        culture: Culture,
+        recordings: Sequence[Recording],
+        policies: dict[str, Policy],
+        account: Any,
+        progress: Progress,
+    ) -> tuple[Calibration, Pulse, int | None]:
+        """From the recordings; without any, the culture is recorded as the policies' recordings were presented."""
+        from animat.cultures.kinds import pulse_for
+        from animat.live.recording import record_within
+        from animat.neurons.series import extract_series
+        from animat.reality_gap import Calibration
+        from animat.recordings.protocol import Presentation, Protocol
+
+        first = next(iter(policies.values()))
+        pulse, patterns = pulse_for(self.culture), None
+        if recordings:
+            told = recordings[0].provenance.get("protocol")
+            if told is not None:
+                protocol = Protocol.from_json(told)
+                pulse, patterns = protocol.pulse, protocol.patterns
+            at_min = self.at_min
+        else:
+            presentation = first.presentation or Presentation("mixed")
+            protocol = Protocol(
+                tuple(condition.value for condition in first.conditions),
+                order=presentation.order,
+                pulses=presentation.pulses,
+                patterns=min(100, len(culture.patterns)),
+                pulse=pulse,
+            )
+            print("no recordings were given: the culture is recorded first", file=sys.stderr)
+            recording = record_within(account, culture, protocol, self.seed, progress)
+            recording.save(self.out / "calibration.nwb")
+            recordings, at_min = [recording], recording.start_min
+        series = extract_series(recordings, window_ms=first.window_ms or (2.0, 10.0))
+        usable = None if patterns is None else min(patterns, len(culture.patterns))
+        return Calibration.of_series(series, first, at_min=at_min), pulse, usable
+
+
+@dataclass(frozen=True)
+class Recover:
+    """Write the recording of a closed-loop session that was killed, from its log."""
+
+    session: Positional[Path] = Path("session")
+    """The session's folder"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Recover."""
+        from animat.closed_loop.session import recover_session
+
+        session = recover_session(self.session)
+        told = session.to_dict()
+        print(f"{session.recording_file}: {told['ticks']} ticks, {told['pulses']} pulses; it ended: {told['ended']}")
+        if told["lost_bytes"]:
+            print(f"{told['lost_bytes']} bytes at the end of the log make no whole record and are lost")
+        return {"recording": str(session.recording_file), **told}
+
+
+def _expect_no_fault(ending: Ending, folder: Path) -> None:
+    """Turn an ending before its time into an error, now that all is told and written."""
+    if ending.by == "person":
+        raise KeyboardInterrupt
+    if ending.by != "plan":
+        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
+
+
+def _say(findings: Sequence[Finding]) -> None:
+    for finding in findings:
+        if finding.severity != "note":
+            print(f"warning: {finding.sentence}", file=sys.stderr)

@@ -1,0 +1,82 @@
+"""The kinds of cultures by name: to run on another one is to change one word."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from animat.cultures.base import Culture
+from animat.errors import InvalidArgument
+from animat.progress import Progress
+from animat.recordings.recording import Recording
+from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+
+CultureKind = Literal["virtual", "replay", "cl1"]
+
+
+def culture_of(
+    kind: CultureKind,
+    *,
+    seed: int = 1,
+    state: str | os.PathLike[str] | None = None,
+    recordings: Sequence[Recording] = (),
+    progress: Progress | None = None,
+) -> Culture:
+    """A culture of a kind, closed.
+
+    Args:
+        kind: `"virtual"`, `"replay"` or `"cl1"`.
+        seed: which virtual culture; of the draws of a replay; of a CL1's patterns.
+        state: of a virtual culture, to go on from (`VirtualCulture.save_state`).
+        recordings: that a replay answers from.
+        progress: told about a virtual culture's scan.
+
+    Raises:
+        InvalidArgument: for another kind, or a state for one that has none.
+        InvalidFile, Mismatch: if the state is damaged, or another culture's.
+        DeviceFailed: for a device whose package is not installed.
+    """
+    if state is not None and kind != "virtual":
+        raise InvalidArgument(f"state: expected none for a culture of kind {kind!r}, got {state}")
+    if kind == "virtual":
+        from animat.cultures.virtual import VirtualCulture
+
+        culture = VirtualCulture(seed, progress=progress)
+        if state is not None:
+            culture.restore_state(state)
+        return culture
+    if kind == "replay":
+        from animat.cultures.replay import ReplayCulture
+
+        return ReplayCulture(recordings, seed=seed)
+    if kind == "cl1":
+        from animat.cultures.cl1 import CL1Culture
+
+        return CL1Culture(seed=seed)
+    raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")
+
+
+def pulse_for(kind: CultureKind) -> Pulse:
+    """The pulse that a kind of culture is given where none is asked for."""
+    if kind == "cl1":
+        from animat.cultures.cl1 import CL1_PULSE
+
+        return CL1_PULSE
+    return PUBLISHED_PULSE
+
+
+def recorded_culture(recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
+    """The seed of the virtual culture that recordings are of, and the state that was written after them, as known."""
+    found: dict[str, Any] = {}
+    provenance = recordings[0].provenance if recordings else {}
+    if provenance.get("source", "").startswith("virtual culture") and provenance.get("seed", "").isdigit():
+        found["seed"] = int(provenance["seed"])
+        from animat.cultures.series import STATE_FILE
+
+        folders = {file if file.is_dir() else file.parent for file in files}
+        states = [folder / STATE_FILE for folder in folders if (folder / STATE_FILE).is_file()]
+        if len(states) == 1:
+            found["state"] = states[0]
+    return found
