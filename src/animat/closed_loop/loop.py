@@ -68,7 +68,7 @@ class Loop:
         on_burst: `"use"` the response as any other; `"repeat"` the stimulus, at most `most_repeats` times; `"skip"`
             it, and move the robot by the command before it (0 where there was none).
         most_repeats: of one action; the response after that is used.
-        on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session. It is logged either way.
+        on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: observed without a stimulus before each episode.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung.
         real_time: whether a culture that is faster is held back to real time.

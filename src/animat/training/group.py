@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from animat.animat import Environment
 from animat.errors import InvalidFile
+from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.training.policy import Policy
 from animat.training.sac import Learner, begin, train_chunk
@@ -66,58 +66,80 @@ def train_group(group: Group, checkpoint: Path, report: Report, *, checkpoint_s:
     training, timeline = group.training, group.timeline
     if timeline is not None and training.percentiles == "first":
         timeline = timeline.with_first_percentiles()
-    environment = training.environment(0 if timeline is None else len(timeline.conditions))
-    settings = training.algorithm
-
-    chunk = jax.jit(
-        jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)), donate_argnums=0
-    )
-    learners = _begin(group, environment)
-    curve = np.full((CHUNKS, len(group.members), 3), np.nan)
-    done = 0
-    if checkpoint.exists():
-        done, learners, curve = _read_checkpoint(checkpoint, group.fingerprint, learners, curve)
-
+    together = SideBySide(group)
+    done = together.resume(checkpoint) if checkpoint.exists() else 0
     start_min = 0.0 if timeline is None else float(timeline.start_min[0])
     written = time.monotonic()
     for index in range(done, CHUNKS):
-        first, last = training.chunk(index)
-        simulator = None if timeline is None else timeline.at(start_min + training.minute(index))
-        learners, finished = chunk(learners, simulator, jnp.int32(first), jnp.int32(last))
-        episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
-        with np.errstate(invalid="ignore"):
-            curve[index] = np.stack(
-                [np.full(len(episodes), last * settings.environments), episodes, returns / episodes], axis=1
-            )
+        mean_return = together.train(
+            index, None if timeline is None else timeline.at(start_min + training.minute(index))
+        )
         if time.monotonic() - written > checkpoint_s:
-            _write_checkpoint(checkpoint, group.fingerprint, index + 1, learners, curve)
+            together.keep(checkpoint)
             written = time.monotonic()
-        report(index + 1, float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan"))
-    return _policies(group, environment, learners, curve)
+        report(index + 1, mean_return)
+    return together.policies()
 
 
 def untrained_policies(group: Group) -> list[Policy]:
     """A group's policies as they are before their first iteration: what training is compared with."""
-    environment = group.training.environment(0 if group.timeline is None else len(group.timeline.conditions))
-    return _policies(group, environment, _begin(group, environment), np.zeros((0, len(group.members), 3)))
+    return SideBySide(group).policies()
 
 
-def _begin(group: Group, environment: Environment[Any]) -> Learner[Any]:
-    training = group.training
-    keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
-    return jax.jit(jax.vmap(partial(begin, environment, training.algorithm)))(keys)  # type: ignore[no-any-return]
+class SideBySide:
+    """The policies of a group while they are trained: chunk after chunk, each with the simulator it is handed.
 
+    Args:
+        group: the policies; of its timeline only what all simulators of it share is used.
+    """
 
-def _policies(group: Group, environment: Environment[Any], learners: Learner[Any], curve: np.ndarray) -> list[Policy]:
-    return [
-        _policy(
-            group,
-            environment.scales,
-            jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), learners.deployed),
-            curve[:, i],
+    def __init__(self, group: Group) -> None:
+        training = group.training
+        self._group = group
+        self._environment = training.environment(0 if group.timeline is None else len(group.timeline.conditions))
+        self._chunk = jax.jit(
+            jax.vmap(partial(train_chunk, self._environment, training.algorithm), in_axes=(0, None, None, None)),
+            donate_argnums=0,
         )
-        for i in range(len(group.members))
-    ]
+        keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
+        self._learners = jax.jit(jax.vmap(partial(begin, self._environment, training.algorithm)))(keys)
+        self._curve: list[np.ndarray] = []
+
+    def train(self, index: int, simulator: NeuronSimulator | None) -> float:
+        """Train one chunk; returns the mean return of the episodes that ended in it, NaN for none.
+
+        Chunks are numbered on from 0; one may go beyond those of the training.
+        """
+        first, last = self._group.training.chunk(index)
+        self._learners, finished = self._chunk(self._learners, simulator, jnp.int32(first), jnp.int32(last))
+        episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
+        iterations = np.full(len(episodes), last * self._group.training.algorithm.environments)
+        with np.errstate(invalid="ignore"):
+            self._curve.append(np.stack([iterations, episodes, returns / episodes], axis=1))
+        return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")
+
+    def policies(self) -> list[Policy]:
+        """What they are now."""
+        curve = np.stack(self._curve) if self._curve else np.zeros((0, len(self._group.members), 3))
+        return [
+            _policy(
+                self._group,
+                self._environment.scales,
+                jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), self._learners.deployed),
+                curve[:, i],
+            )
+            for i in range(len(self._group.members))
+        ]
+
+    def keep(self, checkpoint: Path) -> None:
+        """Write a checkpoint."""
+        _write_checkpoint(checkpoint, self._group.fingerprint, len(self._curve), self._learners, np.stack(self._curve))
+
+    def resume(self, checkpoint: Path) -> int:
+        """Go on from a checkpoint; returns how many chunks are done."""
+        done, self._learners, curve = _read_checkpoint(checkpoint, self._group.fingerprint, self._learners)
+        self._curve = list(curve[:done])
+        return done
 
 
 def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> Policy:
@@ -145,9 +167,7 @@ def _write_checkpoint(path: Path, fingerprint: str, done: int, learners: Learner
         np.savez(file, fingerprint=np.array(fingerprint), done=np.array(done), curve=curve, **arrays)
 
 
-def _read_checkpoint(
-    path: Path, fingerprint: str, like: Learner[Any], curve: np.ndarray
-) -> tuple[int, Learner[Any], np.ndarray]:
+def _read_checkpoint(path: Path, fingerprint: str, like: Learner[Any]) -> tuple[int, Learner[Any], np.ndarray]:
     like = like._replace(key=jax.random.key_data(like.key))
     leaves, structure = jax.tree.flatten(like)
     try:
