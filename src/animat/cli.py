@@ -16,6 +16,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcomman
 
 from animat.cli_convert import Convert
 from animat.cli_loop import Recover, Run
+from animat.cli_studies import Reproduce, StudyFile
 from animat.errors import AnimatError, InvalidArgument, Mismatch
 from animat.recordings.findings import Finding
 
@@ -310,6 +311,8 @@ Command = (
     | Annotated[Convert, subcommand("convert")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Reproduce, subcommand("reproduce")]
+    | Annotated[StudyFile, subcommand("study")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Recover, subcommand("recover")]
 )
@@ -339,7 +342,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(arguments: list[str]) -> Record | Inspect | Convert | Train | Evaluate | Run | Recover:
+def _parse(
+    arguments: list[str],
+) -> Record | Inspect | Convert | Train | Evaluate | Reproduce | StudyFile | Run | Recover:
     """Read the command line; usage errors come in one line, not in a box."""
     said = io.StringIO()
     try:

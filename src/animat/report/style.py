@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 FORMATS = ("png", "svg", "pdf")
 
+PNG_DPI = 160
+
 # Okabe and Ito's palette, which people with any common colour blindness can tell apart.
 BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (
     "#000000",
@@ -31,6 +33,7 @@ WINDOW = ORANGE
 NON_BURST = BLUE
 BURST = RED
 MEDIAN = RED
+LIMIT = GREEN
 
 # Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
@@ -87,5 +90,38 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     # A date in the file would make the same figure another file each time; PNG holds none.
     metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower())
     with written_whole(path) as beside, matplotlib.rc_context(_SAVING):
-        figure.savefig(beside, format=path.suffix[1:].lower(), dpi=160, metadata=metadata)
+        figure.savefig(beside, format=path.suffix[1:].lower(), dpi=PNG_DPI, metadata=metadata)
     return path
+
+
+def grid_of_panels(
+    n: int,
+    columns: int,
+    width_in: float,
+    height_in: float,
+    title: str,
+    *,
+    share_x: bool = False,
+    share_y: bool = False,
+) -> tuple[Figure, list[Axes]]:
+    """A figure of n panels in rows, each of a size in inches, and its panels; places left over stay empty."""
+    columns = min(columns, max(n, 1))
+    rows = max(1, -(-n // columns))
+    figure = new_figure(max(width_in * columns, 4.5), height_in * rows + 0.35)
+    figure.suptitle(title, fontsize=10)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=share_x, sharey=share_y).reshape(-1)
+    for axes in panels[n:]:
+        axes.set_visible(False)
+    for axes in panels[max(0, n - columns) : n]:
+        # The lowest panel of a column that is not full shows its ticks too.
+        axes.tick_params(labelbottom=True)
+    return figure, list(panels[:n])
+
+
+def draw_levels(axes: Axes, random: float | None, limit: float | None, *, upright: bool = False) -> None:
+    """Lines across the axes at the return of random actions (dotted) and the best possible one (dashed)."""
+    line = axes.axvline if upright else axes.axhline
+    if limit is not None:
+        line(limit, color=LIMIT, linewidth=1.2, linestyle="--", label="best possible return")
+    if random is not None:
+        line(random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")

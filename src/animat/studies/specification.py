@@ -33,6 +33,11 @@ def _check_algorithm(settings: dict[str, float]) -> None:
 def _check_name(what: str, name: str) -> None:
     if not _NAME.fullmatch(name):
         raise InvalidArgument(f"{what}: expected letters, digits, spaces, dots and dashes, got {name!r}")
+    try:
+        float(name)
+    except ValueError:
+        return
+    raise InvalidArgument(f"{what}: expected a name, got {name!r}, which in a table would be a number")
 
 
 def _unlike(what: str, names: Sequence[str]) -> None:
@@ -208,6 +213,7 @@ class Study:
         training_min: minutes of the culture's clock that a training stands for.
         episodes: of each policy where no comparison says otherwise, and of controls.
         episodes_over_time: of each policy at every recording.
+        actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
         limit_resolution: steps of the grid of the best possible return, as a multiple; 0.6 is fast and rough.
         limit_episodes: episodes in which that controller's return is checked.
         algorithm: settings of `animat.training.sac.SAC` in place of its defaults.
@@ -228,6 +234,7 @@ class Study:
     training_min: float = 60.0
     episodes: int = 100
     episodes_over_time: int = 30
+    actions: Literal["most probable", "drawn"] = "most probable"
     limit_resolution: float = 1.0
     limit_episodes: int = 4000
     algorithm: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,48 @@
+"""Controls beside the trained policies: is it the culture that does the work?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from animat.report.style import BLACK, BLUE, draw_levels, grid_of_panels, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Controls:
+    """The mean returns with one mapping at one recording.
+
+    Attributes:
+        title: the mapping and the minute.
+        returns: name, mean return and its standard error (None: not known), the trained policies first.
+        limit: the best possible return; None where not known.
+    """
+
+    title: str
+    returns: tuple[tuple[str, float, float | None], ...]
+    limit: float | None = None
+
+
+def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
+    """A panel a mapping: mean returns with their standard errors, and the best possible return.
+
+    Args:
+        panels_of: on one robot.
+        title: of the whole figure.
+    """
+    most = max(len(controls.returns) for controls in panels_of)
+    figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)
+    for axes, controls in zip(panels, panels_of, strict=True):
+        for place, (_, mean, error) in enumerate(controls.returns):
+            colour = BLUE if place == 0 else BLACK
+            axes.errorbar([mean], [-place], xerr=[error or 0.0], fmt="o", markersize=4, color=colour, capsize=2)
+        axes.set_yticks([-i for i in range(len(controls.returns))], [name for name, _, _ in controls.returns])
+        axes.set_ylim(-len(controls.returns) + 0.4, 0.6)
+        draw_levels(axes, None, controls.limit, upright=True)
+        style_axes(axes, controls.title, "mean return and its standard error", "")
+        axes.grid(axis="y", linewidth=0.4, alpha=0.5)
+    return figure

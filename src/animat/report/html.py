@@ -1,0 +1,133 @@
+"""A report as one HTML file that needs no network: text, tables and figures, all inside."""
+
+from __future__ import annotations
+
+import base64
+import os
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from animat.errors import InvalidFile
+from animat.report.style import PNG_DPI
+from animat.writing import written_whole
+
+TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the page.
+
+    Attributes:
+        file: the PNG.
+        title: in a few words; also the text for those who cannot see it.
+        caption: what is to be seen in it.
+        beside: names of the same figure in other formats, relative to the page.
+    """
+
+    file: Path
+    title: str
+    caption: str
+    beside: tuple[str, ...] = ()
+
+    @property
+    def data(self) -> str:
+        """The PNG as a data address."""
+        return "data:image/png;base64," + base64.b64encode(self._bytes()).decode()
+
+    @property
+    def width_px(self) -> int:
+        """Width on the page: a hundred pixels an inch, so that text in figures is as large as text around them."""
+        # The first chunk of a PNG starts with the width.
+        (width,) = struct.unpack(">I", self._bytes()[16:20])
+        return int(width * 100 // PNG_DPI)
+
+    def _bytes(self) -> bytes:
+        try:
+            return self.file.read_bytes()
+        except OSError as error:
+            raise InvalidFile(f"{self.file}: expected a figure, got none: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page.
+
+    Attributes:
+        title: above it.
+        head: names of the columns.
+        rows: cells: text, numbers (written with four digits) or None (written as a dash).
+        note: under it.
+        beside: the file that holds all digits, relative to the page.
+        marked: rows that stand out, by index.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    note: str = ""
+    beside: str = ""
+    marked: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page: paragraphs, then points of a list, then tables, then figures."""
+
+    title: str
+    paragraphs: tuple[str, ...] = ()
+    points: tuple[tuple[str, str], ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+
+    @property
+    def anchor(self) -> str:
+        """Its address on the page."""
+        return "".join(letter if letter.isalnum() else "-" for letter in self.title.lower())
+
+
+def write_page(
+    path: str | os.PathLike[str], title: str, lead: str, sections: Sequence[Section], colophon: Sequence[str]
+) -> Path:
+    """Write the page, complete or absent.
+
+    Args:
+        path: the file.
+        title: of the page.
+        lead: under the title.
+        sections: in their order; each has an entry in the list of contents.
+        colophon: lines at the end: versions, seeds.
+
+    Raises:
+        InvalidFile: if a figure cannot be read or the page cannot be written.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("animat.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["cell"] = cell
+    text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
+    path = Path(path)
+    with written_whole(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+    return path
+
+
+def cell(value: Any) -> str:
+    """A cell as text: numbers with four digits at most, a dash for None."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if value == int(value) and abs(value) < 1e6:
+        return f"{int(value)}"
+    written = f"{value:.4g}" if abs(value) < 0.01 or abs(value) >= 1000 else f"{value:.3g}"
+    return written.replace("-", "−", 1) if value < 0 else written

@@ -1,0 +1,73 @@
+"""Learning curves: the return of the episodes that ended in each part of training, over the policies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.report.style import BLUE, GREY, add_legend, draw_levels, grid_of_panels, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class LearningCurve:
+    """One condition's.
+
+    Attributes:
+        name: the condition.
+        iterations: done at the end of each part of training, shape (parts,).
+        returns: mean return of the episodes that ended in it, NaN where none did, shape (policies, parts).
+        random, limit: of random actions and the best possible, at the start of training; None where not known.
+    """
+
+    name: str
+    iterations: Float64[np.ndarray, " parts"]
+    returns: Float64[np.ndarray, "policies parts"]
+    random: float | None = None
+    limit: float | None = None
+
+
+def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
+    """A panel a condition: every policy thin, their mean with its 95 % bootstrap interval, random and the limit.
+
+    Args:
+        curves: of one robot.
+        title: of the whole figure.
+    """
+    figure, panels = grid_of_panels(len(curves), 3, 3.1, 2.4, title, share_x=True, share_y=True)
+    for axes, curve in zip(panels, curves, strict=True):
+        x = curve.iterations / 1000
+        for of_policy in curve.returns:
+            axes.plot(x, of_policy, color=GREY, linewidth=0.5, alpha=0.6)
+        mean, low, high = _mean_with_interval(curve.returns)
+        axes.fill_between(x, low, high, color=BLUE, alpha=0.3, linewidth=0, label="95 % interval of the mean")
+        axes.plot(x, mean, color=BLUE, linewidth=1.5, label="mean of the policies")
+        draw_levels(axes, curve.random, curve.limit)
+        style_axes(axes, curve.name, "iterations (thousands)", "return")
+        axes.set_xlim(0, None)
+    add_legend(panels[0], loc="lower right")
+    return figure
+
+
+def _mean_with_interval(
+    returns: Float64[np.ndarray, "policies parts"],
+) -> tuple[Float64[np.ndarray, " parts"], Float64[np.ndarray, " parts"], Float64[np.ndarray, " parts"]]:
+    """Policies are drawn again with the same luck in all parts, as each is one sample."""
+    known = np.isfinite(returns)
+    filled = np.where(known, returns, 0.0)
+    often = np.random.default_rng(0).multinomial(len(returns), np.full(len(returns), 1 / len(returns)), _RESAMPLES)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = filled.sum(axis=0) / known.sum(axis=0)
+        resampled = (often @ filled) / (often @ known)
+    some = np.isfinite(resampled)
+    # A part in which no episode of the drawn policies ended says nothing; the mean stands for it.
+    low, high = np.quantile(np.where(some, resampled, mean), [0.025, 0.975], axis=0)
+    return mean, low, high

@@ -1,0 +1,188 @@
+"""Evaluation as jobs: a condition's policies on one robot, and the controls that ask whether the culture does it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import jax.numpy as jnp
+
+from animat.animat import Animat, Environment
+from animat.evaluation.hand_made import hand_made
+from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, networks_of, roll_out
+from animat.neurons.simulator import NeuronSimulator, silenced
+from animat.neurons.timeline import SimulatorTimeline
+from animat.studies.jobs import Report, Task
+from animat.studies.paths import record_paths
+from animat.studies.places import TIMELINE, episodes_file, policies_folder, write_table
+from animat.studies.simulating import load_timeline
+from animat.studies.specification import Body, Condition, Study
+from animat.studies.training import training_of
+from animat.training.policy import Policy
+
+HEAD = ("at_min", "actor", "episode", "return", "iterations", "ended")
+
+
+@final
+@dataclass(frozen=True)
+class Evaluate(Task):
+    """Run a condition's policies at the minutes of its comparisons, at every recording, and once for their paths."""
+
+    body: Body
+    condition: Condition
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        setting = setting_of(study, self.body, self.condition, timeline)
+        networks = _networks(study, folder, self.body, self.condition)
+        robot, slug, n = self.body.name, self.condition.slug, study.policies
+        rows: list[tuple[Any, ...]] = []
+        for at_min, episodes in study.minutes_of(self.condition, last_minute(timeline)).items():
+            seed = draw_seed(study.seed, robot, slug, at_min)
+            rows += _rows(at_min, setting.run(networks, n, at_min, episodes, seed), [f"p{i}" for i in range(n)])
+        files = [write_table(episodes_file(folder, robot, slug), HEAD, rows)]
+        if self.condition.through_neurons and timeline is not None:
+            over_time = []
+            for i, at_min in enumerate(timeline.start_min.tolist()):
+                report(i / len(timeline), "over time")
+                seed = draw_seed(study.seed, robot, slug, at_min, "over time")
+                means = setting.run(networks, n, at_min, study.episodes_over_time, seed).returns.mean(axis=1)
+                over_time += [(at_min, f"p{i}", mean) for i, mean in enumerate(means.tolist())]
+            path = episodes_file(folder, robot, f"{slug}-over-time")
+            files.append(write_table(path, ("at_min", "actor", "mean_return"), over_time))
+        return [*files, self._paths(study, folder, setting, networks, last_minute(timeline))]
+
+    def _paths(self, study: Study, folder: Path, setting: Setting, networks: Networks, at_min: float) -> Path:
+        seed = draw_seed(study.seed, self.body.name, self.condition.slug, at_min, "paths")
+        paths = record_paths(setting.environment, setting.simulator(at_min), networks, study.policies, seed)
+        rows = [
+            (f"p{actor}", i, *paths.observations[actor, i].tolist(), paths.commands[actor, i - 1].item() if i else None)
+            for actor, length in enumerate(paths.lengths.tolist())
+            for i in range(length + 1)
+        ]
+        head = ("actor", "iteration", *(q.name for q in setting.environment.robot.quantities), "command")
+        return write_table(episodes_file(folder, self.body.name, f"{self.condition.slug}-paths"), head, rows)
+
+
+@final
+@dataclass(frozen=True)
+class Control(Task):
+    """Run the controls of a mapping on a robot: random, constant, made by hand; and silent and shuffled with policies.
+
+    Attributes:
+        plain: condition that gives the mapping; the one whose policies are used, if it is trained as usual.
+    """
+
+    body: Body
+    plain: Condition
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        condition, robot = replace(self.plain, delivery="chosen"), self.body.name
+        setting = setting_of(study, self.body, condition, timeline)
+        name = f"controls-{condition.mapping}" + ("-held" if condition.percentiles == "first" else "")
+        networks = _networks(study, folder, self.body, self.plain) if is_usual(self.plain) else None
+        rows: list[tuple[Any, ...]] = []
+        minutes = study.limit_minutes(last_minute(timeline)) if condition.through_neurons else [last_minute(timeline)]
+        for i, at_min in enumerate(minutes):
+            report(i / len(minutes), f"at {at_min:g} min")
+            for control, actor, n, of in self._controls(setting, networks, at_min, study.policies):
+                seed = draw_seed(study.seed, robot, name, at_min, control)
+                ran = of.run(actor, n, at_min, study.episodes, seed)
+                rows += [(control, *row) for row in _rows(at_min, ran, [f"p{i}" if n > 1 else "" for i in range(n)])]
+        files = [write_table(episodes_file(folder, robot, name), ("control", *HEAD), rows)]
+        if timeline is not None and condition.through_neurons:
+            over_time = []
+            for at_min in timeline.start_min.tolist():
+                seed = draw_seed(study.seed, robot, name, at_min, "over time")
+                random = setting.run(Uniform(), 1, at_min, study.episodes, seed)
+                over_time.append((at_min, random.returns.mean().item()))
+            path = episodes_file(folder, robot, f"{name}-over-time")
+            files.append(write_table(path, ("at_min", "random"), over_time))
+        return files
+
+    def _controls(
+        self, setting: Setting, networks: Networks | None, at_min: float, n: int
+    ) -> list[tuple[str, Actor, int, Setting]]:
+        environment, simulator = setting.environment, setting.simulator(at_min)
+        controls: list[tuple[str, Actor, int, Setting]] = [("random", Uniform(), 1, setting)]
+        for i in range(environment.n_actions or 0):
+            controls.append((f"constant {setting.action_labels[i]}", Constant(jnp.array([i])), 1, setting))
+        controls.append(("made by hand", hand_made(environment, simulator), 1, setting))
+        if networks is not None and isinstance(environment, Animat):
+            controls.append(("silent", networks, n, replace(setting, silent=True)))
+            shuffled = replace(environment, delivery="shuffled")
+            controls.append(("shuffled", networks, n, replace(setting, environment=shuffled)))
+        return controls
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What policies are run in: an environment, and the neurons of every minute.
+
+    Attributes:
+        timeline: None without neurons.
+        action_labels: of discrete actions.
+        silent: whether the culture always answers 0.
+    """
+
+    environment: Environment[Any]
+    timeline: SimulatorTimeline | None
+    action_labels: tuple[str, ...]
+    silent: bool = False
+
+    def simulator(self, at_min: float) -> NeuronSimulator | None:
+        """The neurons at a minute."""
+        if self.timeline is None:
+            return None
+        simulator = self.timeline.at(at_min)
+        return silenced(simulator) if self.silent else simulator
+
+    def run(self, actor: Actor, n: int, at_min: float, episodes: int, seed: int) -> Episodes:
+        """Episodes at a minute."""
+        return roll_out(self.environment, self.simulator(at_min), actor, n, episodes=episodes, seed=seed)
+
+
+def setting_of(study: Study, body: Body, condition: Condition, timeline: SimulatorTimeline | None) -> Setting:
+    """What a condition's policies are evaluated in."""
+    training = training_of(study, body, condition)
+    if not condition.through_neurons or timeline is None:
+        labels = tuple(f"{command:+g}" for command in training.commands or ())
+        return Setting(training.environment(0), None, labels)
+    if condition.percentiles == "first":
+        timeline = timeline.with_first_percentiles()
+    labels = tuple(each.label for each in timeline.conditions)
+    return Setting(training.environment(len(timeline.conditions)), timeline, labels)
+
+
+def is_usual(condition: Condition) -> bool:
+    """Whether its policies are trained, and get what they choose."""
+    return condition.trained and condition.delivery == "chosen" and condition.through_neurons
+
+
+def last_minute(timeline: SimulatorTimeline | None) -> float:
+    """Of the recordings; 0 without any."""
+    return 0.0 if timeline is None else float(timeline.start_min[-1])
+
+
+def draw_seed(*names: object) -> int:
+    """A seed of its own for every set of episodes, so that no two conditions share their luck."""
+    return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
+
+
+def _networks(study: Study, folder: Path, body: Body, condition: Condition) -> Networks:
+    out = policies_folder(folder, body, condition)
+    policies = [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
+    return networks_of(policies, greedy=study.actions == "most probable")
+
+
+def _rows(at_min: float, ran: Episodes, actors: list[str]) -> list[tuple[Any, ...]]:
+    return [
+        (at_min, actor, episode, return_, length, int(ended))
+        for actor, returns, lengths, terminated in zip(
+            actors, ran.returns.tolist(), ran.lengths.tolist(), ran.terminated.tolist(), strict=True
+        )
+        for episode, (return_, length, ended) in enumerate(zip(returns, lengths, terminated, strict=True))
+    ]

@@ -1,0 +1,61 @@
+"""Single episodes with all that happened in them, for pictures and tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int64
+
+from animat.animat import Environment
+from animat.evaluation.rollouts import Actor
+from animat.neurons.simulator import NeuronSimulator
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """One episode of each of several actors.
+
+    Attributes:
+        observations: before each iteration and after the last, shape (actors, iterations + 1, observations).
+        commands: u of each iteration, shape (actors, iterations).
+        lengths: iterations of each episode; what comes after them means nothing, shape (actors,).
+    """
+
+    observations: Float[np.ndarray, "actors iterations+1 observations"]
+    commands: Float[np.ndarray, "actors iterations"]
+    lengths: Int64[np.ndarray, " actors"]
+
+
+def record_paths(
+    environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, n_actors: int, seed: int
+) -> Paths:
+    """Run one episode of each actor; arguments as in `animat.evaluation.rollouts.roll_out`."""
+    keys = jax.random.split(jax.random.key(seed), n_actors)
+    observations, commands, lengths = _record(environment, simulator, actors, keys)
+    return Paths(np.asarray(observations), np.asarray(commands), np.asarray(lengths, np.int64))
+
+
+@partial(jax.jit, static_argnums=0)
+def _record(environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, keys: Any) -> Any:
+    def one_actor(actor: Actor, key: Any) -> Any:
+        def iteration(carry: Any, key: Any) -> Any:
+            state, going = carry
+            uniforms = jax.random.uniform(key, (environment.noise_size + 1,))
+            observation = environment.observe(state)
+            action = actor.act(environment, (observation / environment.scales)[None], uniforms[:1])[0]
+            outcome = environment.advance(uniforms[1:], state, action, simulator)
+            still = going & ~(outcome.terminated | outcome.truncated)
+            return (outcome.state, still), (environment.observe(outcome.state), outcome.command, going)
+
+        start, key = jax.random.split(key)
+        state = environment.reset(start)
+        keys = jax.random.split(key, environment.robot.episode_limit)
+        _, (after, commands, going) = jax.lax.scan(iteration, (state, jnp.bool_(True)), keys)
+        return jnp.concatenate([environment.observe(state)[None], after]), commands, going.sum()
+
+    return jax.vmap(one_actor)(actors, keys)

@@ -1,0 +1,70 @@
+"""Where everything lies in a study's folder, and its tables as CSV files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from animat.errors import InvalidFile
+from animat.studies.specification import Body, Condition
+from animat.writing import written_whole
+
+RECORDINGS = "recordings"
+TIMELINE = "simulators/timeline.safetensors"
+RESPONSES = "simulators/responses.csv"
+REPORT = "report.html"
+UNFINISHED = ".unfinished"
+"""For checkpoints; gone when the study is finished."""
+
+
+def policies_folder(folder: Path, body: Body, condition: Condition) -> Path:
+    """Of the policies of a condition on a robot."""
+    return folder / "policies" / body.name / condition.slug
+
+
+def episodes_file(folder: Path, robot: str, what: str) -> Path:
+    """A table of episodes on a robot: of a condition, its paths or means over time, or of controls."""
+    return folder / "episodes" / robot / f"{what}.csv"
+
+
+def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:
+    """The best possible returns on a robot."""
+    return folder / "limits" / f"{robot}-{what}.csv"
+
+
+def table_file(folder: Path, name: str) -> Path:
+    """A table of results."""
+    return folder / "tables" / f"{name}.csv"
+
+
+def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
+    """Write a CSV file, complete or absent; numbers with all their digits, None as nothing."""
+    with written_whole(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(rows)
+    return path
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """Read what `write_table` wrote: numbers as float where they are some, nothing as None, else text.
+
+    Raises:
+        InvalidFile: if it cannot be read.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [{name: _cell(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InvalidFile(f"{path}: expected a table of the study, got a file that cannot be read: {error}") from error
+
+
+def _cell(cell: str) -> Any:
+    if not cell:
+        return None
+    try:
+        return float(cell)
+    except ValueError:
+        return cell

@@ -1,0 +1,86 @@
+"""The study's recordings: of a culture that is recorded for it, or copies of files at hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from animat.cultures.series import record_virtual_series, recording_name
+from animat.studies.folder import source_files
+from animat.studies.identity import settle_identity
+from animat.studies.jobs import Report, Task
+from animat.studies.places import RECORDINGS
+from animat.studies.specification import Study
+
+
+@final
+@dataclass(frozen=True)
+class Record(Task):
+    """Make the recordings, as NWB.
+
+    Attributes:
+        base: what a specification's file names are relative to.
+    """
+
+    base: Path
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        out = folder / RECORDINGS
+        files = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[study.culture.kind](
+            study, out, _Told(report)
+        )
+        for file in files:
+            settle_identity(file)
+        return sorted(file for file in out.iterdir() if not file.name.startswith("."))
+
+    def _copies(self, study: Study, out: Path, progress: _Told) -> list[Path]:
+        from animat.recordings.reading import read_recordings
+
+        copies = []
+        recordings = read_recordings(source_files(study, self.base))
+        for i, recording in enumerate(recordings):
+            copies.append(out / recording_name(recording.start_min))
+            recording.save(copies[-1])
+            progress.update(i + 1, len(recordings))
+        return copies
+
+
+def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
+    from animat.cultures.virtual import VirtualCulture
+    from animat.recordings.protocol import Protocol
+
+    culture = study.culture
+    return record_virtual_series(
+        lambda: VirtualCulture(culture.seed),
+        Protocol(order=culture.order, pulses=culture.pulses, presentations=culture.presentations),
+        out,
+        sessions=culture.sessions,
+        interval_min=culture.interval_min,
+        progress=progress,
+    )
+
+
+def _made_up(study: Study, out: Path, progress: _Told) -> list[Path]:
+    from animat.recordings.made_up import write_made_up_series
+
+    culture = study.culture
+    return write_made_up_series(
+        culture.seed,
+        out,
+        sessions=culture.sessions,
+        interval_min=culture.interval_min,
+        progress=progress,
+        patterns=culture.presentations,
+        channels=culture.channels,
+    )
+
+
+class _Told:
+    """A progress that reports."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        self._report(done / total, note)

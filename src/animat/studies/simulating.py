@@ -1,0 +1,127 @@
+"""The study's neuron simulators: fitted once, kept in a file that holds no code and needs no recordings."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from animat.errors import AnimatError, InvalidFile
+from animat.neurons.conditions import Condition as Stimulus
+from animat.neurons.conditions import conditions_named
+from animat.neurons.fidelity import Fidelity
+from animat.neurons.responses import Responses
+from animat.neurons.series import extract_series
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
+from animat.recordings.reading import read_recordings
+from animat.studies.jobs import Report, Task
+from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE, write_table
+from animat.studies.specification import Study
+from animat.writing import written_whole
+
+_KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator)}
+
+
+@final
+@dataclass(frozen=True)
+class Fit(Task):
+    """Read the responses of all recordings and fit a simulator to each."""
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        series = read_series(study, folder)
+        settings = study.simulators
+        timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+        save_timeline(timeline, folder / TIMELINE)
+        rows = (
+            (responses.start_min, responses.conditions[c].label, x, ratio, int(burst))
+            for responses in series
+            for c, x, ratio, burst in zip(
+                responses.condition.tolist(),
+                responses.rate_hz.tolist(),
+                responses.active_ratio.tolist(),
+                responses.is_burst.tolist(),
+                strict=True,
+            )
+        )
+        head = ("start_min", "condition", "rate_hz", "active_ratio", "is_burst")
+        return [folder / TIMELINE, write_table(folder / RESPONSES, head, rows)]
+
+
+def read_series(study: Study, folder: Path) -> list[Responses]:
+    """The responses of the study's recordings, in the order of time."""
+    settings = study.simulators
+    return extract_series(
+        read_recordings(folder / RECORDINGS),
+        conditions_named(settings.conditions) if settings.conditions else None,
+        settings.window_ms,
+        burst_threshold=settings.burst_threshold,
+        despite=settings.despite,
+    )
+
+
+def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
+    """Write the simulators as safetensors, with all that is no array as JSON in the metadata; the same bytes always.
+
+    Raises:
+        InvalidFile: if it cannot be written.
+    """
+    from safetensors.numpy import save
+
+    simulators = timeline.simulators
+    names = [field.name for field in fields(simulators)]  # type: ignore[arg-type]
+    arrays = {name: np.ascontiguousarray(getattr(simulators, name)) for name in names}
+    told = {
+        "kind": type(simulators).__name__,
+        "start_min": timeline.start_min.tolist(),
+        "conditions": [asdict(condition) for condition in timeline.conditions],
+        "window_ms": timeline.window_ms,
+        "presentation": None if timeline.presentation is None else asdict(timeline.presentation),
+        "in_data": [kept.in_data.tolist() for kept in timeline.fidelities],
+        "in_simulator": [kept.in_simulator.tolist() for kept in timeline.fidelities],
+        "n_above_range": [kept.n_above_range for kept in timeline.fidelities],
+        "findings": [asdict(finding) for finding in timeline.findings],
+    }
+    with written_whole(path) as beside:
+        beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
+
+
+def load_timeline(path: Path) -> SimulatorTimeline:
+    """Read what `save_timeline` wrote; its arrays are numpy's.
+
+    Raises:
+        InvalidFile: if it cannot be read.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        data = path.read_bytes()
+        told: dict[str, Any] = json.loads(_metadata(data)["animat"])
+        conditions = tuple(Stimulus(**each) for each in told["conditions"])
+        labels = tuple(condition.label for condition in conditions)
+        presentation = told["presentation"]
+        kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
+        return SimulatorTimeline(
+            simulators=_KINDS[told["kind"]](**load(data)),  # type: ignore[arg-type]
+            start_min=np.array(told["start_min"], np.float64),
+            conditions=conditions,
+            window_ms=tuple(told["window_ms"]),
+            presentation=None if presentation is None else Presentation(**presentation),
+            fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n) for a, b, n in kept),
+            findings=tuple(Finding(**each) for each in told["findings"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:
+        raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    (length,) = struct.unpack("<Q", data[:8])
+    metadata: dict[str, str] = json.loads(data[8 : 8 + length])["__metadata__"]
+    return metadata

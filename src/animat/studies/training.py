@@ -1,0 +1,76 @@
+"""Training as jobs: each a group of one condition's policies on one robot, with its checkpoint in the folder."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from animat.mapping import mapping_named
+from animat.neurons.timeline import SimulatorTimeline
+from animat.studies.jobs import Report, Task
+from animat.studies.places import TIMELINE, UNFINISHED, policies_folder
+from animat.studies.simulating import load_timeline
+from animat.studies.specification import Body, Condition, Study
+from animat.training.group import Group, train_group, untrained_policies
+from animat.training.sac import SAC
+from animat.training.specification import CHUNKS, Training
+from animat.training.trainer import MANIFEST, describe
+from animat.writing import written_whole
+
+
+@final
+@dataclass(frozen=True)
+class TrainGroup(Task):
+    """Train some policies of a condition on a robot, going on from where a killed run stopped."""
+
+    body: Body
+    condition: Condition
+    members: tuple[int, ...]
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        timeline = timeline_for(self.condition, folder)
+        training = training_of(study, self.body, self.condition)
+        manifest = describe(training, timeline)
+        out = policies_folder(folder, self.body, self.condition)
+        provenance = {key: value for key, value in manifest.items() if key != "sources"}
+        group = Group(training, self.members, timeline, manifest["fingerprint"], provenance)
+        checkpoint = folder / UNFINISHED / f"{self.body.name}-{self.condition.slug}-p{self.members[0]}.npz"
+
+        def told(done: int, mean_return: float) -> None:
+            report(done / CHUNKS, "" if math.isnan(mean_return) else f"return {mean_return:.1f}")
+
+        policies = train_group(group, checkpoint, told) if self.condition.trained else untrained_policies(group)
+        files = [out / f"p{member}.safetensors" for member in self.members]
+        for file, policy in zip(files, policies, strict=True):
+            policy.save(file)
+        with written_whole(out / MANIFEST) as beside:
+            beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+        checkpoint.unlink(missing_ok=True)
+        return [*files, out / MANIFEST]
+
+
+def training_of(study: Study, body: Body, condition: Condition) -> Training:
+    """What a condition means for the trainer."""
+    through_neurons = condition.through_neurons
+    return Training(
+        robot=body.robot(),
+        mapping=mapping_named(condition.mapping) if through_neurons else None,
+        policies=study.policies,
+        iterations=body.trained_for,
+        seed=study.seed,
+        shadowing=condition.shadowing,
+        duration_min=study.training_min,
+        percentiles=condition.percentiles,
+        delivery=condition.delivery,
+        # The paper's baselines: pushes to either side; any turn.
+        commands=(-1.0, 1.0) if not through_neurons and body.name == "cartpole" else None,
+        algorithm=SAC(**study.algorithm),  # type: ignore[arg-type]
+    )
+
+
+def timeline_for(condition: Condition, folder: Path) -> SimulatorTimeline | None:
+    """The study's simulators, for a condition that has neurons."""
+    return load_timeline(folder / TIMELINE) if condition.through_neurons else None
