@@ -99,8 +99,9 @@ class Delivery:
     def _hand_over(self, stimulus: Stimulus, frame: int) -> int:
         """Give one stimulus to the device, at a frame or as soon after it as can be; returns the frame."""
         soonest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
-        at_s = self._pace.soonest([replace(stimulus, time_s=0.0)], max(frame, soonest) / FRAMES_PER_S)
-        frame = round(at_s * FRAMES_PER_S)
+        alone = [replace(stimulus, time_s=0.0)]
+        frame = round(self._pace.soonest(alone, max(frame, soonest) / FRAMES_PER_S) * FRAMES_PER_S)
+        self._pace.count(alone, frame / FRAMES_PER_S)
         plan = self._neurons.create_stim_plan()
         plan.stim(self._cl.ChannelSet(*stimulus.electrodes), self._design(stimulus.pulse), lead_time_us=LEAD_US)
         plan.run(at_timestamp=frame - LEAD_FRAMES)

@@ -32,7 +32,7 @@ class Pace:
         self._guard = Guard(limits, sites)
 
     def soonest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
-        """The soonest time from `from_s` on, on the device's clock, at which the stimuli may begin; they then count.
+        """The soonest time from `from_s` on, on the device's clock, at which the stimuli may begin.
 
         Args:
             stimuli: with times counted from their beginning.
@@ -44,13 +44,21 @@ class Pace:
         waited_s = 0.0
         while True:
             try:
-                self._guard.admit(stimuli, from_s + waited_s)
+                self._guard.check(stimuli, from_s + waited_s)
             except UnsafeStimulus as error:
                 if error.limit not in _PACE or waited_s >= PATIENCE_S:
                     raise
                 waited_s += LATER_S
             else:
                 return from_s + waited_s
+
+    def count(self, stimuli: Sequence[Stimulus], at_s: float) -> None:
+        """Remember stimuli as delivered, at the soonest time or later.
+
+        Raises:
+            UnsafeStimulus: for a time at which they may not begin.
+        """
+        self._guard.admit(stimuli, at_s)
 
 
 def from_zero(stimuli: Sequence[Stimulus]) -> list[Stimulus]:

@@ -36,7 +36,7 @@ class Limits:
         alternates: whether phases that follow each other must differ in sign.
         phase_step_us: phases last whole multiples of it; 0: any time.
         amplitude_step: what the device rounds amplitudes to, 0 where it does not: the charges of the *rounded* phases
-            are what `charge_per_phase` and `net_charge` hold for.
+            are what `charge_per_phase` and `net_charge` hold for. It is the device's, whatever is asked for.
         interval_us: least time from the start of a stimulus to the start of the next one on the same electrode.
         gap_us: least time from the end of a stimulus to the start of the next one, on whatever electrodes.
 
@@ -89,8 +89,6 @@ class Limits:
         looser += [name for name in _LEAST if getattr(self, name) < getattr(device, name)]
         looser += ["alternates"] * (device.alternates and not self.alternates)
         looser += ["phase_step_us"] * (not _is_multiple(self.phase_step_us, device.phase_step_us))
-        # What the device rounds to is no matter of wishes.
-        looser += ["amplitude_step"] * (self.amplitude_step != device.amplitude_step)
         if looser:
             raise InvalidArgument(
                 f"limits.{looser[0]}: expected no looser than the device's {getattr(device, looser[0])}, got "

@@ -1,0 +1,300 @@
+"""A culture on a MaxWell MaxOne, through the vendor's module `maxlab`, which comes with MaxLab Live."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Int64
+
+from animat.cultures.base import Culture
+from animat.cultures.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
+from animat.cultures.maxone_stream import SpikeStream, ZmqSpikes
+from animat.cultures.maxone_wiring import Wiring, wire
+from animat.cultures.observed import Observed, Spikes
+from animat.cultures.pace import Pace, from_zero
+from animat.cultures.safety import Admitted, Limits
+from animat.errors import AnimatError, DeviceFailed, InvalidArgument
+from animat.recordings.recording import UNKNOWN, Channels
+from animat.recordings.selection import Selection
+from animat.recordings.stimulus import Stimulus
+
+DAC_STEPS = 511
+"""Codes on either side of 0 V."""
+
+MAXONE_LIMITS = Limits(
+    kind="voltage",
+    amplitude=400.0,
+    phase_us=(SAMPLE_US, 1000.0),
+    charge_per_phase=200.0,
+    # In what the converter makes of it; what is left is rounding.
+    net_charge=1e-6,
+    electrodes_at_once=32,
+    stimuli_per_electrode_s=100,
+    stimuli_per_s=200,
+    stimuli_per_session=1_000_000,
+    phases_per_pulse=4,
+    alternates=True,
+    phase_step_us=SAMPLE_US,
+    interval_us=10_000.0,
+    gap_us=1_000.0,
+)
+"""Ours, not the vendor's, whose converter would give 1.5 V: for a living culture, up to twice the paper's pulse.
+`amplitude_step` is the converter's, asked from the device when it is opened."""
+
+
+class MaxOneCulture(Culture):
+    """A culture on a MaxOne: electrodes as selected, one stimulation unit each, all driven by one converter.
+
+    Opening routes the array and refuses, by name, every stimulation electrode that was not routed, got no unit, or
+    shares one with another. Recording electrodes that were not routed are left out and counted. A stimulus powers and
+    connects the units of its electrodes for as long as its pulse lasts. Each pattern with its pulse is kept on
+    the device as a sequence; stimuli that follow each other within `sequence_s` are one sequence, in which times
+    are exact (50 us). When a sequence starts is the computer's doing: `stimulus_time_s` is estimated from the newest
+    frame when the server had taken it. `stop` takes the power from all units.
+
+    Never run on a device: `docs/hardware.md` says what was tested against what.
+
+    Args:
+        selection: electrodes to record, to stimulate, and the patterns.
+        stream: where spikes come from; None: the vendor's server, through ZeroMQ.
+        sequence_s: the longest time that one sequence spans.
+        settle: whether to wait as long as the vendor says after each step of opening.
+        limits: tighter limits than `MAXONE_LIMITS`.
+
+    Raises:
+        InvalidArgument: for a selection on another array, or without sites.
+    """
+
+    name: ClassVar[str] = "maxone"
+
+    def __init__(
+        self,
+        selection: Selection,
+        *,
+        stream: SpikeStream | None = None,
+        sequence_s: float = 1.0,
+        settle: bool = True,
+        limits: Limits | None = None,
+    ) -> None:
+        super().__init__(limits)
+        array = selection.array
+        if (array.columns, array.rows) != (220, 120):
+            raise InvalidArgument(f"selection: expected one on a MaxOne, got one on a {array.name}")
+        if not len(selection.recording) or not 1 <= len(selection.stimulation) <= array.stimulation_units:
+            raise InvalidArgument(
+                f"selection: expected recording sites and 1 to {array.stimulation_units} stimulation sites, got "
+                f"{len(selection.recording)} and {len(selection.stimulation)}"
+            )
+        if not 0 < sequence_s <= 60:
+            raise InvalidArgument(f"sequence_s: expected above 0 to 60 s, got {sequence_s}")
+        self.selection = selection
+        self._given_stream, self._sequence_s, self._settle = stream, sequence_s, settle
+        self._mx: ModuleType | None = None
+        self._stream: SpikeStream | None = None
+        self._wiring: Wiring | None = None
+        self._sequences: Sequences | None = None
+        self._pace: Pace | None = None
+        self._lsb_mv = 0.0
+        self._zero_frame = 0
+        self._is_halted = False
+        self.spikes_not_recorded = 0
+        """Spikes that the device reported on amplifiers that no recording electrode is routed to; left out."""
+
+    @property
+    def channels(self) -> Channels:
+        """The recording electrodes that were routed; a label is the amplifier's number."""
+        return self._wired().channels
+
+    @property
+    def not_routed(self) -> tuple[int, ...]:
+        """Recording electrodes that were asked for and not routed."""
+        return self._wired().not_routed
+
+    @property
+    def stimulation_electrodes(self) -> tuple[int, ...]:
+        """Those of the selection: all of them are connected, or the culture does not open."""
+        return tuple(self.selection.stimulation.tolist())
+
+    @property
+    def patterns(self) -> Int64[np.ndarray, "patterns size"]:
+        """Those of the selection."""
+        return self.selection.patterns
+
+    @property
+    def device_limits(self) -> Limits:
+        """`MAXONE_LIMITS` with the device's own step of voltage, once it is open."""
+        reach_mv = DAC_STEPS * self._lsb_mv or MAXONE_LIMITS.amplitude
+        return replace(MAXONE_LIMITS, amplitude=min(MAXONE_LIMITS.amplitude, reach_mv), amplitude_step=self._lsb_mv)
+
+    @property
+    def now_s(self) -> float:
+        """Frames since it was opened, by the newest one that came."""
+        return (self._streaming().frame() - self._zero_frame) / FRAMES_PER_S
+
+    @property
+    def sampling_rate_hz(self) -> float:
+        """20 kHz."""
+        return float(FRAMES_PER_S)
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """How it was wired."""
+        wiring = self._wired()
+        units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
+        return {
+            "source": "MaxOne by animat.cultures.maxone",
+            "dac_lsb_mv": str(self._lsb_mv),
+            "stimulation_units": units,
+            "not_routed": " ".join(map(str, wiring.not_routed)),
+            "stimulus_times": "estimated: the newest frame when the server had taken the sequence, and its delay",
+        }
+
+    def _open(self) -> None:
+        self._mx = mx = _vendor()
+        self._is_halted = False
+        self.spikes_not_recorded = 0
+        try:
+            mx.initialize()
+            if (reply := mx.send(mx.Core().enable_stimulation_power(True))) != "Ok":
+                raise DeviceFailed(f"MaxOne: expected stimulation power to be switched on, got {reply!r}")
+            self._wait("waitInit")
+            self._lsb_mv = _step_mv(mx.query_DAC_lsb_mV())
+            if self._asked_limits is not None:
+                self._asked_limits = replace(self._asked_limits, amplitude_step=self._lsb_mv)
+                self._asked_limits.check_within(self.device_limits)
+            self._wiring = wire(mx, self.selection, wait=self._wait)
+            self._sequences = Sequences(mx, self._wiring.unit_of, self._lsb_mv)
+            self._stream = self._given_stream or ZmqSpikes()
+            self._stream.start()
+        except AnimatError:
+            raise
+        except Exception as error:
+            raise DeviceFailed(
+                f"MaxOne: expected a device to open, got {type(error).__name__}: {' '.join(str(error).split())}: is "
+                "MaxLab Live's server running?"
+            ) from error
+        self._zero_frame = self._stream.frame()
+        self._pace = Pace(self.limits, self.stimulation_electrodes)
+
+    def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        stream, sequences, pace = self._streaming(), self._sequences, self._pace
+        assert sequences is not None and pace is not None
+        groups = _groups(admitted.stimuli, self._sequence_s)
+        made = [sequences.of(group) for group in groups]
+        start, late = stream.frame(), 0
+        begun: list[int] = []
+        for group, sequence in zip(groups, made, strict=True):
+            asked = start + round(group[0].time_s * FRAMES_PER_S) + late
+            relative = from_zero(group)
+            stream.wait(asked - INITIAL_DELAY)
+            soonest = max(asked, stream.frame() + INITIAL_DELAY)
+            soonest = round(pace.soonest(relative, soonest / FRAMES_PER_S) * FRAMES_PER_S)
+            stream.wait(soonest - INITIAL_DELAY)
+            if self._is_halted:
+                raise DeviceFailed(
+                    f"MaxOne: stopped while delivering: {len(begun)} of {len(admitted.stimuli)} stimuli had been sent, "
+                    "and the units have no power"
+                )
+            sequence.send()
+            # The pulse waits for the initial delay from when the server took the command: about now.
+            first = stream.frame() + INITIAL_DELAY
+            pace.count(relative, first / FRAMES_PER_S)
+            offsets = [round(stimulus.time_s * FRAMES_PER_S) for stimulus in relative]
+            begun += [first + offset for offset in offsets]
+            late += first - asked
+            # Two sequences at once would drive the same converter.
+            stream.wait(begun[-1] + round(group[-1].pulse.duration_us / SAMPLE_US))
+        if self._is_halted and admitted.stimuli:
+            raise DeviceFailed("MaxOne: stopped while delivering: the units have no power, so pulses may not have come")
+        stop = max(start + int(np.ceil(duration_s * FRAMES_PER_S)) + late, stream.frame() if duration_s else start)
+        stream.wait(stop)
+        frames, amplifiers = stream.take(start, stop)
+        row = self._wired().row_of[amplifiers]
+        self.spikes_not_recorded += int(np.count_nonzero(row == UNKNOWN))
+        frames, row = frames[row != UNKNOWN], row[row != UNKNOWN]
+        order = np.lexsort((row, frames))
+        return Observed(
+            start_s=(start - self._zero_frame) / FRAMES_PER_S,
+            duration_s=(stop - start) / FRAMES_PER_S,
+            spikes=Spikes((frames[order] - start) / FRAMES_PER_S, row[order]),
+            stimulus_time_s=(np.array(begun, dtype=np.float64) - start) / FRAMES_PER_S,
+        )
+
+    def _rest(self, duration_s: float) -> None:
+        stream = self._streaming()
+        until = stream.frame() + int(np.ceil(duration_s * FRAMES_PER_S))
+        stream.wait(until)
+        stream.forget(until)
+
+    def _halt(self) -> None:
+        self._is_halted = True
+        mx = self._mx
+        if mx is not None:
+            mx.send(mx.Core().enable_stimulation_power(False))
+
+    def _close(self) -> None:
+        mx, wiring, stream = self._mx, self._wiring, self._stream
+        try:
+            if mx is not None:
+                mx.send(mx.Core().enable_stimulation_power(False))
+                for unit in wiring.unit_of.values() if wiring else ():
+                    mx.send(mx.StimulationUnit(unit).power_up(False).connect(False))
+                if self._sequences is not None:
+                    self._sequences.delete()
+        finally:
+            if stream is not None:
+                stream.stop()
+            # What it was wired as stays readable; `device_limits` too, for the next opening.
+            self._mx = self._stream = self._sequences = self._pace = None
+
+    def _wait(self, what: str) -> None:
+        """As long as the vendor says, by the name it has in `maxlab.Timing`."""
+        if self._settle and self._mx is not None:
+            time.sleep(float(getattr(getattr(self._mx, "Timing", None), what, 5.0)))
+
+    def _wired(self) -> Wiring:
+        if self._wiring is None:
+            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
+        return self._wiring
+
+    def _streaming(self) -> SpikeStream:
+        if self._stream is None:
+            raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
+        return self._stream
+
+
+def _vendor() -> ModuleType:
+    try:
+        return import_module("maxlab")
+    except ImportError as error:
+        raise DeviceFailed(
+            "maxlab: expected the vendor's Python module, got none: it comes with MaxLab Live (MaxWell Biosystems), "
+            "and no package index has it; run where it is installed"
+        ) from error
+
+
+def _step_mv(told: Any) -> float:
+    try:
+        lsb_mv = float(told)
+    except (TypeError, ValueError):
+        lsb_mv = np.nan
+    if not 0.01 <= lsb_mv <= 100:
+        raise DeviceFailed(f"MaxOne: expected the converter's step in mV, got {told!r}: is the device connected?")
+    return lsb_mv
+
+
+def _groups(stimuli: Sequence[Stimulus], sequence_s: float) -> list[list[Stimulus]]:
+    """Stimuli that one sequence holds, in the order of time."""
+    groups: list[list[Stimulus]] = []
+    for stimulus in stimuli:
+        if groups and stimulus.time_s - groups[-1][0].time_s < sequence_s:
+            groups[-1].append(stimulus)
+        else:
+            groups.append([stimulus])
+    return groups

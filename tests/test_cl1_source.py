@@ -1,0 +1,107 @@
+"""The simulated tissue as the CL1's SDK would read it: time cut in any way gives the same frames and spikes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from animat.cultures.cl1_source import BEFORE, NOT_ELECTRODES, SAMPLES, SimulatedCL1
+from animat.errors import InvalidArgument
+
+
+def event(frame: int, channel: int, ua: float = 2.0) -> Any:
+    return SimpleNamespace(timestamp=frame, channel=channel, phase_durations_us=(160, 160), phase_currents_uA=(-ua, ua))
+
+
+STIMULI = [event(frame, channel) for frame in (701, 1503, 2250) for channel in (9, 18, 27)]
+
+
+def read(pieces: list[int], stimuli: list[Any] = STIMULI) -> tuple[np.ndarray, list[tuple[int, int]], np.ndarray]:
+    """Frames, spikes and their waveforms; stimuli are told of as the SDK does, before the frames that they lie in."""
+    culture, at, waiting = SimulatedCL1(2, neurons=200), 0, sorted(stimuli, key=lambda e: e.timestamp)
+    frames, spikes, shapes = [], [], []
+    for piece in pieces:
+        due = [e for e in waiting if e.timestamp < at + piece]
+        waiting = waiting[len(due) :]
+        culture.stimulate(due)
+        part, found = culture.read(at, piece)
+        assert part.shape == (piece, 64)
+        assert part.dtype == np.int16
+        assert all(at <= frame < at + piece for frame, _, _ in found)
+        frames.append(part)
+        spikes += [(frame, channel) for frame, channel, _ in found]
+        shapes += [shape for _, _, shape in found]
+        at += piece
+    return np.concatenate(frames), spikes, np.array(shapes)
+
+
+WHOLE = 3000
+_whole: list[Any] = []
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.integers(1, 700), min_size=1, max_size=30))
+def test_pieces_do_not_change_what_is_read(pieces: list[int]) -> None:
+    if not _whole:
+        _whole.append(read([WHOLE]))
+    cut: list[int] = []
+    while sum(cut) < WHOLE:
+        cut.append(min(pieces[len(cut) % len(pieces)], WHOLE - sum(cut)))
+    frames, spikes, _ = read(cut)
+    assert sorted(spikes) == sorted(_whole[0][1])
+    np.testing.assert_array_equal(frames, _whole[0][0])
+
+
+def test_it_answers_pulses_and_only_cathodic_charge_counts() -> None:
+    def answers(stimuli: list[Any]) -> int:
+        return len(read([WHOLE], stimuli)[1])
+
+    quiet, loud = answers([]), answers(STIMULI)
+    assert loud > quiet
+    assert answers([event(701, channel) for channel in NOT_ELECTRODES]) == quiet
+    anodic = SimpleNamespace(timestamp=701, channel=9, phase_durations_us=(160,), phase_currents_uA=(2.0,))
+    assert answers([anodic]) == quiet
+
+
+def test_spikes_are_in_the_frames_on_their_channel_and_ground_is_silent() -> None:
+    frames, spikes, shapes = read([WHOLE])
+    assert not np.any(frames[:, list(NOT_ELECTRODES)])
+    assert not {channel for _, channel in spikes} & set(NOT_ELECTRODES)
+    assert shapes.shape == (len(spikes), SAMPLES)
+    assert np.all(np.argmin(shapes, axis=1) == BEFORE)
+    # 60 uV is the smallest spike, five standard deviations of the noise less is below 48 uV, which is 246 units.
+    times = np.array(spikes)
+    depth = np.array([frames[frame, channel] for frame, channel in spikes])
+    alone = [np.count_nonzero((times[:, 1] == c) & (np.abs(times[:, 0] - f) < SAMPLES)) == 1 for f, c in spikes]
+    assert np.count_nonzero(alone) > 10
+    assert np.all(depth[alone] < -246)
+
+
+def test_time_only_goes_on_and_may_be_skipped() -> None:
+    culture = SimulatedCL1(2, neurons=100)
+    culture.read(0, 100)
+    frames, spikes = culture.read(5000, 500)
+    assert all(5000 <= frame < 5500 for frame, _, _ in spikes)
+    assert frames.shape == (500, 64)
+    with pytest.raises(InvalidArgument, match="time only goes on"):
+        culture.read(5499, 10)
+
+
+def test_late_stimuli_act_at_once_and_clash_with_nothing() -> None:
+    culture = SimulatedCL1(2, neurons=100)
+    culture.read(0, 1000)
+    culture.stimulate([event(10, 9), event(10, 18)])
+    culture.stimulate([event(1003, 9)])
+    culture.read(1000, 500)
+    culture.read(1500, 2)
+
+
+@pytest.mark.parametrize("bad", [{"pitch_um": 0.0}, {"reach_um": -1.0}, {"charge_nc": float("nan")}])
+def test_settings_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(InvalidArgument, match="expected above 0"):
+        SimulatedCL1(1, **bad)  # type: ignore[arg-type]

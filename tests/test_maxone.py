@@ -1,0 +1,274 @@
+"""The MaxOne's driver against a stand-in of the vendor's module, written from notes: no device was at hand."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from animat.cultures.base import Culture
+from animat.cultures.contract import CultureContract
+from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.maxone_sequences import dac_code
+from animat.cultures.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
+from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
+from animat.recordings.array import MAXONE
+from animat.recordings.formats.stimulus_text import said
+from animat.recordings.patterns import draw_patterns
+from animat.recordings.protocol import Protocol
+from animat.recordings.selection import Selection
+from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from stand_in_maxlab import LSB_MV, Rig, Stream, install
+
+SITES = [(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)]
+RECORDED = [*SITES, *range(13_000, 13_100)]
+
+
+@pytest.fixture(autouse=True)
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    yield install(monkeypatch)
+
+
+def selection(recording: list[int] = RECORDED, sites: list[int] = SITES) -> Selection:
+    patterns = draw_patterns(MAXONE, np.array(sites), seed=1)
+    return Selection(MAXONE, np.array(recording), np.array(sites), patterns)
+
+
+def culture_on(rig: Rig, **settings: object) -> MaxOneCulture:
+    return MaxOneCulture(selection(), stream=Stream(rig), settle=False, **settings)  # type: ignore[arg-type]
+
+
+class TestMaxOne(CultureContract):
+    pulse = BALANCED_PULSE
+
+    @pytest.fixture(autouse=True)
+    def _patch(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.patch = monkeypatch
+
+    def make_culture(self) -> Culture:
+        return culture_on(install(self.patch))
+
+
+def test_stimulation_electrodes_that_were_not_routed_are_refused_by_name(rig: Rig) -> None:
+    rig.drop = {SITES[3], SITES[9], 13_050}
+    with pytest.raises(DeviceFailed, match=f"but not electrodes {SITES[3]}, {SITES[9]}: choose others") as failed:
+        culture_on(rig).open()
+    assert "\n" not in str(failed.value)
+    assert not rig.powered
+
+
+def test_recording_electrodes_that_were_not_routed_are_left_out_and_counted(rig: Rig) -> None:
+    rig.drop = {13_050, 13_051}
+    with culture_on(rig) as culture:
+        assert culture.not_routed == (13_050, 13_051)
+        assert len(culture.channels) == len(RECORDED) - 2
+        assert culture.provenance["not_routed"] == "13050 13051"
+
+
+def test_electrodes_that_share_a_unit_are_refused_by_name(rig: Rig) -> None:
+    rig.same_unit = {SITES[5]: SITES[2]}
+    with pytest.raises(DeviceFailed, match=f"electrodes {SITES[2]} and {SITES[5]} share unit 2: choose another"):
+        culture_on(rig).open()
+    assert not rig.powered
+
+
+def test_electrodes_without_a_unit_are_refused_by_name(rig: Rig) -> None:
+    rig.without_unit = {SITES[1]}
+    with pytest.raises(DeviceFailed, match=f"there is none for electrode {SITES[1]}: choose others"):
+        culture_on(rig).open()
+
+
+def test_codes_are_inverted_and_rounded_alike_on_both_sides() -> None:
+    assert dac_code(0.0, LSB_MV) == 512
+    # What the vendor's notes give as examples: 100 mV is 512 - 33.5.
+    assert dac_code(100.0, LSB_MV) == 478
+    assert dac_code(-100.0, LSB_MV) == 546
+    for amplitude_mv in np.linspace(0, 400, 1001).tolist():
+        assert dac_code(amplitude_mv, LSB_MV) - 512 == -(dac_code(-amplitude_mv, LSB_MV) - 512)
+        assert abs((512 - dac_code(amplitude_mv, LSB_MV)) * LSB_MV - amplitude_mv) <= LSB_MV / 2 + 1e-9
+
+
+def test_what_comes_out_is_the_pulse_on_the_patterns_electrodes_and_nowhere_else(rig: Rig) -> None:
+    with culture_on(rig) as culture:
+        pattern = tuple(culture.patterns[4].tolist())
+        start = rig.now
+        observed = culture.deliver([Stimulus(0.02, pattern, BALANCED_PULSE, 20.0, 4, 0)], 0.05)
+    assert sorted(pulse.electrode for pulse in rig.delivered) == sorted(pattern)
+    for pulse in rig.delivered:
+        assert pulse.frame == start + 400 == start + round(observed.stimulus_time_s[0] * 20_000)
+        assert [samples for samples, _ in pulse.phases] == [10, 10]
+        np.testing.assert_allclose([mv for _, mv in pulse.phases], [-200, 200], atol=LSB_MV / 2)
+        assert sum(samples * mv for samples, mv in pulse.phases) == 0
+    assert said(rig.events[0][1]) == {"electrodes": list(pattern), "pattern": 4}
+
+
+def test_pulses_that_do_not_balance_after_rounding_are_refused(rig: Rig) -> None:
+    with culture_on(rig) as culture:
+        assert culture.limits.amplitude_step == LSB_MV
+        uneven = Pulse((Phase(500, amplitude_mv=-200), Phase(1000, amplitude_mv=100)))
+        assert uneven.net_charge == 0
+        with pytest.raises(UnsafeStimulus, match=r"net_charge: .* which the device makes of"):
+            culture.deliver([Stimulus(0.0, (SITES[0],), uneven)], 0.1)
+        with pytest.raises(UnsafeStimulus, match="net_charge"):
+            culture.deliver([Stimulus(0.0, (SITES[0],), PUBLISHED_PULSE)], 0.1)
+        # 66 and 33 steps balance.
+        even = Pulse((Phase(500, amplitude_mv=-66 * LSB_MV), Phase(1000, amplitude_mv=33 * LSB_MV)))
+        culture.deliver([Stimulus(0.0, (SITES[0],), even)], 0.1)
+        with pytest.raises(UnsafeStimulus, match="phase_step_us: expected phases in steps of 50 us, got 460"):
+            culture.deliver([Stimulus(0.0, (SITES[0],), Pulse((Phase(460, amplitude_mv=1),)))], 0.1)
+    assert rig.delivered[0].phases[0][0] * rig.delivered[0].phases[0][1] == -20 * rig.delivered[0].phases[1][1]
+
+
+def test_each_pattern_is_one_sequence_that_stays_on_the_device(rig: Rig) -> None:
+    with culture_on(rig) as culture:
+        for pattern in (0, 1, 0, 1, 0):
+            electrodes = tuple(culture.patterns[pattern].tolist())
+            culture.deliver([Stimulus(0.0, electrodes, BALANCED_PULSE, 20.0, pattern)], 0.05)
+        assert len(set(rig.sent)) == 2
+        assert rig.sent[0] == rig.sent[2] == rig.sent[4]
+        assert len(rig.sequences) == 2
+    assert rig.sequences == {}
+
+
+def test_a_recording_is_delivered_to_the_sample_within_a_sequence(rig: Rig) -> None:
+    rig.jitter = 13
+    protocol = Protocol(pulse=BALANCED_PULSE, order="mixed", pulses=5, presentations=4, setup_s=0.1)
+    with culture_on(rig) as culture:
+        recording = culture.record(protocol, seed=1)
+        asked = np.concatenate([block.stimuli.time_s for block in culture.schedule(protocol, 1).blocks])
+    frames = np.array(sorted({pulse.frame for pulse in rig.delivered}))
+    assert len(frames) == len(asked) == 100
+    assert len(rig.delivered) == 500
+    gap, wished = np.diff(frames), np.rint(np.diff(asked) * 20_000)
+    assert np.all(gap >= wished)
+    assert np.mean(gap == wished) > 0.6
+    for row, frame in enumerate(frames):
+        out = {pulse.electrode for pulse in rig.delivered if pulse.frame == frame}
+        assert out == set(recording.stimuli.electrodes[row].tolist())
+
+
+def test_spikes_are_by_channel_and_those_of_no_electrode_are_counted(rig: Rig) -> None:
+    stream = Stream(rig)
+    with MaxOneCulture(selection(), stream=stream, settle=False) as culture:
+        stream.extra = [(rig.now + 20, 31), (rig.now + 30, 1000), (rig.now + 31, 32), (rig.now + 5000, 3)]
+        spikes = culture.advance(0.1)
+        assert spikes.time_s.tolist() == [0.001, 0.00155]
+        assert culture.channels.electrode[spikes.channel].tolist() == [RECORDED[31], RECORDED[32]]
+        assert culture.channels.label[spikes.channel].tolist() == ["31", "32"]
+        assert culture.spikes_not_recorded == 1
+
+
+def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
+    with culture_on(rig, sequence_s=0.1) as culture:
+        rig.on_send = lambda: culture.stop("smoke") if len(rig.sent) == 3 else None
+        stimuli = [Stimulus(0.05 * i, (SITES[0],), BALANCED_PULSE) for i in range(20)]
+        with pytest.raises(DeviceFailed, match="stopped while delivering: 6 of 20 stimuli had been sent"):
+            culture.deliver(stimuli, 1.0)
+        assert len(rig.delivered) == 4
+        assert not rig.powered
+        with pytest.raises(UnsafeStimulus, match="smoke"):
+            culture.deliver(stimuli[:1], 1.0)
+    with culture:
+        rig.on_send = None
+        culture.deliver(stimuli[:1], 1.0)
+    assert len(rig.delivered) == 5
+
+
+def test_closing_leaves_no_unit_powered(rig: Rig) -> None:
+    with culture_on(rig):
+        assert sum(bool(unit["power"]) for unit in rig.units.values()) == 32
+        assert not any(unit["connected"] for unit in rig.units.values())
+    assert not rig.powered
+    assert not any(unit["power"] or unit["connected"] for unit in rig.units.values())
+
+
+def test_a_device_that_does_not_answer_is_one_line(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig.dead = True
+    with pytest.raises(DeviceFailed, match="expected stimulation power to be switched on, got 'Error'"):
+        culture_on(rig).open()
+    rig.dead = False
+    for told in ("", None, "nan", "-1"):
+        rig.lsb_mv = told
+        with pytest.raises(DeviceFailed, match="expected the converter's step"):
+            culture_on(rig).open()
+    monkeypatch.setattr(sys.modules["maxlab"], "initialize", lambda: [][0])
+    with pytest.raises(DeviceFailed, match="MaxLab Live's server running"):
+        culture_on(rig).open()
+    monkeypatch.setitem(sys.modules, "maxlab", None)
+    with pytest.raises(DeviceFailed, match="comes with MaxLab Live") as failed:
+        culture_on(rig).open()
+    assert "\n" not in str(failed.value)
+
+
+def test_tighter_limits_take_the_devices_step_and_looser_ones_are_refused(rig: Rig) -> None:
+    with culture_on(rig, limits=replace(MAXONE_LIMITS, amplitude=300.0)) as culture:
+        assert culture.limits.amplitude_step == LSB_MV
+    with pytest.raises(InvalidArgument, match=r"limits\.amplitude"):
+        culture_on(rig, limits=replace(MAXONE_LIMITS, amplitude=401.0)).open()
+    rig.lsb_mv = "0.5"
+    with pytest.raises(InvalidArgument, match=r"limits\.amplitude: expected no looser than the device's 255.5"):
+        culture_on(rig, limits=replace(MAXONE_LIMITS, amplitude=300.0)).open()
+
+
+def test_a_selection_that_cannot_be_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match="1 to 32 stimulation sites, got 132 and 33"):
+        MaxOneCulture(selection(sites=[*SITES, 26_000]))
+    with pytest.raises(InvalidArgument, match="expected one on a MaxOne, got one on a CL1"):
+        MaxOneCulture(_on_another_array())
+
+
+def _on_another_array() -> Selection:
+    other = replace(MAXONE, name="CL1", columns=8, rows=8)
+    return Selection(other, np.array([1]), np.array([1]), np.array([[1]]))
+
+
+@pytest.mark.parametrize(("layout", "size"), [(EVENT_24, 24), (EVENT_16, 16)])
+def test_messages_of_the_stream_in_both_versions(layout: np.dtype, size: int) -> None:
+    assert layout.itemsize == size
+    stream = ZmqSpikes(event_bytes=size)
+    spikes = np.zeros(2, layout)
+    spikes["frame"], spikes["channel"] = [41, 42], [1023, 5]
+    stream.hear([np.uint64(42).tobytes(), b"", spikes.tobytes()])
+    stream.hear([np.uint64(45).tobytes(), b""])
+    assert (stream.frame(), stream.lost_frames) == (45, 2)
+    frames, channels = stream.take(0, 100)
+    assert (frames.tolist(), channels.tolist()) == ([41, 42], [1023, 5])
+    with pytest.raises(DeviceFailed, match="is event_bytes that of this version"):
+        stream.hear([np.uint64(46).tobytes(), b"", b"123"])
+
+
+def test_the_stream_hears_a_server() -> None:
+    zmq = pytest.importorskip("zmq", reason="pyzmq is not installed")
+    with zmq.Context() as context, context.socket(zmq.PUB) as server:
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+        stream = ZmqSpikes(f"tcp://127.0.0.1:{port}")
+        going = threading.Event()
+        going.set()
+
+        def serve() -> None:
+            number = 0
+            while going.is_set():
+                spike = np.zeros(1, EVENT_24)
+                spike["frame"], spike["channel"] = number, number % 7
+                server.send_multipart([np.uint64(number).tobytes(), b"\0" * 4108, spike.tobytes()])
+                number += 1
+                if number % 50 == 0:
+                    threading.Event().wait(0.002)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            stream.start()
+            first = stream.frame()
+            stream.wait(first + 500)
+            frames, channels = stream.take(first, first + 500)
+            np.testing.assert_array_equal(channels, frames % 7)
+            assert len(frames) + stream.lost_frames >= 500
+        finally:
+            stream.stop()
+            going.clear()
+            thread.join()
