@@ -11,7 +11,9 @@ from jaxtyping import Bool
 
 from animat.neurons.bursts import BurstSeparation
 from animat.neurons.conditions import NO_CONDITION, Assignment
+from animat.neurons.drift_quality import drift_findings
 from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
+from animat.neurons.timing_quality import artefact_findings
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 
@@ -58,9 +60,11 @@ def findings_on(
     return (
         *_left_out(recording, assignment, inside),
         *_timing(responses, recording),
+        *artefact_findings(recording, responses.window_ms),
         *_conditions(responses),
         *_bursts(responses, bursts),
         *_difference(responses),
+        *drift_findings(responses),
     )
 
 

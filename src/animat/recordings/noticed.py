@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 
+from animat.recordings.channel_quality import channel_findings
 from animat.recordings.findings import Finding, Severity
 from animat.recordings.recording import UNKNOWN, Recording
 
@@ -22,8 +23,9 @@ def as_provenance(findings: Iterable[Finding]) -> dict[str, str]:
 def noticed(recording: Recording) -> tuple[Finding, ...]:
     """All findings about a recording: those noted when its file was read, then those seen in its data.
 
-    Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent channels (`silent-channels`),
-    stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
+    Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
+    (`animat.recordings.channel_quality`), stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown
+    presentation (`presentation-unknown`).
     """
     from_file = []
     for key, sentence in recording.provenance.items():
@@ -45,10 +47,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     if not len(recording.spike_times_s):
         yield Finding("no-spikes", "refuse", f"no spike on any of {len(channels):,} channels: nothing can be learned")
     else:
-        silent = len(channels) - len(np.unique(recording.spike_channels))
-        if silent:
-            sentence = f"{silent:,} of {len(channels):,} channels are silent; they count in rates per channel"
-            yield Finding("silent-channels", "note", sentence, float(silent))
+        yield from channel_findings(recording)
     unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1)))
     if unknown:
         sentence = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"

@@ -77,6 +77,15 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
     return PlainColumns(**columns).to_recording(provenance, tuple(findings))
 
 
+def read_stimuli_csv(path: Path) -> dict[str, Any]:
+    """The stimulus columns of `PlainColumns` in a file of stimuli, whatever else is not known left out.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged or lacks the times.
+    """
+    return _table(path, STIMULUS_COLUMNS)[0]
+
+
 def stimuli_beside(path: Path) -> Path | None:
     """The file of stimuli that belongs to a file of spikes, if there is one."""
     name = _stem(path).removesuffix("_spikes")

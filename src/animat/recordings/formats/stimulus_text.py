@@ -76,9 +76,11 @@ def stimulus_columns(lines: Sequence[str]) -> dict[str, Any]:
     if np.any(pattern != UNKNOWN):
         columns["stimulus_pattern"] = pattern
     presentation = np.array([_whole(words.get("presentation")) for words in read], dtype=np.int64)
-    has_presentation = bool(len(read)) and bool(np.all(presentation != UNKNOWN))
+    # One number for all is what a pulse has that belongs to no presentation in particular.
+    has_presentation = bool(np.all(presentation != UNKNOWN)) and len(np.unique(presentation)) > 1
     if has_presentation:
-        columns["stimulus_presentation"] = presentation
+        # Numbers can begin anew in the middle of a file: what counts is where they change.
+        columns["stimulus_presentation"] = np.cumsum(np.diff(presentation, prepend=presentation[0]) != 0)
     electrodes = [_electrodes(words.get("electrodes")) for words in read]
     if any(electrodes):
         columns["stimulus_electrodes"] = padded(electrodes)

@@ -1,0 +1,119 @@
+"""The command that brings any recording into animat's own NWB."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write a recording of any rig as NWB, with who recorded it; find the spikes in raw traces where asked to."""
+
+    recording: Positional[Path]
+    """The recording: NWB, MaxWell, CL1, NPZ, CSV; with --reader whatever SpikeInterface reads"""
+    out: Path
+    """The NWB file to write"""
+    subject_id: str | None = None
+    """The culture's own name"""
+    species: str | None = None
+    """In Latin, such as "Mus musculus\""""
+    sex: Literal["M", "F", "U", "O"] | None = None
+    """Of the subject; U, unknown, where it is not given"""
+    age: str | None = None
+    """ISO 8601 duration, such as P42D"""
+    subject_description: str | None = None
+    """Such as "dissociated cortical culture\""""
+    experimenter: str | None = None
+    """"Last, First"; several separated by semicolons"""
+    institution: str | None = None
+    """Where it was recorded"""
+    lab: str | None = None
+    """In which laboratory"""
+    keywords: str | None = None
+    """Separated by commas"""
+    recorded_at: str | None = None
+    """ISO 8601 date, such as 2024-05-31T14:00:00+09:00"""
+    experiment_description: str | None = None
+    """In words"""
+    start_min: float | None = None
+    """Start on the culture's clock, in minutes"""
+    stimuli: str | None = None
+    """Which of several things in the file are the stimuli (NWB: the name; MaxWell: the events' type)"""
+    stimuli_path: Path | None = None
+    """File of stimuli beside CSV spikes or traces"""
+    part: str | None = None
+    """Which of several recordings in the file, such as well000/rec0000"""
+    raw: bool = False
+    """Find the spikes in the raw traces, in place of those that the rig found"""
+    reader: str | None = None
+    """Find the spikes in traces of another format, by its name in SpikeInterface (animat[raw]), such as intan"""
+    band_hz: tuple[float, float] = (100.0, 3000.0)
+    """Pass band of the filter for finding spikes; 0 0: the traces are filtered already"""
+    threshold: float = 5.0
+    """Depth of a spike, in standard deviations of its channel's noise"""
+    dead_time_ms: float = 1.0
+    """Of two troughs within it, the deeper one is the spike"""
+    blank_ms: tuple[float, float] = (0.5, 1.5)
+    """From before to after each stimulus in which nothing is looked for"""
+    engine: Literal["auto", "scipy", "spikeinterface"] = "auto"
+    """What filters and finds spikes; auto: SpikeInterface where it is installed"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Convert."""
+        from animat.progress import Bar
+        from animat.recordings.conversion import Origin, convert_recording
+        from animat.recordings.detection.settings import Detection
+        from animat.recordings.noticed import noticed
+
+        detection = Detection(
+            band_hz=None if self.band_hz == (0, 0) else self.band_hz,
+            threshold=self.threshold,
+            dead_time_ms=self.dead_time_ms,
+            blank_ms=self.blank_ms,
+            recovery_ms=max(20.0, self.blank_ms[1]),
+            engine=self.engine,
+        )
+        origin = Origin(
+            subject_id=self.subject_id,
+            species=self.species,
+            sex=self.sex,
+            age=self.age,
+            subject_description=self.subject_description,
+            experimenter=self.experimenter,
+            institution=self.institution,
+            lab=self.lab,
+            keywords=self.keywords,
+            recorded_at=self.recorded_at,
+            experiment_description=self.experiment_description,
+        )
+        with Bar("finding spikes") as progress:
+            recording = convert_recording(
+                self.recording,
+                self.out,
+                origin,
+                detection=detection if self.raw or self.reader is not None else None,
+                reader=self.reader,
+                stimuli_path=self.stimuli_path,
+                stimuli=self.stimuli,
+                part=self.part,
+                start_min=self.start_min,
+                progress=progress,
+            )
+        n_spikes, n_stimuli = len(recording.spike_times_s), len(recording.stimuli)
+        print(f"{self.out}: {n_spikes:,} spikes on {len(recording.channels):,} channels, {n_stimuli:,} stimuli")
+        findings = noticed(recording)
+        for finding in findings:
+            print(f"  {finding.severity}: {finding.sentence}")
+        return {
+            "recording": str(self.out),
+            "spikes": n_spikes,
+            "channels": len(recording.channels),
+            "stimuli": n_stimuli,
+            "findings": [finding.name for finding in findings],
+        }

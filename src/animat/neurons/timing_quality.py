@@ -1,0 +1,137 @@
+"""What the moments around a stimulus tell of its artefact: spikes that are none, and stretches that were blanked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.neurons.psth import post_stimulus_histogram, spontaneous_rate
+from animat.recordings.findings import Finding
+from animat.recordings.recording import Recording
+
+BIN_MS = 0.5
+SPAN_MS = (-10.0, 20.0)
+LOOKED_AT_MS = (-2.0, 10.0)
+"""Where an artefact is looked for; a response that is sharper than one comes later."""
+ARTEFACT_UNTIL_MS = 2.0
+"""An artefact begins before this."""
+TIMES = 5.0
+"""As many spikes as elsewhere, and more, are an artefact; as few, and fewer, were blanked."""
+ENOUGH = 10.0
+"""Spikes expected without a blank, to tell one."""
+
+
+def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
+    """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
+
+    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around 0,
+    or from less than 2 ms on, in which b is above five times both the spontaneous rate and the median of b from 3 to
+    20 ms after. The blank is the run of bins around 0, without the artefact, in which b is below a fifth of the
+    spontaneous rate; it is looked for where 10 spikes or more would be in it.
+
+    Args:
+        recording: with stimuli.
+        window_ms: of the responses.
+    """
+    stimuli = recording.stimuli
+    read = stimuli.is_last_of_presentation
+    if not read.any():
+        return
+    gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
+    before_ms = 1e3 * np.concatenate([[np.inf], np.diff(stimuli.time_s)])
+    # Bins must not hold what belongs to a neighbouring pulse.
+    apart = read & (gap_ms >= SPAN_MS[1]) & (before_ms >= -SPAN_MS[0] + SPAN_MS[1])
+    chosen = apart if int(apart.sum()) >= min(20, int(read.sum())) else read
+    histogram = post_stimulus_histogram(recording, *SPAN_MS, BIN_MS, chosen)
+    centre_ms = histogram.edges_ms[:-1] + BIN_MS / 2
+    count = histogram.count.astype(np.float64)
+    rate_hz, quiet_s = spontaneous_rate(recording)
+    spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * histogram.n_stimuli
+    usual = max(spontaneous, float(np.median(count[centre_ms > 3.0])), 1.0)
+    artefact = _artefact(centre_ms, count, usual)
+    if artefact is not None:
+        yield _artefact_finding(centre_ms, count, artefact, usual, recording, histogram.n_stimuli, window_ms)
+    if quiet_s > 0 and spontaneous > 0:
+        yield from _blank(centre_ms, count, artefact, spontaneous, window_ms)
+
+
+def _artefact(
+    centre_ms: Float64[np.ndarray, " bins"], count: Float64[np.ndarray, " bins"], usual: float
+) -> tuple[int, int] | None:
+    """First and last bin of the artefact; None where there is none."""
+    above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
+    starts = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
+    if not len(starts):
+        return None
+    first = last = int(starts[0])
+    while last + 1 < len(above) and (above[last + 1] or (last + 2 < len(above) and above[last + 2])):
+        last += 1
+    return first, last
+
+
+def _artefact_finding(
+    centre_ms: Float64[np.ndarray, " bins"],
+    count: Float64[np.ndarray, " bins"],
+    artefact: tuple[int, int],
+    usual: float,
+    recording: Recording,
+    n_stimuli: int,
+    window_ms: tuple[float, float],
+) -> Finding:
+    first, last = artefact
+    from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
+    spikes = float(count[first : last + 1].sum())
+    reaches = to_ms > window_ms[0] + 1e-9
+    remedy = (
+        f"the window begins at {window_ms[0]:g} ms, inside it: begin it at {to_ms:g} ms or later (--window-ms)"
+        if reaches
+        else f"the window from {window_ms[0]:g} ms on does not hold them"
+    )
+    return Finding(
+        "artefact-spikes",
+        "warning" if reaches else "note",
+        f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
+        f"{count[first : last + 1].max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
+        f"as spikes ({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
+        spikes / n_stimuli,
+    )
+
+
+def _blank(
+    centre_ms: Float64[np.ndarray, " bins"],
+    count: Float64[np.ndarray, " bins"],
+    artefact: tuple[int, int] | None,
+    spontaneous: float,
+    window_ms: tuple[float, float],
+) -> Iterator[Finding]:
+    is_blank = count < spontaneous / TIMES
+    if artefact is not None:
+        is_blank[artefact[0] : artefact[1] + 1] = True
+    zero = int(np.searchsorted(centre_ms, 0.0))
+    if not is_blank[zero]:
+        return
+    first = last = zero
+    while first > 0 and is_blank[first - 1]:
+        first -= 1
+    while last + 1 < len(is_blank) and is_blank[last + 1]:
+        last += 1
+    silent = last - first + 1 - (0 if artefact is None else artefact[1] - artefact[0] + 1)
+    from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
+    if silent * spontaneous < ENOUGH or last == len(is_blank) - 1:
+        return
+    lost = (min(to_ms, window_ms[1]) - window_ms[0]) / (window_ms[1] - window_ms[0])
+    found = f"from {from_ms:g} to {to_ms:g} ms around a stimulus next to nothing was recorded (blanked, or saturated)"
+    if lost <= 1e-9:
+        yield Finding("blanked-window", "note", f"{found}; the window from {window_ms[0]:g} ms on is after it", 0.0)
+        return
+    remedy = f"use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else "use a window after it"
+    yield Finding(
+        "blanked-window",
+        "note" if lost <= 0.15 else "warning",
+        f"{found}: {100 * min(lost, 1):.0f} % of the window from {window_ms[0]:g} to {window_ms[1]:g} ms is lost, and "
+        f"rates are too low by as much: {remedy}",
+        min(lost, 1.0),
+    )

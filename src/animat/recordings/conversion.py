@@ -1,0 +1,102 @@
+"""Any recording to animat's own NWB, with who recorded it and what of; raw traces become spikes on the way."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from animat.errors import InvalidArgument
+from animat.progress import Progress
+from animat.recordings.detection.settings import Detection
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Who recorded what, as NWB wants it; what is None stays as the file says.
+
+    Attributes:
+        subject_id: the culture's own name.
+        species: in Latin, such as `Mus musculus`.
+        sex: `U` for unknown, as of most cultures.
+        age: ISO 8601 duration, such as `P42D`.
+        subject_description: such as `dissociated cortical culture`.
+        experimenter: `Last, First`; several separated by semicolons.
+        institution, lab: where.
+        keywords: separated by commas.
+        recorded_at: ISO 8601 date.
+        experiment_description: in words.
+    """
+
+    subject_id: str | None = None
+    species: str | None = None
+    sex: str | None = None
+    age: str | None = None
+    subject_description: str | None = None
+    experimenter: str | None = None
+    institution: str | None = None
+    lab: str | None = None
+    keywords: str | None = None
+    recorded_at: str | None = None
+    experiment_description: str | None = None
+
+    def words(self) -> Mapping[str, str]:
+        """What is given, as entries of `Recording.provenance`. A subject without a sex is of an unknown one."""
+        given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+        return {"sex": "U", **given} if "subject_id" in given else given
+
+
+def convert_recording(
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    origin: Origin | None = None,
+    *,
+    detection: Detection | None = None,
+    reader: str | None = None,
+    stimuli_path: str | os.PathLike[str] | None = None,
+    stimuli: str | None = None,
+    part: str | None = None,
+    start_min: float | None = None,
+    progress: Progress | None = None,
+) -> Recording:
+    """Read a recording in any format and write it as NWB.
+
+    Args:
+        path: the recording.
+        out: the NWB file, complete or absent.
+        origin: who recorded what.
+        detection: find the spikes in raw traces, in this way; None: take the spikes that the file has.
+        reader: the format's name for SpikeInterface; the spikes are then found in its traces.
+        stimuli_path, stimuli, part, start_min: as in `read_recording`.
+        progress: of finding spikes.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InvalidFile: if the file cannot be read, or the new one not be written.
+        InvalidArgument: for a choice that the format does not offer, or an `out` that is the file itself.
+    """
+    path, out = Path(path), Path(out)
+    if out.exists() and path.exists() and out.samefile(path):
+        raise InvalidArgument(f"--out: expected another file than the recording itself, got {out}")
+    if reader is not None:
+        from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
+        from animat.recordings.spikes_of_traces import with_spikes_of
+
+        traces, base = open_with_spikeinterface(path, reader, stimuli_path=stimuli_path)
+        recording = with_spikes_of(traces, base, detection, progress=progress)
+    elif detection is not None:
+        from animat.recordings.spikes_of_traces import read_traces
+
+        recording = read_traces(path, detection, part=part, stimuli=stimuli, progress=progress)
+    else:
+        recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
+    words = {} if origin is None else origin.words()
+    start_min = recording.start_min if start_min is None else start_min
+    recording = replace(recording, provenance={**recording.provenance, **words}, start_min=float(start_min))
+    recording.save(out)
+    return recording

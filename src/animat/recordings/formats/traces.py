@@ -1,0 +1,171 @@
+"""Raw traces in MaxWell, CL1 and NWB files, and the recording without spikes that they belong to."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.recordings.formats.choice import choose
+from animat.recordings.formats.cl1 import read_cl1
+from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, hdf5_file, unavailable_filters
+from animat.recordings.formats.hdf5_formats import format_of
+from animat.recordings.formats.maxwell import is_old, parts, read_maxwell
+from animat.recordings.formats.nwb_of_others import read_other_nwb
+from animat.recordings.raw import Hdf5Traces
+from animat.recordings.recording import UNKNOWN, Channels, Recording
+
+OLD_ROWS = 1024
+OLD_LSB_V = 6.294e-6
+"""Of the old layout, where the file does not say."""
+
+
+def open_traces(
+    path: str | os.PathLike[str], *, part: str | None = None, stimuli: str | None = None
+) -> tuple[Hdf5Traces, Recording]:
+    """Raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
+
+    Args:
+        path: the file.
+        part: of a MaxWell file that holds several recordings, which; of an NWB file with several series, which.
+        stimuli: which of several things are the stimuli, as in `read_recording`.
+
+    Raises:
+        InvalidFile: if the file holds no raw traces, or they are compressed by a filter that is not installed.
+    """
+    path = Path(path)
+    with hdf5_file(path, "file of raw traces") as file:
+        found = format_of(file)
+        if found is None:
+            raise InvalidFile(f"{path}: expected raw traces in MaxWell, CL1 or NWB, got another HDF5 file")
+    if found == "MaxWell":
+        base = read_maxwell(path, part=part, stimuli=stimuli, spikes=False)
+    elif found == "CL1":
+        base = read_cl1(path, spikes=False)
+    else:
+        with hdf5_file(path, "NWB recording") as file:
+            base = read_other_nwb(file, path, stimuli, spikes=False)
+    with hdf5_file(path, "file of raw traces") as file:
+        if found == "MaxWell":
+            traces = _maxwell(file, path, part, base)
+        elif found == "CL1":
+            scale = file.attribute("/", "uV_per_sample_unit")
+            traces = _traces(file, path, "samples", False, base, base.sampling_rate_hz, _number(scale, 0.195), 0.0)
+        else:
+            traces = _nwb(file, path, part, base)
+    stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
+    start_s = min(base.start_s, traces.start_s)
+    base = replace(
+        base,
+        channels=traces.channels,
+        sampling_rate_hz=traces.sampling_rate_hz,
+        start_s=start_s,
+        duration_s=stop_s - start_s,
+    )
+    return traces, base
+
+
+def _maxwell(file: Hdf5File, path: Path, part: str | None, base: Recording) -> Hdf5Traces:
+    if is_old(file):
+        lsb = _number(file.first("settings/lsb"), OLD_LSB_V)
+        return _traces(file, path, "sig", True, base, base.sampling_rate_hz, 1e6 * lsb, 0.0, labels=np.arange(OLD_ROWS))
+    there = parts(file)
+    at = there[choose(f"{path}: part", "--part", there, part)]
+    groups = [g for g in file.names(f"{at}/groups") if file.has(f"{at}/groups/{g}/raw")]
+    if not groups:
+        raise InvalidFile(f"{path}: expected raw traces at /{at}/groups, found none: the rig kept spikes only")
+    # Most groups are parts of one; the one with the most channels has them all.
+    group = max(groups, key=lambda g: file.dataset(f"{at}/groups/{g}/raw").shape[0])
+    labels = file.read(f"{at}/groups/{group}/channels") if file.has(f"{at}/groups/{group}/channels") else None
+    ends = [e for g in groups if (e := file.ends(f"{at}/groups/{g}/frame_nos")) is not None]
+    own = file.ends(f"{at}/groups/{group}/frame_nos")
+    start_s = 0.0 if own is None else (own[0] - min(e[0] for e in ends)) / base.sampling_rate_hz
+    lsb = _number(file.first(f"{at}/settings/lsb"), OLD_LSB_V)
+    where = f"{at}/groups/{group}/raw"
+    return _traces(file, path, where, True, base, base.sampling_rate_hz, 1e6 * lsb, start_s, labels=labels)
+
+
+def _nwb(file: Hdf5File, path: Path, part: str | None, base: Recording) -> Hdf5Traces:
+    series = [
+        n
+        for n in file.names("acquisition")
+        if file.attribute(f"acquisition/{n}", "neurodata_type") == "ElectricalSeries"
+    ]
+    if not series:
+        raise InvalidFile(f"{path}: expected raw traces as an ElectricalSeries in /acquisition, found none")
+    at = f"acquisition/{choose(f'{path}: series', '--part', series, part)}"
+    rate_hz = _number(file.attribute(f"{at}/starting_time", "rate"), math.nan)
+    if math.isnan(rate_hz):
+        raise InvalidFile(f"{path}: expected the rate of /{at} in Hz at its starting_time, found none")
+    rows = file.read(f"{at}/electrodes").astype(np.int64) if file.has(f"{at}/electrodes") else None
+    labels = None
+    if rows is not None and len(rows) and rows.max() < len(base.channels) and rows.min() >= 0:
+        labels = base.channels.label[rows]
+    scale = _number(file.attribute(f"{at}/data", "conversion"), 1.0)
+    start_s = file.first(f"{at}/starting_time")
+    return _traces(
+        file, path, f"{at}/data", False, base, rate_hz, 1e6 * scale, float(start_s or 0.0), labels=labels
+    )  # fmt: skip
+
+
+def _traces(
+    file: Hdf5File,
+    path: Path,
+    where: str,
+    channels_first: bool,
+    base: Recording,
+    rate_hz: float,
+    uv_per_step: float,
+    start_s: float,
+    labels: Any = None,
+) -> Hdf5Traces:
+    """Traces in a dataset, with the channels of the recording that it holds; one row or column a label."""
+    if not isinstance(file.node(where), h5py.Dataset):
+        raise InvalidFile(f"{path}: expected raw traces at /{where}, found none")
+    dataset = file.dataset(where)
+    if dataset.ndim != 2 or dataset.dtype.kind not in "iuf":
+        raise InvalidFile(
+            f"{path}: expected traces of several channels at /{where}, got {dataset.shape} {dataset.dtype}"
+        )
+    missing = unavailable_filters(dataset)
+    if missing:
+        raise InvalidFile(
+            f"{path}: the raw traces at /{where} are compressed by {missing}, which is not installed: {PLUGIN_ADVICE}; "
+            "spikes that the rig found itself can be read without it"
+        )
+    if not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise InvalidFile(f"{path}: expected a sampling rate of the traces at /{where}, got {rate_hz:g}")
+    samples, columns = dataset.shape[::-1] if channels_first else dataset.shape
+    names = np.arange(columns) if labels is None else np.asarray(labels)[:columns]
+    row_of = {str(label): row for row, label in enumerate(base.channels.label)}
+    if labels is None and len(base.channels) == columns:
+        rows = list(range(columns))
+    else:
+        rows = [row_of.get(str(name), UNKNOWN) for name in names]
+    used = np.array([column for column, row in enumerate(rows) if row != UNKNOWN], dtype=np.int64)
+    if not len(used):
+        channels = Channels(
+            label=np.arange(columns).astype(np.str_),
+            electrode=np.full(columns, UNKNOWN),
+            x_um=np.full(columns, np.nan),
+            y_um=np.full(columns, np.nan),
+        )
+        used = np.arange(columns)
+    else:
+        # A channel twice in the traces is one channel: its first column.
+        _, first = np.unique(np.array(rows)[used], return_index=True)
+        used = used[np.sort(first)]
+        kept = np.array(rows)[used]
+        table = base.channels
+        channels = Channels(table.label[kept], table.electrode[kept], table.x_um[kept], table.y_um[kept])
+    return Hdf5Traces(path, where, used, channels_first, channels, int(samples), float(rate_hz), uv_per_step, start_s)
+
+
+def _number(value: Any, otherwise: float) -> float:
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) and value > 0 else otherwise

@@ -1,0 +1,47 @@
+"""Damaged and hostile files: read, or refused in one line, whatever they hold. Oracle: the operating system's limits."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from damaging import KINDS
+
+
+def damage(kind: str, seed: int, count: int, folder: Path) -> None:
+    """Damage and read `count` files in a process of its own."""
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-W",
+            "ignore",
+            str(Path(__file__).parent / "damaging.py"),
+            kind,
+            str(seed),
+            str(count),
+            folder,
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)},
+    )
+    last = folder / "last"
+    where = last.read_text() if last.exists() else "before the first file"
+    assert done.returncode == 0, f"{where}: status {done.returncode}\n{done.stdout}{done.stderr[-3000:]}"
+    print(done.stdout)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
+    damage(kind, 1, 100, tmp_path)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_thousand_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
+    damage(kind, 2, 2000, tmp_path)

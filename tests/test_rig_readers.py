@@ -1,0 +1,333 @@
+"""Readers of MaxWell, CL1 and other programs' NWB. Oracles: files made row by row, pynwb's writer."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.noticed import noticed
+from animat.recordings.protocol import Presentation
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+from animat.recordings.spikes_of_traces import read_traces
+from rig_files import (
+    BITS,
+    FIRST_FRAME,
+    event_table,
+    mapping_table,
+    packed_text,
+    spike_table,
+    write_cl1,
+    write_maxwell,
+    write_old_maxwell,
+)
+
+TABLE = mapping_table([3, 9, 40], [1000, 2000, 26_399])
+
+
+def found(recording: Recording) -> dict[str, str]:
+    return {finding.name: finding.sentence for finding in noticed(recording)}
+
+
+def said(frequency: float, presentation: int) -> str:
+    words = {"frequency_hz": frequency, "pattern": 2, "presentation": presentation, "electrodes": [909, 23_923]}
+    return json.dumps({**words, "order": "mixed", "pulses": 2})
+
+
+# --- MaxWell ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_maxwell_spikes_stimuli_and_electrodes(tmp_path: Path, linked: bool) -> None:
+    path = write_maxwell(
+        tmp_path / "no_ending",
+        mapping=TABLE,
+        spikes=spike_table([0.5, 1.25, 1.0], [9, 40, 3]),
+        events=event_table([0.2, 0.4, 0.7, 0.9], [said(5, 0), said(5, 0), said(20, 1), said(20, 1)]),
+        recorded=[3, 9, 40],
+        linked=linked,
+    )
+    recording = read_recording(path)
+    assert recording.spike_times_s.tolist() == [0.5, 1.0, 1.25]
+    assert recording.channels.label[recording.spike_channels].tolist() == ["9", "3", "40"]
+    assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
+    assert recording.channels.x_um.tolist() == [1000 % 220 * 17.5, 2000 % 220 * 17.5, 219 * 17.5]
+    assert recording.channels.y_um.tolist() == [4 * 17.5, 9 * 17.5, 119 * 17.5]
+    stimuli = recording.stimuli
+    np.testing.assert_allclose(stimuli.time_s, [0.2, 0.4, 0.7, 0.9], rtol=0, atol=1e-12)
+    assert stimuli.frequency_hz.tolist() == [5, 5, 20, 20]
+    assert stimuli.electrodes.tolist() == [[909, 23_923]] * 4
+    assert stimuli.is_last_of_presentation.tolist() == [False, True, False, True]
+    assert recording.presentation == Presentation("mixed", 2)
+    assert (recording.sampling_rate_hz, recording.duration_s) == (20_000.0, 10.0)
+    assert recording.provenance["recorded_at"].startswith("2023-11-14T22:13:20")
+
+
+def test_maxwell_channels_named_twice_are_one_channel(tmp_path: Path) -> None:
+    twice = mapping_table([3, 9, 9, 40, 40], [1000, 2000, 2000, 26_399, 7])
+    path = write_maxwell(
+        tmp_path / "a.h5", mapping=twice, spikes=spike_table([0.5, 0.6], [9, 40]), recorded=[3, 9, 40], events=None
+    )
+    recording = read_recording(path)
+    assert recording.channels.label.tolist() == ["3", "9", "40"]
+    assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
+    assert "names 2 channels again" in found(recording)["duplicate-channels"]
+    assert "another electrode (1 times)" in found(recording)["duplicate-channels"]
+    assert "no-stimuli" in found(recording)
+
+
+def test_maxwell_only_recorded_channels_count_and_spikes_elsewhere_are_counted(tmp_path: Path) -> None:
+    path = write_maxwell(
+        tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5, 0.6, 0.7], [9, 40, 1023]), recorded=[9, 3]
+    )
+    recording = read_recording(path)
+    assert recording.channels.label.tolist() == ["3", "9"]
+    assert recording.spike_times_s.tolist() == [0.5]
+    assert "2 of 3 spikes are on channels that no electrode is routed to" in found(recording)["spikes-not-routed"]
+
+
+def test_maxwell_without_groups_or_mapping_is_read_with_what_there_is(tmp_path: Path) -> None:
+    spikes = spike_table([0.5, 0.25], [9, 40])
+    recording = read_recording(write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spikes))
+    assert recording.spike_times_s.tolist() == [0.0, 0.25]
+    assert "the clock starts at the first spike" in found(recording)["clock-from-first-event"]
+    recording = read_recording(write_maxwell(tmp_path / "b.h5", mapping=None, spikes=spikes))
+    assert recording.channels.electrode.tolist() == [-1, -1]
+    assert "which electrode a channel reads is not known" in found(recording)["mapping-missing"]
+
+
+def test_maxwell_without_spikes_says_what_to_do(tmp_path: Path) -> None:
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=None, recorded=[3])
+    with pytest.raises(InvalidFile, match=r"expected spikes at /wells/well000/rec0000/spikes.*animat convert"):
+        read_recording(path)
+
+
+def test_maxwell_with_several_recordings_lists_them(tmp_path: Path) -> None:
+    parts = (("well000", "rec0000"), ("well001", "rec0000"))
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5], [9]), parts=parts, recorded=[9])
+    with pytest.raises(InvalidFile, match=r"found 2: well000/rec0000, well001/rec0000; choose with --part NAME"):
+        read_recording(path)
+    assert read_recording(path, part="well001/rec0000").provenance["part"] == "well001/rec0000"
+    with pytest.raises(InvalidFile, match=r"expected one of well000/rec0000.*got well9"):
+        read_recording(path, part="well9")
+
+
+def test_maxwell_events_of_several_types_are_not_guessed(tmp_path: Path) -> None:
+    events = event_table([0.1, 0.2, 0.3], ["", "frequency 20 electrode 909", ""], [1, 2, 1])
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5], [9]), events=events, recorded=[9])
+    with pytest.raises(InvalidFile, match=r"found 2: 1 \(2 events\), 2 \(1 events\); choose with --stimuli NAME"):
+        read_recording(path)
+    stimuli = read_recording(path, stimuli="2").stimuli
+    assert (stimuli.frequency_hz.tolist(), stimuli.electrodes.tolist()) == ([20.0], [[909]])
+
+
+def test_maxwell_raw_without_the_plugin_spikes_still_read(tmp_path: Path) -> None:
+    path = write_maxwell(
+        tmp_path / "a.h5",
+        mapping=TABLE,
+        spikes=spike_table([0.0005], [9]),
+        recorded=[3, 9, 40],
+        raw=np.zeros((3, 400), "<u2"),
+        compressed=True,
+    )
+    assert read_recording(path).spike_times_s.tolist() == [0.0005]
+    with pytest.raises(InvalidFile, match=r"compressed by filter 32001.*not installed.*HDF5_PLUGIN_PATH.*spikes that"):
+        read_traces(path)
+
+
+def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
+    bits = np.zeros(5, BITS)
+    bits["frameno"] = FIRST_FRAME + np.array([2000, 2100, 4000, 4100, 4200])
+    bits["bits"] = [1, 0, 2, 2, 0]
+    path = write_old_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.11, 0.21], [9, 3]), bits=bits)
+    recording = read_recording(path)
+    assert recording.stimuli.time_s.tolist() == [0.1, 0.2]
+    assert recording.stimuli.pattern.tolist() == [1, 2]
+    assert recording.spike_times_s.tolist() == [0.11, 0.21]
+    assert recording.channels.electrode[recording.spike_channels].tolist() == [2000, 1000]
+    assert "3 of 5 entries of /bits" in found(recording)["bits-not-rising"]
+
+
+# --- CL1 -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [0, 90_000_000])
+def test_cl1_spikes_and_stimuli_with_what_the_data_stream_says(tmp_path: Path, start: int) -> None:
+    mark = tmp_path / "unpickled"
+    path = write_cl1(
+        tmp_path / "a",
+        spikes=[(start + 50_000, 8), (start + 25_000, 63)],
+        stims=[(start + 1000, 9), (start + 1000, 12), (start + 6000, 9), (start + 11_000, 20)],
+        stream=[(start + 990, packed_text(said(5, 0))), (start + 10_000, packed_text(said(40, 1)))],
+        start=start,
+        mark=mark,
+    )
+    recording = read_recording(path)
+    assert not mark.exists()
+    assert recording.spike_times_s.tolist() == [1.0, 2.0]
+    assert recording.channels.electrode[recording.spike_channels].tolist() == [63, 8]
+    assert len(recording.channels) == 64
+    stimuli = recording.stimuli
+    assert stimuli.time_s.tolist() == [0.04, 0.24, 0.44]
+    assert stimuli.electrodes.tolist() == [[9, 12], [9, -1], [20, -1]]
+    assert stimuli.frequency_hz.tolist() == [5, 5, 40]
+    assert stimuli.is_last_of_presentation.tolist() == [False, True, True]
+    assert recording.presentation == Presentation("mixed", 2)
+    assert (recording.sampling_rate_hz, recording.duration_s) == (25_000.0, 10.0)
+
+
+def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
+    recording = read_recording(write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=[(1, 2)]))
+    assert np.isnan(recording.stimuli.frequency_hz).all()
+    assert len(read_recording(write_cl1(tmp_path / "b.h5", spikes=[(5, 1)], stims=None)).stimuli) == 0
+    path = write_cl1(tmp_path / "c.h5", spikes=None, stims=[(1, 2)], samples=np.zeros((10, 64), "<i2"))
+    with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\xd9\xff", packed_text("{" * 5000), packed_text("[]"), b"\xff" * 99])
+def test_what_the_data_stream_says_badly_is_left_out(tmp_path: Path, data: bytes) -> None:
+    path = write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=[(100, 2)], stream=[(50, data)])
+    assert np.isnan(read_recording(path).stimuli.frequency_hz).all()
+
+
+# --- NWB of other programs -------------------------------------------------------------------------------------------
+
+
+def other_nwb(path: Path, electrodes: bool = True, stimuli: tuple[str, ...] = ("pulses",)) -> Path:
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    if electrodes:
+        device = nwb.create_device(name="d")
+        group = nwb.create_electrode_group(name="g", description="g", location="in vitro", device=device)
+        for i in range(3):
+            nwb.add_electrode(location="in vitro", group=group, rel_x=10.0 * i, rel_y=5.0 * i)
+    for i, times in enumerate(([0.5, 2.0], [], [1.0])):
+        nwb.add_unit(spike_times=times, **({"electrodes": [2 - i]} if electrodes else {}))
+    for name in stimuli:
+        if name == "pulses":
+            table = pynwb.epoch.TimeIntervals(name=name, description="pulses")
+            table.add_column(name="frequency_hz", description="Hz")
+            table.add_column(name="stimulus_type", description="kind")
+            for t, kind in ((0.25, "left"), (0.75, "right")):
+                table.add_row(start_time=t, stop_time=t + 0.001, frequency_hz=20.0, stimulus_type=kind)
+            nwb.add_stimulus(table)
+        elif name == "events":
+            nwb.add_stimulus(pynwb.TimeSeries(name=name, data=[1.0, 0.0, 2.0], timestamps=[0.1, 0.2, 0.3], unit="V"))
+        elif name == "wave":
+            data = np.zeros(20_000)
+            for at in (1000, 9000):
+                data[at : at + 4], data[at + 4 : at + 8] = -1.0, 1.0
+            nwb.add_stimulus(pynwb.TimeSeries(name=name, data=data, rate=10_000.0, starting_time=1.0, unit="V"))
+        else:
+            nwb.add_acquisition(pynwb.TimeSeries(name=name, data=[1.0, 1.0], timestamps=[0.1, 0.9], unit="V"))
+    with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
+        nwb_io.write(nwb)
+    return path
+
+
+def test_other_nwb_units_with_electrodes_and_intervals(tmp_path: Path) -> None:
+    recording = read_recording(other_nwb(tmp_path / "a.nwb"))
+    assert recording.spike_times_s.tolist() == [0.5, 1.0, 2.0]
+    assert recording.spike_channels.tolist() == [0, 2, 0]
+    assert recording.channels.x_um.tolist() == [20.0, 10.0, 0.0]
+    assert recording.channels.y_um.tolist() == [10.0, 5.0, 0.0]
+    assert recording.stimuli.time_s.tolist() == [0.25, 0.75]
+    assert recording.stimuli.frequency_hz.tolist() == [20.0, 20.0]
+    assert recording.provenance["patterns"] == "0: left, 1: right"
+    assert recording.provenance["recorded_at"] == "2024-01-01T00:00:00+00:00"
+
+
+def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
+    recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
+    assert len(recording.channels) == 3
+    assert np.isnan(recording.channels.x_um).all()
+    assert "units-without-electrodes" in found(recording)
+
+
+@pytest.mark.parametrize(
+    ("name", "times_s"), [("events", [0.1, 0.3]), ("wave", [1.1, 1.9]), ("stim_ttl", [0.1, 0.9]), ("lever", [])]
+)
+def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[float]) -> None:
+    np.testing.assert_allclose(read_recording(other_nwb(tmp_path / "a.nwb", stimuli=(name,))).stimuli.time_s, times_s)
+
+
+def test_other_nwb_with_several_stimuli_lists_them(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb", stimuli=("pulses", "events", "lever"))
+    with pytest.raises(
+        InvalidFile, match=r"found 2: stimulus/presentation/events, stimulus/presentation/pulses; choose"
+    ):
+        read_recording(path)
+    assert read_recording(path, stimuli="events").stimuli.time_s.tolist() == [0.1, 0.3]
+    assert read_recording(path, stimuli="acquisition/lever").stimuli.time_s.tolist() == [0.1, 0.9]
+    with pytest.raises(InvalidFile, match=r"expected one of .*got nothing"):
+        read_recording(path, stimuli="nothing")
+
+
+def test_a_choice_that_a_format_does_not_offer_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidFile, match="part: expected only for MaxWell"):
+        read_recording(other_nwb(tmp_path / "a.nwb"), part="well000")
+    np.savez(tmp_path / "a.npz", spike_time_s=np.zeros(1))
+    with pytest.raises(InvalidArgument, match="only for HDF5 files"):
+        read_recording(tmp_path / "a.npz", stimuli="x")
+
+
+# --- what every reader refuses ---------------------------------------------------------------------------------------
+
+
+def test_links_to_other_files_are_never_followed(tmp_path: Path) -> None:
+    secret = tmp_path / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["spikes"] = spike_table([0.5], [9])
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=None, recorded=[9])
+    at = "wells/well000/rec0000"
+    with h5py.File(path, "r+") as file:
+        file[f"{at}/spikes"] = h5py.ExternalLink(str(secret), "/spikes")
+    with pytest.raises(InvalidFile, match="is a link to another file, which is never followed"):
+        read_recording(path)
+    with h5py.File(path, "r+") as file:
+        del file[f"{at}/spikes"]
+        file["out"] = h5py.ExternalLink(str(secret), "/")
+        file[f"{at}/spikes"] = h5py.SoftLink("/out/spikes")
+    with pytest.raises(InvalidFile, match="is a link to another file, which is never followed"):
+        read_recording(path)
+    with h5py.File(path, "r+") as file:
+        del file[f"{at}/spikes"]
+        file[f"{at}/spikes"] = h5py.SoftLink(f"/{at}/spikes")
+    with pytest.raises(InvalidFile, match="links in a circle"):
+        read_recording(path)
+
+
+def test_values_in_other_files_are_never_read(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(bytes(800))
+    path = other_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "r+") as file:
+        del file["units/spike_times"]
+        file.create_dataset("units/spike_times", (3,), "f8", external=[(str(tmp_path / "secret"), 0, 24)])
+    with pytest.raises(InvalidFile, match="they lie in other files, which are never opened"):
+        read_recording(path)
+    with h5py.File(path, "r+") as file:
+        del file["units/spike_times"]
+        layout = h5py.VirtualLayout((3,), "f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", (3,))
+        file.create_virtual_dataset("units/spike_times", layout)
+    with pytest.raises(InvalidFile, match="they lie in other files, which are never opened"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("shape", [(2**40,), (2**62,), (2**31, 2**20)])
+def test_absurd_sizes_are_refused_before_memory_is_asked_for(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = other_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "r+") as file:
+        del file["units/spike_times"]
+        file.create_dataset("units/spike_times", shape, "f8", chunks=(1024,) + (1,) * (len(shape) - 1))
+    with pytest.raises(InvalidFile, match=r"claims [\d,]+ values, more than a file of"):
+        read_recording(path)
