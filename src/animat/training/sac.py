@@ -392,4 +392,5 @@ def _average(settings: SAC, deployed: Network, actor: Network, index: Int[Array,
 
 
 def _adam(settings: SAC) -> optax.GradientTransformation:
-    return optax.adam(settings.learning_rate)
+    # Flat, as one long vector compiles faster than nineteen arrays and runs as fast.
+    return optax.flatten(optax.adam(settings.learning_rate))
