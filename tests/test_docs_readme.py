@@ -1,0 +1,55 @@
+"""The README against the product: its links, its commands, its code."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import animat
+from animat.cli import _parse
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "benchmarks" / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+COMMANDS = re.findall(r"\.venv/bin/animat ([^\n&#`]+)", README)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
+    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_is_one_that_animat_knows(command: str) -> None:
+    _parse(shlex.split(command))
+
+
+def test_the_two_commands_are_one_line_each_and_the_second_is_what_ci_runs() -> None:
+    assert [block.count("\n") for block in BLOCKS[:2]] == [1, 1]
+    wanted = [line for line in README.splitlines() if line.endswith("python -m pytest")]
+    assert wanted == [BLOCKS[1].strip()]
+
+
+def test_the_code_for_gymnasium_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[0]
+    exec(compile(code, "README.md", "exec"), {})
+    rate_hz, command = map(float, capsys.readouterr().out.split())
+    assert rate_hz >= 0
+    assert -1 <= command <= 1
+
+
+def test_the_names_in_the_python_example_are_public() -> None:
+    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
+    names = re.findall(r"from animat import (.*)", code)[0].split(", ")
+    assert set(names) <= set(animat.__all__)
