@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcommand
 
 from animat.cli_convert import Convert
-from animat.cli_loop import Recover, Run
+from animat.cli_loop import Live, Recover, Run
 from animat.cli_studies import Reproduce, StudyFile
 from animat.errors import AnimatError, InvalidArgument, Mismatch
 from animat.recordings.findings import Finding
@@ -314,6 +314,7 @@ Command = (
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[StudyFile, subcommand("study")]
     | Annotated[Run, subcommand("run")]
+    | Annotated[Live, subcommand("live")]
     | Annotated[Recover, subcommand("recover")]
 )
 
@@ -344,7 +345,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parse(
     arguments: list[str],
-) -> Record | Inspect | Convert | Train | Evaluate | Reproduce | StudyFile | Run | Recover:
+) -> Record | Inspect | Convert | Train | Evaluate | Reproduce | StudyFile | Run | Live | Recover:
     """Read the command line; usage errors come in one line, not in a box."""
     said = io.StringIO()
     try:

@@ -171,6 +171,117 @@ class Run(Stimulating):
 
 
 @dataclass(frozen=True)
+class Live(Stimulating):
+    """Parameter shadowing on one culture while it lives: record, train, refresh, then run in closed loop."""
+
+    robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
+    """The robot to drive"""
+    mapping: Literal["1-threshold", "9-thresholds", "linear"] = "1-threshold"
+    """From responses to motor commands"""
+    policies: int = 5
+    """How many policies, each from its own random numbers"""
+    order: Literal["mixed", "blocked"] = "mixed"
+    """How recordings are presented; mixed is how a closed loop presents"""
+    pulses: int = 5
+    """Pulses a presentation, the last one read"""
+    presentations: int = 100
+    """Of each frequency in a recording"""
+    interval_min: float = 10.0
+    """Minutes of the culture's clock from one recording to the next"""
+    duration_min: float = 60.0
+    """Minutes of the culture's clock that training lasts"""
+    speed: float | None = None
+    """Minutes of the culture's clock in one of ours; default: 30 for a simulated culture, 1 for a living one"""
+    episodes: int = 5
+    """Of each policy in closed loop, at the end"""
+    controls: Literal["all", "random"] = "random"
+    """Run between the policies' episodes"""
+    percentiles: Literal["moving", "first"] = "moving"
+    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    simulator: Literal["histogram", "empirical"] = "histogram"
+    """histogram: a distribution in bins (the paper); empirical: draw a measured value"""
+    recordings: tuple[Path, ...] = ()
+    """For a replay: what it answers from"""
+    seed: int = 1
+    """Decides every random draw, but what the culture does and when simulators are swapped"""
+    out: Path = Path("live")
+    """Folder for recordings, policies, the session, and live.log"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Live."""
+        from animat.compilation import keep_compilations
+        from animat.cultures.budget import Account, Budget
+        from animat.cultures.kinds import culture_of, pulse_for
+        from animat.live.shadowing import Pace, live
+        from animat.mapping import mapping_named
+        from animat.progress import Bar
+        from animat.recordings.protocol import Protocol
+        from animat.recordings.reading import read_recordings
+        from animat.robots.registry import robot_named
+        from animat.training.specification import Training
+
+        simulated = self.culture != "cl1"
+        if self.speed is not None and self.speed != 1 and not simulated:
+            raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
+        pace = Pace(self.interval_min, self.duration_min, self.speed or (30.0 if simulated else 1.0))
+        robot = robot_named(self.robot)
+        training = Training(
+            robot,
+            mapping_named(self.mapping),
+            policies=self.policies,
+            iterations=robot.paper_iterations,
+            seed=self.seed,
+            percentiles=self.percentiles,
+        )
+        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        keep_compilations()
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        seed = 1 if self.culture_seed is None else self.culture_seed
+        with (
+            Bar("live") as progress,
+            culture_of(self.culture, seed=seed, recordings=recordings, progress=progress) as culture,
+        ):
+            lived = live(
+                training,
+                culture,
+                Protocol(
+                    order=self.order,
+                    pulses=self.pulses,
+                    patterns=min(100, len(culture.patterns)),
+                    presentations=self.presentations,
+                    pulse=pulse_for(self.culture),
+                ),
+                self.out,
+                pace=pace,
+                episodes=self.episodes,
+                with_controls=self.controls == "all",
+                kind=self.simulator,
+                account=account,
+                progress=progress,
+                on_burst=self.on_burst,
+                on_late=self.on_late,
+                pause_s=self.pause_s,
+                patience_s=self.patience_s,
+            )
+        print(
+            f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
+            f"({lived.wall_s:.0f} s of ours); {lived.iterations:,} iterations of each policy, never stopped; "
+            f"{len(lived.swaps)} swaps of simulators:"
+        )
+        for swap in lived.swaps:
+            print(
+                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
+                f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
+            )
+        _say(lived.gap.findings)
+        print(lived.gap.to_text())
+        _expect_no_fault(lived.gap.session.ending, self.out)
+        return lived.to_dict()
+
+
+@dataclass(frozen=True)
 class Recover:
     """Write the recording of a closed-loop session that was killed, from its log."""
 
@@ -197,6 +308,10 @@ def _expect_no_fault(ending: Ending, folder: Path) -> None:
         raise KeyboardInterrupt
     if ending.by != "plan":
         raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
+
+
+def _range(members: Sequence[int]) -> str:
+    return f"p{members[0]} to p{members[-1]}" if len(members) > 1 else f"p{members[0]}"
 
 
 def _say(findings: Sequence[Finding]) -> None:

@@ -1,0 +1,323 @@
+"""Parameter shadowing as the paper meant it: the culture is recorded while policies train on what it was last."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from animat.cultures.base import Culture
+from animat.cultures.budget import Account
+from animat.cultures.series import recording_name
+from animat.errors import BudgetSpent, InvalidArgument, Mismatch, UnusableData
+from animat.live.exchange import Exchange
+from animat.live.recording import record_within
+from animat.live.trainers import Trainers
+from animat.neurons.responses import Responses
+from animat.neurons.series import extract_series
+from animat.neurons.simulator import Kind
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.progress import Progress, Silent
+from animat.reality_gap import Calibration, RealityGap, run_policies
+from animat.recordings.protocol import Protocol
+from animat.training.group import Group, split_groups
+from animat.training.policy import Policy
+from animat.training.specification import Training
+from animat.training.trainer import describe
+
+LOG_FILE = "live.log"
+RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
+_POLL_S = 0.1
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When the culture is recorded.
+
+    Attributes:
+        interval_min: of the culture's clock, between the starts of two recordings.
+        duration_min: of the culture's clock, from the first recording to the end of training.
+        speed: minutes of the culture's clock in one of ours: 1 for a living one.
+
+    Raises:
+        InvalidArgument: for a number that is not above 0.
+    """
+
+    interval_min: float = 10.0
+    duration_min: float = 60.0
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("interval_min", "duration_min", "speed"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")
+
+    @property
+    def recordings(self) -> int:
+        """How many are made: the end of training needs none."""
+        return math.ceil(self.duration_min / self.interval_min - 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Lived:
+    """What came of a live run.
+
+    Attributes:
+        recordings: the files.
+        policies: by name.
+        swaps: every time that a group of policies went over to newer simulators, dated.
+        iterations: that each policy was trained for at least.
+        culture_min, wall_s: how long it took from the first recording to the end of training.
+        gap: predicted against lived return.
+    """
+
+    recordings: tuple[Path, ...]
+    policies: dict[str, Policy]
+    swaps: tuple[dict[str, Any], ...]
+    iterations: int
+    culture_min: float
+    wall_s: float
+    gap: RealityGap
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "recordings": [str(file) for file in self.recordings],
+            "policies": list(self.policies),
+            "swaps": list(self.swaps),
+            "iterations": self.iterations,
+            "culture_min": self.culture_min,
+            "wall_s": self.wall_s,
+            "closed_loop": self.gap.to_dict(),
+        }
+
+
+def live(
+    training: Training,
+    culture: Culture,
+    protocol: Protocol,
+    folder: str | os.PathLike[str],
+    *,
+    pace: Pace | None = None,
+    episodes: int = 5,
+    with_controls: bool = False,
+    kind: Kind = "histogram",
+    account: Account | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Lived:
+    """Record a culture again and again while policies train on its newest simulators, then run them on it.
+
+    The culture is recorded; training starts at once, in processes of its own, and never stops; every `interval_min` the
+    culture is recorded again, and each group of policies goes over to the new simulators at its next chunk. Training
+    ends at `duration_min`, however many iterations that were; `training.iterations` sets the length of a chunk only.
+    Then the policies run in closed loop, with percentiles of the last recording they were trained on.
+
+    A simulated culture whose clock runs fast is not recorded again before all have gone over to the last simulators.
+
+    Args:
+        training: robot, mapping, policies, seed, algorithm; its duration is set to the pace's.
+        culture: open.
+        protocol: of every recording.
+        folder: for `recordings/`, `policies/`, `session/` and `live.log`, a line of JSON each time something happened.
+        pace: when to record.
+        episodes: of each policy in closed loop.
+        with_controls: all of them between the policies' episodes; if not, only the random one.
+        kind: of simulator.
+        account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
+        progress: told as the culture's time goes by, and in the closed loop.
+        settings: of the closed loop (`animat.closed_loop.loop.Loop`).
+
+    Raises:
+        InvalidArgument: for a training without neurons, or recordings that take longer than an interval.
+        Mismatch: if something is in the folder already.
+        BudgetSpent: if the budget does not hold the first recording.
+        AnimatError: if a process that trains fails.
+    """
+    run = _Run(training, culture, protocol, Path(folder), pace or Pace(), kind, account or Account(), progress)
+    policies = run.shadow()
+    try:
+        calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
+        if training.percentiles == "first":
+            first = Calibration.of_series(run.used[:1], kind=kind).simulator.percentiles
+            held = replace(calibration.simulator, percentiles=first)  # type: ignore[type-var]
+            calibration = replace(calibration, simulator=held)
+        gap = run_policies(
+            policies,
+            culture,
+            calibration,
+            run.folder / SESSION,
+            episodes=episodes,
+            with_controls=with_controls,
+            seed=training.seed,
+            account=run.account,
+            progress=progress,
+            pulse=protocol.pulse,
+            patterns=protocol.patterns,
+            **settings,
+        )
+        run.write("closed loop", **gap.session.to_dict())
+    finally:
+        run.write("end", budget=run.account.to_dict())
+    return Lived(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
+
+
+class _Run:
+    def __init__(
+        self,
+        training: Training,
+        culture: Culture,
+        protocol: Protocol,
+        folder: Path,
+        pace: Pace,
+        kind: Kind,
+        account: Account,
+        progress: Progress | None,
+    ) -> None:
+        if training.mapping is None:
+            raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
+        takes_min = culture.schedule(protocol).duration_s / 60
+        if takes_min > pace.interval_min:
+            raise InvalidArgument(
+                f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got "
+                f"{pace.interval_min:g}"
+            )
+        if folder.exists() and any(folder.iterdir()):
+            raise Mismatch(f"{folder}: expected an empty folder for a live run, got one with files: choose another")
+        self.folder, self.account = folder, account
+        self.files: list[Path] = []
+        self.used: list[Responses] = []
+        self.swaps: list[dict[str, Any]] = []
+        self.iterations, self.culture_min, self.wall_s = 0, 0.0, 0.0
+        self._training = replace(training, duration_min=pace.duration_min, shadowing=True)
+        self._culture, self._protocol, self._pace, self._kind = culture, protocol, pace, kind
+        self._progress = progress or Silent()
+        self._zero_s, self._wall_zero_s = culture.now_s, time.monotonic()
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def shadow(self) -> dict[str, Policy]:
+        """Record and train to the end; returns the policies."""
+        exchange = Exchange(self.folder / ".exchange")
+        timeline = self._record(0)
+        if timeline is None:
+            raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
+        exchange.publish(0, float(timeline.start_min[-1]), _newest(timeline))
+        groups = self._groups(timeline)
+        with Trainers(groups, exchange, self.folder / POLICIES) as trainers:
+            self.write("training", policies=self._training.policies, processes=len(groups))
+            try:
+                self._shadow(exchange, trainers)
+            except KeyboardInterrupt:
+                # Whoever ends it early keeps the policies as they are.
+                self._culture.stop("stopped by a person (Ctrl-C)")
+                self.write("interrupted")
+                trainers.finish()
+                raise
+            self._note(trainers.finish())
+            self.iterations = trainers.iterations
+        self.culture_min = (self._culture.now_s - self._zero_s) / 60
+        self.wall_s = time.monotonic() - self._wall_zero_s
+        self.write("trained", iterations=self.iterations, swaps=len(self.swaps), wall_s=round(self.wall_s, 1))
+        shutil.rmtree(exchange.folder, ignore_errors=True)
+        policies = self.folder / POLICIES
+        return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self._training.policies)}
+
+    def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
+        published, in_budget = 0, True
+        for number in range(1, self._pace.recordings + 1):
+            self._wait(number * self._pace.interval_min, trainers, published)
+            if number == self._pace.recordings or not in_budget:
+                continue
+            try:
+                timeline = self._record(number)
+            except BudgetSpent as spent:
+                self.write("budget", sentence=str(spent))
+                in_budget = False
+                continue
+            if timeline is not None:
+                published = number
+                exchange.publish(number, float(timeline.start_min[-1]), _newest(timeline))
+
+    def _wait(self, minute: float, trainers: Trainers, number: int) -> None:
+        """Let the culture's clock come to a minute of the run, training going on."""
+        minute = min(minute, self._pace.duration_min)
+        due_s = self._wall_zero_s + 60 * minute / self._pace.speed
+        while time.monotonic() < due_s or not trainers.all_use(number):
+            self._note(trainers.swaps(_POLL_S))
+            passed_min = (time.monotonic() - self._wall_zero_s) * self._pace.speed / 60
+            told = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
+            note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{told}"
+            self._progress.update(min(passed_min, minute), self._pace.duration_min, note)
+        self._culture.rest(max(0.0, self._zero_s + 60 * minute - self._culture.now_s))
+
+    def _record(self, number: int) -> SimulatorTimeline | None:
+        """Record and fit; None where the recording cannot be trained on, which is written down."""
+        began_s = time.monotonic()
+        # Other cultures and other recordings have other orders.
+        seed = self._training.seed * 10_000 + number
+        recording = record_within(self.account, self._culture, self._protocol, seed)
+        file = self.folder / RECORDINGS / recording_name(round(recording.start_min, 3))
+        recording.save(file)
+        self.files.append(file)
+        try:
+            series = [*self.used, *extract_series([recording])]
+            timeline = self._fit(series)
+        except (UnusableData, Mismatch) as error:
+            self.write("unusable", file=file.name, sentence=str(error))
+            return None
+        self.used = series
+        self.write(
+            "recording",
+            file=file.name,
+            number=number,
+            took_s=round(time.monotonic() - began_s, 2),
+            budget=self.account.to_dict(),
+        )
+        return timeline
+
+    def _fit(self, series: Sequence[Responses]) -> SimulatorTimeline:
+        # All are fitted again, so that histograms have the range of the first recording, and one shape.
+        timeline = fit_timeline(series, kind=self._kind)
+        return timeline.with_first_percentiles() if self._training.percentiles == "first" else timeline
+
+    def _groups(self, timeline: SimulatorTimeline) -> list[Group]:
+        timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
+        manifest = describe(self._training, timeline)
+        provenance = {key: value for key, value in manifest.items() if key not in ("sources", "recorded_at_min")}
+        return [
+            Group(self._training, members, timeline, manifest["fingerprint"], provenance)
+            for members in split_groups(self._training.policies)
+        ]
+
+    def _note(self, swaps: Sequence[dict[str, Any]]) -> None:
+        for swap in swaps:
+            if swap["swap"] > 0:
+                self.swaps.append({**swap, **self.write("swap", **swap)})
+            else:
+                self.write("training began", **swap)
+
+    def write(self, what: str, **words: Any) -> dict[str, Any]:
+        """Put down that something happened, with the date and both clocks."""
+        line = {
+            "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
+            "culture_min": round((self._culture.now_s - self._zero_s) / 60, 4),
+            "what": what,
+            **words,
+        }
+        with (self.folder / LOG_FILE).open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        return line
+
+
+def _newest(timeline: SimulatorTimeline) -> Any:
+    return jax.device_get(timeline.at(float(timeline.start_min[-1])))

@@ -1,0 +1,71 @@
+"""A process that trains one group of policies until it is told to end: `python -m animat.live.worker CPU`.
+
+The job comes pickled on standard input, from the process that records. Before each chunk the newest simulator is taken
+from the exchange; progress and swaps go out as JSON lines.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+
+def main() -> int:
+    """Read a job, train until the exchange says to finish, write the policies."""
+    # JAX sizes its thread pool by the cores it may use: pin first. Ctrl-C is for the process that records, which ends
+    # this one by the exchange.
+    os.sched_setaffinity(0, {int(sys.argv[1])})
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from animat.training.worker import end_with_parent
+
+    end_with_parent()
+
+    from animat.compilation import keep_compilations
+    from animat.errors import AnimatError
+    from animat.live.exchange import Exchange
+    from animat.training.group import Group, SideBySide
+
+    keep_compilations()
+    group: Group
+    exchange: Exchange
+    folder: Path
+    group, exchange, folder = pickle.load(sys.stdin.buffer)
+
+    def tell(**words: Any) -> None:
+        print(json.dumps({"members": group.members, **words}), flush=True)
+
+    try:
+        swaps: list[dict[str, Any]] = []
+        # The policies tell what they were trained on, the last of it known only in the end.
+        group = replace(group, provenance={**group.provenance, "swaps": swaps})
+        together = SideBySide(group)
+        number, simulator, index = -1, None, 0
+        while not (exchange.is_finished and index):
+            newer = exchange.newest(number)
+            if newer is not None:
+                number, start_min, simulator = newer
+                iterations = group.training.chunk(index)[0] * group.training.algorithm.environments
+                swaps.append({"chunk": index, "iterations": iterations, "recorded_at_min": start_min})
+                tell(swap=number, **swaps[-1])
+            if simulator is None:
+                raise AnimatError("live: expected a simulator in the exchange before training began, got none")
+            mean_return = together.train(index, simulator)
+            index += 1
+            iterations = group.training.chunk(index)[0] * group.training.algorithm.environments
+            tell(done=index, using=number, iterations=iterations, mean_return=mean_return)
+        for member, policy in zip(group.members, together.policies(), strict=True):
+            policy.save(folder / f"p{member}.safetensors")
+    except AnimatError as error:
+        tell(error=str(error))
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
