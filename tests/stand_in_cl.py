@@ -44,13 +44,14 @@ class Neurons:
         self.pulses: list[tuple[int, int, StimDesign]] = []
         self.queue: list[tuple[int, int, StimDesign]] = []
         self.late_frames = 0
+        self.in_loop = False
         self.drop: set[int] = set()
         self.fail: Exception | None = None
         self.interrupted = 0
         self.stream: list[tuple[int, Any]] = []
 
     def timestamp(self) -> int:
-        return self.now + self.late_frames
+        return self.now + (self.late_frames if self.in_loop else 0)
 
     def get_frames_per_second(self) -> int:
         return 25_000
@@ -100,7 +101,9 @@ class Neurons:
             stims = [SimpleNamespace(timestamp=f, channel=c) for f, c, _ in done]
             spikes = [SimpleNamespace(timestamp=f, channel=c) for f, c, _ in done if f % 7 == 0]
             found = SimpleNamespace(start_timestamp=first, stop_timestamp=last, spikes=spikes, stims=stims)
+            self.in_loop = True
             yield SimpleNamespace(analysis=found, loop=stop, iteration_timestamp=last)
+            self.in_loop = False
 
 
 def install(patch: pytest.MonkeyPatch) -> Neurons:
