@@ -108,7 +108,7 @@ def test_what_begins_late_keeps_its_distance_from_what_was_before(neurons: Neuro
         neurons.late_frames = 0
         culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.1)
     first, second = [frame for frame, _, _ in neurons.pulses]
-    # Without its wait the second would come 75 frames after the first: 3 ms, not 5.
+    # Without its wait the second would come 50 frames after the first: 2 ms, not 5.
     assert 125 <= second - first <= 150
 
 

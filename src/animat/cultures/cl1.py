@@ -93,7 +93,7 @@ class CL1Culture(Culture):
         *,
         seed: int = 0,
         ticks_per_s: int = 1000,
-        margin_ms: float = 1.0,
+        margin_ms: float = 0.5,
         jitter_tolerance_ms: float | None = None,
         pitch_um: float | None = None,
         record_to: str | os.PathLike[str] | None = None,
