@@ -1,0 +1,229 @@
+"""How fast the closed loop decides, and whether it keeps its deadlines, beside an idle loop in the same run.
+
+    python benchmarks/loop.py [--ticks 100000] [--minutes 10] [--json results.json]
+
+Decision: from the end of the response window, when a culture of 1,024 channels has handed over its spikes, until the
+next stimulus has passed the guard and is handed to the culture. In between lie the extraction of the response, the
+mapping, the robot's step, the log, the policy, the patterns and the safety limits. Beside it, the jitter of the
+machine: a loop that does nothing but wait for as long as a decision takes.
+
+Deadlines: a session in real time at 80 Hz, where 2.4 ms are left from the window's end to the next pulse, in pieces
+that take turns with an idle loop which only sleeps from one window's end to the next.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from animat.closed_loop.contenders import Contender, Greedy
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.closed_loop.timing import WallClock
+from animat.cultures.base import Culture
+from animat.cultures.observed import Observed, Spikes
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
+from animat.mapping import mapping_named
+from animat.neurons.conditions import Condition
+from animat.recordings.recording import Channels
+from animat.robots import Cartpole
+from animat.training.policy import Policy
+
+CHANNELS = 1024
+SPIKES = 300
+"""In one stretch of 10 ms: what 1,024 channels answer at 20 Hz each, and half as much again."""
+PERIOD_S, WINDOW_S = 1 / 80, 0.0101
+CONDITIONS = tuple(Condition(f"{hz} Hz", float(hz), "Hz") for hz in (5, 10, 20, 40, 80))
+
+
+class Instant(Culture):
+    """1,024 channels that answer at once, from a store of spikes, and note when they are asked and have answered."""
+
+    name: ClassVar[str] = "instant"
+
+    def __init__(self, deliveries: int) -> None:
+        super().__init__()
+        rng = np.random.default_rng(1)
+        self._store = [Spikes(np.sort(rng.random(SPIKES) * 0.01), rng.integers(0, CHANNELS, SPIKES)) for _ in range(64)]
+        self._now_ns = 0
+        self.asked_ns, self.answered_ns = np.zeros(deliveries, np.int64), np.zeros(deliveries, np.int64)
+        self.number = 0
+
+    @property
+    def channels(self) -> Channels:
+        n = np.arange(CHANNELS)
+        return Channels(label=n.astype(np.str_), electrode=n, x_um=17.5 * n, y_um=0.0 * n)
+
+    @property
+    def stimulation_electrodes(self) -> tuple[int, ...]:
+        return tuple(range(32))
+
+    @property
+    def patterns(self) -> np.ndarray:
+        rng = np.random.default_rng(2)
+        return np.array([rng.choice(32, 5, replace=False) for _ in range(100)])
+
+    @property
+    def device_limits(self) -> Limits:
+        return SIMULATED_LIMITS
+
+    @property
+    def now_s(self) -> float:
+        return self._now_ns / 1e9
+
+    @property
+    def sampling_rate_hz(self) -> float:
+        return 20_000.0
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        return {"source": "a store of random spikes"}
+
+    def _open(self) -> None:
+        pass
+
+    def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        asked_ns = time.perf_counter_ns()
+        number, self.number = self.number, self.number + 1
+        start_s = self.now_s
+        self._now_ns += round(duration_s * 1e9)
+        first_s = admitted.stimuli[0].time_s if admitted.stimuli else 0.0
+        stored = self._store[number % len(self._store)]
+        spikes = Spikes(stored.time_s + first_s, stored.channel) if admitted.stimuli else Spikes(*_NOTHING)
+        observed = Observed(start_s, duration_s, spikes, np.array([s.time_s for s in admitted.stimuli], np.float64))
+        if number < len(self.asked_ns):
+            self.asked_ns[number] = asked_ns
+            self.answered_ns[number] = time.perf_counter_ns()
+        return observed
+
+    def _rest(self, duration_s: float) -> None:
+        self._now_ns += round(duration_s * 1e9)
+
+    def _halt(self) -> None:
+        pass
+
+    def _close(self) -> None:
+        pass
+
+
+_NOTHING = np.empty(0), np.empty(0, np.int64)
+
+
+def policy() -> Policy:
+    """Two hidden layers of 64 units, as trained ones have; its weights are random but for the last condition's bias."""
+    rng = np.random.default_rng(3)
+    sizes = (4, 64, 64, 5)
+    weights = tuple((rng.standard_normal((a, b)) / np.sqrt(a)).astype(np.float32) for a, b in itertools.pairwise(sizes))
+    biases = (*(np.zeros(n, np.float32) for n in sizes[1:3]), np.array([0, 0, 0, 0, 1e6], np.float32))
+    return Policy(
+        weights,
+        biases,
+        np.ones(4, np.float32),
+        Cartpole(),
+        mapping_named("9-thresholds"),
+        CONDITIONS,
+        None,
+        (2.0, 10.0),
+    )
+
+
+def loop_of(iterations: int, **settings: Any) -> Loop:
+    """A loop whose robot never falls: an episode lasts as long as is measured."""
+    robot = Cartpole(track_length_m=1e8, angle_limit_rad=1e8, force_n=0.0, episode_limit=iterations)
+    return Loop(robot, mapping_named("9-thresholds"), CONDITIONS, np.linspace(0, 40, 11), pause_s=0.1, **settings)
+
+
+def decisions_us(ticks: int) -> np.ndarray:
+    """How long each decision took."""
+    with tempfile.TemporaryDirectory() as folder, Instant(ticks + 1) as culture:
+        contender = Contender("policy", "random weights", Greedy(policy()))
+        session = run_session(culture, loop_of(ticks), [contender], folder, episodes=1)
+        assert session.ending.by == "plan", session.ending
+        assert len(session.ticks) == ticks
+        # Number 0 is the pause, and the first decision is made at its end.
+        return (culture.asked_ns[1:] - culture.answered_ns[:-1]) / 1e3
+
+
+def idle_us(waits: int, length_us: float) -> np.ndarray:
+    """How long a wait of `length_us` took, that does nothing but look at the clock."""
+    took = np.empty(waits)
+    now = time.perf_counter_ns
+    for i in range(waits):
+        began = now()
+        while now() - began < 1e3 * length_us:
+            pass
+        took[i] = (now() - began) / 1e3
+    return took
+
+
+def late_ms(seconds: float) -> np.ndarray:
+    """How late each pulse of a session in real time at 80 Hz came."""
+    ticks = round(seconds / PERIOD_S)
+    with tempfile.TemporaryDirectory() as folder, Instant(0) as culture:
+        contender = Contender("policy", "random weights", Greedy(policy()))
+        session = run_session(culture, loop_of(ticks, real_time=True), [contender], folder, episodes=1)
+        assert session.ending.by == "plan", session.ending
+        return np.array([1e3 * tick.late_s for tick in session.ticks])
+
+
+def idle_late_ms(seconds: float) -> np.ndarray:
+    """How late an idle loop is for the same deadlines: it sleeps until each window's end and has nothing to do then."""
+    clock, late = WallClock(), []
+    began = clock.now_s()
+    for tick in range(round(seconds / PERIOD_S)):
+        window_ends_s = began + tick * PERIOD_S + WINDOW_S
+        clock.sleep_until(window_ends_s)
+        late.append(1e3 * max(0.0, clock.now_s() - (began + (tick + 1) * PERIOD_S)))
+    return np.array(late)
+
+
+def outline(us: np.ndarray) -> dict[str, float]:
+    """Percentiles."""
+    return {
+        "median": float(np.median(us)),
+        "p99": float(np.percentile(us, 99)),
+        "p99.9": float(np.percentile(us, 99.9)),
+        "largest": float(us.max()),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
+    parser.add_argument("--ticks", type=int, default=100_000)
+    parser.add_argument("--minutes", type=float, default=10.0, help="of the session in real time; 0 leaves it out")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args()
+
+    decided = outline(decisions_us(options.ticks))
+    idle = outline(idle_us(options.ticks, decided["median"]))
+    print(f"from the window's end to the next stimulus, {CHANNELS} channels, {options.ticks:,} ticks (us)")
+    print(f"  {'':24} {'median':>8} {'p99':>8} {'p99.9':>8} {'largest':>9}")
+    for name, us in (("closed loop", decided), ("idle, the same median", idle)):
+        print(f"  {name:24} {us['median']:8.1f} {us['p99']:8.1f} {us['p99.9']:8.1f} {us['largest']:9.1f}")
+    measured: dict[str, Any] = {"decision_us": decided, "idle_us": idle, "ticks": options.ticks}
+
+    if options.minutes > 0:
+        pieces = max(1, round(options.minutes))
+        seconds = 60 * options.minutes / pieces
+        late, idle_late = [], []
+        for _ in range(pieces):
+            late.append(late_ms(seconds))
+            idle_late.append(idle_late_ms(seconds))
+        print(f"deadlines at 80 Hz, {options.minutes:g} min in real time and as much of the idle loop between")
+        for name, each in (("closed loop", np.concatenate(late)), ("idle loop", np.concatenate(idle_late))):
+            measured[f"deadlines, {name}"] = {"missed": int(np.sum(each > 0)), "of": len(each), "latest_ms": each.max()}
+            print(f"  {name:24} {np.sum(each > 0):6} missed of {len(each):,}; the latest by {each.max():.2f} ms")
+    if options.json:
+        options.json.write_text(json.dumps(measured, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
