@@ -1,1 +1,1 @@
-"""TODO."""
+"""How good policies are: episodes, controls beside them, statistics, and the best possible return."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""What stimulation does: responses, bursts set apart, and neuron simulators made of them."""
