@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -157,6 +160,26 @@ def test_an_emergency_stop_half_way_delivers_nothing_more(neurons: Neurons) -> N
         assert neurons.queue == []
         culture.advance(0.5)
         assert len(neurons.pulses) == delivered
+
+
+def test_a_stop_from_another_thread_lets_nothing_through_after_it(neurons: Neurons) -> None:
+    """Stops at random times: no pulse is handed over once `stop` has returned."""
+    for delay_s in np.random.default_rng(0).uniform(0, 0.02, 30).tolist():
+        with CL1Culture() as culture:
+
+            def stop(culture: CL1Culture = culture, delay_s: float = delay_s) -> None:
+                time.sleep(delay_s)
+                culture.stop("from outside")
+
+            thread = threading.Thread(target=stop)
+            thread.start()
+            with contextlib.suppress(DeviceFailed, UnsafeStimulus):
+                culture.deliver([Stimulus(0.0125 * i, (1,), CL1_PULSE) for i in range(400)], 6.0)
+            thread.join()
+            assert neurons.queue == []
+            delivered = len(neurons.pulses)
+            culture.advance(0.5)
+            assert len(neurons.pulses) == delivered
 
 
 def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -178,6 +178,23 @@ def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
     assert len(rig.delivered) == 5
 
 
+def test_whatever_goes_wrong_meanwhile_takes_the_power(rig: Rig) -> None:
+    for wrong in (KeyboardInterrupt, DeviceFailed):
+        with culture_on(rig) as culture:
+
+            def on_send(wrong: type[BaseException] = wrong) -> None:
+                raise wrong("now")
+
+            rig.on_send = on_send
+            with pytest.raises(wrong):
+                culture.deliver([Stimulus(0.0, (SITES[0],), BALANCED_PULSE)], 0.1)
+            assert not rig.powered
+            rig.on_send = None
+            with pytest.raises(DeviceFailed, match="stopped"):
+                culture.deliver([Stimulus(0.1, (SITES[0],), BALANCED_PULSE)], 0.2)
+        assert rig.delivered == []
+
+
 def test_closing_leaves_no_unit_powered(rig: Rig) -> None:
     with culture_on(rig):
         assert sum(bool(unit["power"]) for unit in rig.units.values()) == 32

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -122,6 +123,7 @@ class CL1Culture(Culture):
         self._stream: Any = None
         self._delivery: Delivery | None = None
         self._is_halted = False
+        self._lock = threading.RLock()
         self.spikes_not_on_electrodes = 0
         """Spikes that the device reported on ground or reference, which are no recording electrodes; left out."""
 
@@ -202,6 +204,7 @@ class CL1Culture(Culture):
             margin_frames=self._margin_frames,
             jitter=self._jitter,
             keep=self._keep,
+            lock=self._lock,
         )
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
@@ -246,8 +249,9 @@ class CL1Culture(Culture):
             raise DeviceFailed(f"CL1: expected {duration_s:g} s to pass, got {_line(error)}") from error
 
     def _halt(self) -> None:
-        self._is_halted = True
-        self._interrupt()
+        with self._lock:
+            self._is_halted = True
+            self._interrupt()
 
     def _close(self) -> None:
         try:

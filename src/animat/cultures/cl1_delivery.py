@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -39,6 +40,7 @@ class Delivery:
         margin_frames: least time from now to the run of a plan.
         jitter: what the loop is told of jitter.
         keep: called with frame and parameters of each pulse handed over.
+        lock: held while a pulse is handed over.
     """
 
     def __init__(
@@ -51,10 +53,11 @@ class Delivery:
         margin_frames: int,
         jitter: dict[str, Any],
         keep: Callable[[int, dict[str, Any]], None],
+        lock: AbstractContextManager[Any],
     ) -> None:
         self._cl, self._neurons, self._pace = cl, neurons, pace
         self._ticks_per_s, self._margin_frames, self._jitter = ticks_per_s, margin_frames, jitter
-        self._keep = keep
+        self._keep, self._lock = keep, lock
         self._designs: dict[Pulse, Any] = {}
 
     def run(self, stimuli: Sequence[Stimulus], duration_s: float, *, is_halted: Callable[[], bool]) -> Ran:
@@ -79,13 +82,12 @@ class Delivery:
             channels += [spike.channel for spike in found.spikes]
             for pulse in sorted(found.stims, key=lambda pulse: pulse.timestamp):
                 reported[pulse.channel].append(pulse.timestamp)
-            if stimuli and is_halted():
-                raise DeviceFailed(
-                    f"CL1: stopped while delivering: {len(handed)} of {len(stimuli)} stimuli had been handed to the "
-                    "device, and what had not begun was interrupted"
-                )
+            self._check_going(is_halted, len(handed), len(stimuli))
             while waiting and start + asked[len(handed)] + late < stop + AHEAD_FRAMES:
-                frame = self._hand_over(waiting.popleft(), start + asked[len(handed)] + late)
+                # A stop from another thread comes before a hand-over, which then is none, or after, and takes it back.
+                with self._lock:
+                    self._check_going(is_halted, len(handed), len(stimuli))
+                    frame = self._hand_over(waiting.popleft(), start + asked[len(handed)] + late)
                 late = frame - start - asked[len(handed)]
                 handed.append(frame)
             end = start + int(np.ceil(duration_s * FRAMES_PER_S)) + late
@@ -95,6 +97,14 @@ class Delivery:
             raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended before")
         begun = [self._began(stimulus, frame, reported, start) for stimulus, frame in zip(stimuli, handed, strict=True)]
         return start, stop, np.array(frames, np.int64), np.array(channels, np.int64), np.array(begun, np.float64)
+
+    @staticmethod
+    def _check_going(is_halted: Callable[[], bool], handed: int, of: int) -> None:
+        if of and is_halted():
+            raise DeviceFailed(
+                f"CL1: stopped while delivering: {handed} of {of} stimuli had been handed to the device, and what had "
+                "not begun was interrupted"
+            )
 
     def _hand_over(self, stimulus: Stimulus, frame: int) -> int:
         """Give one stimulus to the device, at a frame or as soon after it as can be; returns the frame."""

@@ -183,6 +183,15 @@ class MaxOneCulture(Culture):
         self._pace = Pace(self.limits, self.stimulation_electrodes)
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        try:
+            return self._sent(admitted, duration_s)
+        except BaseException:
+            # A sequence that is under way goes on by itself: without power nothing comes of it.
+            self._halt()
+            raise
+
+    def _sent(self, admitted: Admitted, duration_s: float) -> Observed:
+        """Send sequences in time, and read the spikes meanwhile."""
         stream, sequences, pace = self._streaming(), self._sequences, self._pace
         assert sequences is not None and pace is not None
         groups = _groups(admitted.stimuli, self._sequence_s)
