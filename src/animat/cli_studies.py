@@ -84,6 +84,6 @@ def _run(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, 
         "folder": str(ran.folder),
         "report": str(ran.report),
         "jobs": ran.jobs,
-        "done_now": len(ran.done_now),
+        "done_now_cpu_s": ran.done_now,
         "comparisons": comparisons,
     }

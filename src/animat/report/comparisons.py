@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BLUE, GREY, LIMIT, ORANGE, grid_of_panels, style_axes
+from animat.report.style import BLACK, BLUE, GREY, LIMIT, ORANGE, new_figure, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,33 +55,40 @@ def stars(p: float) -> str:
 
 
 def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
-    """A panel a comparison: boxes from the first to the third quartile with the median, whiskers to 1.5 times that
-    range, policies as points; random as a dotted line, the best possible return as a dashed one.
+    """A column a comparison: above with random actions (dotted) and the best possible return (dashed), below close up.
+
+    Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; policies are
+    points.
 
     Args:
-        pairs: on one robot.
+        pairs: on one robot, at least one.
         title: of the whole figure.
     """
-    figure, panels = grid_of_panels(len(pairs), 4, 2.7, 3.4, title)
-    for axes, pair in zip(panels, pairs, strict=True):
+    figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
+    figure.suptitle(title, fontsize=10)
+    rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])
+    for whole, close, pair in zip(rows[0], rows[1], pairs, strict=True):
         for place, (group, colour) in enumerate(((pair.first, ORANGE), (pair.second, BLUE))):
-            _draw_group(axes, group, place, colour, label=place == 0)
-        low, high = axes.get_ylim()
+            _draw_boxes(whole, group, place, colour)
+            _draw_references(whole, group, place)
+            _draw_boxes(close, group, place, colour)
+        low, high = whole.get_ylim()
         room = high - low
-        axes.plot([0, 0, 1, 1], high + room * np.array([0.03, 0.06, 0.06, 0.03]), color=BLACK, linewidth=0.9)
+        whole.plot([0, 0, 1, 1], high + room * np.array([0.03, 0.06, 0.06, 0.03]), color=BLACK, linewidth=0.9)
         words = f"{stars(pair.p)}  p = {pair.p:.3g}, U = {pair.u:g}"
-        axes.text(0.5, high + 0.08 * room, words, ha="center", va="bottom", fontsize=8)
-        axes.set_ylim(low, high + 0.2 * room)
-        axes.set_xlim(-0.6, 1.6)
-        axes.set_xticks([0, 1], [pair.first.name.replace(" ", "\n", 1), pair.second.name.replace(" ", "\n", 1)])
-        style_axes(axes, pair.title, "", "mean return of a policy")
-    if any(group.limit is not None for pair in pairs for group in (pair.first, pair.second)):
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+        whole.text(0.5, high + 0.08 * room, words, ha="center", va="bottom", fontsize=8)
+        whole.set_ylim(low, high + 0.2 * room)
+        for axes, words in ((whole, pair.title), (close, "close up")):
+            axes.set_xlim(-0.6, 1.6)
+            axes.set_xticks([0, 1], [group.name.replace(" ", "\n", 1) for group in (pair.first, pair.second)])
+            style_axes(axes, words, "", "mean return of a policy")
+    handles, labels = rows[0, 0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return figure
 
 
-def _draw_group(axes: Axes, group: Group, place: int, colour: str, *, label: bool) -> None:
+def _draw_boxes(axes: Axes, group: Group, place: int, colour: str) -> None:
     axes.boxplot(
         [group.returns],
         positions=[place],
@@ -95,10 +102,13 @@ def _draw_group(axes: Axes, group: Group, place: int, colour: str, *, label: boo
     sideways = np.zeros(len(group.returns))
     sideways[np.argsort(group.returns)] = 0.12 * np.resize([-1.0, 1.0, 0.0], len(group.returns))
     axes.scatter(place + sideways, group.returns, s=12, color=colour, edgecolors=BLACK, linewidths=0.4, zorder=3)
+
+
+def _draw_references(axes: Axes, group: Group, place: int) -> None:
     ends = [place - 0.42, place + 0.42]
     if group.random is not None:
-        name = "random actions" if label else None
+        name = "random actions" if place == 0 else None
         axes.plot(ends, [group.random] * 2, color=GREY, linewidth=1.3, linestyle=":", label=name)
     if group.limit is not None:
-        name = "best possible return" if label else None
+        name = "best possible return" if place == 0 else None
         axes.plot(ends, [group.limit] * 2, color=LIMIT, linewidth=1.3, linestyle="--", label=name)

@@ -59,7 +59,7 @@ class Table:
     Attributes:
         title: above it.
         head: names of the columns.
-        rows: cells: text, numbers (written with four digits) or None (written as a dash).
+        rows: cells: text, numbers (written with three digits) or None (written as a dash).
         note: under it.
         beside: the file that holds all digits, relative to the page.
         marked: rows that stand out, by index.
@@ -122,12 +122,10 @@ def write_page(
 
 
 def cell(value: Any) -> str:
-    """A cell as text: numbers with four digits at most, a dash for None."""
+    """A cell as text: whole numbers as they are, others with three digits, a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value)
-    if value == int(value) and abs(value) < 1e6:
-        return f"{int(value)}"
-    written = f"{value:.4g}" if abs(value) < 0.01 or abs(value) >= 1000 else f"{value:.3g}"
-    return written.replace("-", "−", 1) if value < 0 else written
+    whole = value == int(value) and abs(value) < 1e6
+    return (f"{int(value)}" if whole else f"{value:.3g}").replace("-", "−")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, add_legend, draw_levels, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, draw_levels, grid_of_panels, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,14 +46,18 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
     for axes, curve in zip(panels, curves, strict=True):
         x = curve.iterations / 1000
         for of_policy in curve.returns:
-            axes.plot(x, of_policy, color=GREY, linewidth=0.5, alpha=0.6)
-        mean, low, high = _mean_with_interval(curve.returns)
-        axes.fill_between(x, low, high, color=BLUE, alpha=0.3, linewidth=0, label="95 % interval of the mean")
-        axes.plot(x, mean, color=BLUE, linewidth=1.5, label="mean of the policies")
+            ended = np.isfinite(of_policy)
+            axes.plot(x[ended], of_policy[ended], color=GREY, linewidth=0.5, alpha=0.6)
+        # Parts in which no episode of any policy ended are passed over, not drawn as gaps.
+        some = np.isfinite(curve.returns).any(axis=0)
+        mean, low, high = _mean_with_interval(curve.returns[:, some])
+        axes.fill_between(x[some], low, high, color=BLUE, alpha=0.3, linewidth=0, label="95 % interval of the mean")
+        axes.plot(x[some], mean, color=BLUE, linewidth=1.5, label="mean of the policies")
         draw_levels(axes, curve.random, curve.limit)
         style_axes(axes, curve.name, "iterations (thousands)", "return")
         axes.set_xlim(0, None)
-    add_legend(panels[0], loc="lower right")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
 
 

@@ -128,5 +128,4 @@ def explain(row: dict[str, Any]) -> str:
     if score_second is not None and score_second >= NEAR:
         return f"{limits}; {row['second']} is at its limit (score {score_second:.2f}), so more cannot be had from it."
     scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (score_first, score_second))
-    return f"{limits} and random {random:.1f}; the scores are {scores}. The limit leaves room, so it does not explain "
-    "this."
+    return f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, so it does not explain this."

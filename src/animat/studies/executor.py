@@ -28,6 +28,7 @@ class Event:
         share: of the job that is done, for progress.
         words: a remark for progress; what went wrong for a failure.
         files: that it left, when it is done.
+        cpu_s: seconds of processor time that it took, when it is done.
     """
 
     job: str
@@ -35,6 +36,7 @@ class Event:
     share: float = 0.0
     words: str = ""
     files: tuple[str, ...] = ()
+    cpu_s: float = 0.0
 
 
 class Executor(abc.ABC):

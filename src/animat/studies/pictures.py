@@ -54,7 +54,7 @@ class CulturePictures(Task):
         spontaneous_hz, _ = spontaneous_rate(first, responses.window_ms[1])
         figures = {
             "raster": draw_raster(first, responses),
-            "psth": draw_psth(histogram, responses.window_ms, spontaneous_hz),
+            "psth": draw_psth(histogram, responses.window_ms, spontaneous_hz / len(first.channels)),
             "bursts": draw_burst_separation(responses),
             "responses": draw_response_histograms(responses),
         }

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+from animat.evaluation.statistics import p_of_u
 from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.style import FORMATS
 from animat.studies.captions import CULTURE, ROBOT
@@ -65,6 +66,12 @@ def _short(study: Study, folder: Path) -> Section:
             f"{same} of {len(rows)} comparisons came out as in the paper: the same condition better, at p < {LEVEL:g}. "
             + ("The others are marked, and explained under Differences from the paper." if same < len(rows) else "")
         )
+        smallest = p_of_u(0.0, study.policies, study.policies)
+        if smallest >= LEVEL:
+            paragraphs.append(
+                f"With {study.policies} policies a side no p can fall below {smallest:.2g}: these are the figures of a "
+                "first look, and no results."
+            )
     if not rows:
         paragraphs.append("The study compares no conditions; how each did is under Scores.")
     paragraphs.append(
@@ -240,9 +247,11 @@ def _pictures(folder: Path, of: str, captions: dict[str, tuple[str, str]]) -> tu
 
 
 def _controls(folder: Path) -> Section:
-    rows = read_table(table_file(folder, "controls"))
+    every = read_table(table_file(folder, "controls"))
+    last = max(row["at_min"] for row in every)
+    rows = [row for row in every if row["at_min"] == last]
     table = Table(
-        "Controls",
+        f"Controls at {last:g} min",
         ("robot", "mapping", "at (min)", "control", "actors", "mean return", "standard error"),
         tuple(
             (
@@ -341,8 +350,10 @@ def _noticed(folder: Path) -> Section:
     grave = [row for row in rows if row["severity"] != "note"]
     notes = len(rows) - len(grave)
     shown = tuple((row["name"], row["sentence"]) for row in grave)
-    said = f"{len(grave)} warnings and {notes} notes on the recordings and the simulators made of them; all are in "
-    "tables/findings.csv."
+    said = (
+        f"{len(grave)} warnings and {notes} notes on the recordings and the simulators made of them; all are in "
+        "tables/findings.csv."
+    )
     table: tuple[Any, ...] = (
         (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()
     )

@@ -25,13 +25,13 @@ class Ran:
         folder: the study's.
         report: its page.
         jobs: how many there are.
-        done_now: names of those that this run did; none if the folder was finished.
+        done_now: those that this run did, with the processor seconds that each took; none if the folder was finished.
     """
 
     folder: Path
     report: Path
     jobs: int
-    done_now: tuple[str, ...]
+    done_now: dict[str, float]
 
 
 def run_study(
@@ -70,15 +70,15 @@ def run_study(
         claim(folder, study, manifest)
         jobs = in_order(plan_study(study, base))
         receipts = _kept(jobs, folder, manifest["fingerprint"])
-        missing = [job for job in jobs if job.name not in receipts]
-        if missing:
+        run = _Run(study, folder, manifest["fingerprint"], jobs, receipts, progress or Silent())
+        if len(receipts) < len(jobs):
             at = executor or Processes(workers)
             try:
-                _Run(study, folder, manifest["fingerprint"], jobs, receipts, progress or Silent()).finish(at)
+                run.finish(at)
             finally:
                 at.close()
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-    return Ran(folder, folder / REPORT, len(jobs), tuple(job.name for job in missing))
+    return Ran(folder, folder / REPORT, len(jobs), run.took_s)
 
 
 def _kept(jobs: list[Job], folder: Path, study: str) -> dict[str, Receipt]:
@@ -111,6 +111,7 @@ class _Run:
         self._progress = to
         self._total_s = sum(job.cost_s for job in self._waiting)
         self._done_s = 0.0
+        self.took_s: dict[str, float] = {}
 
     def finish(self, executor: Executor) -> None:
         """Run everything that waits."""
@@ -138,6 +139,7 @@ class _Run:
         receipt.save(self._folder)
         self._receipts[job.name] = receipt
         del self._running[job.name]
+        self.took_s[job.name] = event.cpu_s
         self._done_s += job.cost_s
 
     def _tell(self) -> None:

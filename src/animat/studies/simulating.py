@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, final
 
+import jax.numpy as jnp
 import numpy as np
 
 from animat.errors import AnimatError, InvalidFile
@@ -93,7 +94,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:
-    """Read what `save_timeline` wrote; its arrays are numpy's.
+    """Read what `save_timeline` wrote.
 
     Raises:
         InvalidFile: if it cannot be read.
@@ -109,7 +110,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         return SimulatorTimeline(
-            simulators=_KINDS[told["kind"]](**load(data)),  # type: ignore[arg-type]
+            simulators=_KINDS[told["kind"]](**{name: jnp.asarray(array) for name, array in load(data).items()}),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),

@@ -50,12 +50,13 @@ def main() -> int:
                 last = time.monotonic()
                 tell(kind="progress", share=share, words=words)
 
+        began_s = time.process_time()
         try:
             files = task.run(study, folder, report)
         except AnimatError as error:
             tell(kind="failed", words=str(error))
         else:
-            tell(kind="done", files=[str(file) for file in files])
+            tell(kind="done", files=[str(file) for file in files], cpu_s=time.process_time() - began_s)
 
 
 if __name__ == "__main__":
