@@ -6,8 +6,24 @@ import os
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
 
-from animat.compilation import keep_compilations
+# Shapes and types in the signatures of the numerical core are checked while the tests run; this must come before
+# animat is imported.
+install_import_hook(
+    [
+        "animat.neurons.simulator",
+        "animat.neurons.bursts",
+        "animat.robots.cartpole",
+        "animat.robots.navigation",
+        "animat.animat",
+        "animat.training.sac",
+        "animat.evaluation.rollouts",
+    ],
+    "beartype.beartype",
+)
+
+from animat.compilation import keep_compilations  # noqa: E402
 
 
 @pytest.fixture(scope="session", autouse=True)

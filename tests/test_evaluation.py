@@ -122,7 +122,7 @@ def test_greedy_takes_the_most_probable_action() -> None:
     observations = np.random.default_rng(0).normal(0, 0.3, (64, 4)).astype(np.float32)
     environment = Animat(policy.robot, policy.mapping, 3)
     single = jax.tree.map(lambda leaf: leaf[0], network)
-    actions = single.act(environment, observations / environment.scales, jnp.zeros(64))
+    actions = single.act(environment, jnp.asarray(observations / environment.scales), jnp.zeros(64))
     assert actions.tolist() == [policy.act_greedily(o) for o in observations]
 
 

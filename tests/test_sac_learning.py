@@ -46,10 +46,10 @@ def trained_for(
     *,
     seed: int = 0,
     simulator: NeuronSimulator | None = None,
-    learner: Learner[Any] | None = None,
-) -> tuple[Learner[Any], Finished]:
+    learner: Learner | None = None,
+) -> tuple[Learner, Finished]:
     learner = start(environment, settings, jax.random.key(seed)) if learner is None else learner
-    trained: tuple[Learner[Any], Finished] = chunk(
+    trained: tuple[Learner, Finished] = chunk(
         environment, settings, learner, simulator, jnp.int32(0), jnp.int32(rounds)
     )
     return trained

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Generic, Literal, NamedTuple, TypeVar, final
+from typing import Any, Generic, Literal, NamedTuple, TypeVar, final
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +21,14 @@ RobotState = TypeVar("RobotState")
 Delivery = Literal["chosen", "shuffled"]
 
 
-class EpisodeState(NamedTuple, Generic[RobotState]):
+class EpisodeState(NamedTuple):
     """Where an episode stands: the robot's state, and the iterations done."""
 
-    robot: RobotState
+    robot: Any
     iteration: Int[Array, ""]
 
 
-class Outcome(NamedTuple, Generic[RobotState]):
+class Outcome(NamedTuple):
     """What one iteration did.
 
     Attributes:
@@ -41,7 +41,7 @@ class Outcome(NamedTuple, Generic[RobotState]):
         command: the motor command u in [-1, 1].
     """
 
-    state: EpisodeState[RobotState]
+    state: EpisodeState
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
@@ -85,14 +85,12 @@ class Environment(abc.ABC, Generic[RobotState]):
         return np.array([quantity.scale for quantity in self.robot.quantities], np.float32)
 
     @final
-    def reset(self, key: PRNGKeyArray) -> EpisodeState[RobotState]:
+    def reset(self, key: PRNGKeyArray) -> EpisodeState:
         """Start an episode."""
         return EpisodeState(self.robot.reset(key), jnp.int32(0))
 
     @final
-    def step(
-        self, key: PRNGKeyArray, state: EpisodeState[RobotState], action: Array, simulator: NeuronSimulator | None
-    ) -> Outcome[RobotState]:
+    def step(self, key: PRNGKeyArray, state: EpisodeState, action: Array, simulator: NeuronSimulator | None) -> Outcome:
         """One iteration: action, response, command, movement."""
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, action, simulator)
 
@@ -100,10 +98,10 @@ class Environment(abc.ABC, Generic[RobotState]):
     def advance(
         self,
         uniforms: Float[Array, " noise"],
-        state: EpisodeState[RobotState],
+        state: EpisodeState,
         action: Array,
         simulator: NeuronSimulator | None,
-    ) -> Outcome[RobotState]:
+    ) -> Outcome:
         """The same with the random numbers handed in: training draws them for many iterations at once."""
         of_robot = self.robot.noise_size
         delivered, rate_hz, command = self.actuate(uniforms[of_robot:], action, simulator)
@@ -113,7 +111,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         return Outcome(EpisodeState(robot, iteration), reward, terminated, truncated, delivered, rate_hz, command)
 
     @final
-    def observe(self, state: EpisodeState[RobotState]) -> Float[Array, " observations"]:
+    def observe(self, state: EpisodeState) -> Float[Array, " observations"]:
         """The robot's observation in its own units."""
         return self.robot.observe(state.robot)
 

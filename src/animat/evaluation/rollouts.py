@@ -11,7 +11,7 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Int, Int64, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
 from animat.animat import Environment
 from animat.errors import InvalidArgument
@@ -77,7 +77,7 @@ class Uniform(Actor):
 class Constant(Actor):
     """One action always: the constant control."""
 
-    action: Int[Array, ""]
+    action: Int[Array, "*actors"]
 
     def act(
         self,
@@ -155,7 +155,11 @@ def roll_out(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _roll_out(
-    environment: Environment[Any], episodes: int, simulator: NeuronSimulator | None, actors: Actor, keys: PRNGKeyArray
+    environment: Environment[Any],
+    episodes: int,
+    simulator: NeuronSimulator | None,
+    actors: Actor,
+    keys: Key[Array, " actors"],
 ) -> tuple[Array, Array, Array]:
     def one_actor(actor: Actor, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
         def iteration(carry: tuple[Any, ...], key: PRNGKeyArray) -> tuple[tuple[Any, ...], None]:

@@ -107,7 +107,7 @@ def _compiled(animat: Animat[Any]) -> _Functions:
         return jnp.concatenate([pack(state), animat.observe(state)])
 
     def step(given: Array, state: Array, simulator: Any) -> Array:
-        outcome: Outcome[Any] = animat.advance(given[1:], unpack(state), given[0].astype(jnp.int32), simulator)
+        outcome: Outcome = animat.advance(given[1:], unpack(state), given[0].astype(jnp.int32), simulator)
         numbers = outcome[1:]
         return jnp.concatenate(
             [pack(outcome.state), animat.observe(outcome.state), jnp.stack([jnp.float32(x) for x in numbers])]

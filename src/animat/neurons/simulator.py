@@ -27,7 +27,7 @@ class NeuronSimulator(abc.ABC):
         percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,).
     """
 
-    percentiles: Float[Array, " percentiles"]
+    percentiles: Float[Array, "*recordings percentiles"]
 
     @property
     @abc.abstractmethod
@@ -58,9 +58,9 @@ class HistogramSimulator(NeuronSimulator):
         percentiles: as in `NeuronSimulator`.
     """
 
-    cumulative: Float[Array, "conditions edges"]
-    edges_hz: Float[Array, " edges"]
-    percentiles: Float[Array, " percentiles"]
+    cumulative: Float[Array, "*recordings conditions edges"]
+    edges_hz: Float[Array, "*recordings edges"]
+    percentiles: Float[Array, "*recordings percentiles"]
 
     @property
     def n_conditions(self) -> int:
@@ -88,9 +88,9 @@ class EmpiricalSimulator(NeuronSimulator):
         percentiles: as in `NeuronSimulator`.
     """
 
-    values_hz: Float[Array, "conditions values"]
-    counts: Int[Array, " conditions"]
-    percentiles: Float[Array, " percentiles"]
+    values_hz: Float[Array, "*recordings conditions values"]
+    counts: Int[Array, "*recordings conditions"]
+    percentiles: Float[Array, "*recordings percentiles"]
 
     @property
     def n_conditions(self) -> int:

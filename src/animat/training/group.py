@@ -160,14 +160,14 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
     )
 
 
-def _write_checkpoint(path: Path, fingerprint: str, done: int, learners: Learner[Any], curve: np.ndarray) -> None:
+def _write_checkpoint(path: Path, fingerprint: str, done: int, learners: Learner, curve: np.ndarray) -> None:
     leaves = jax.tree.leaves(learners._replace(key=jax.random.key_data(learners.key)))
     arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     with written_whole(path) as beside, beside.open("wb") as file:
         np.savez(file, fingerprint=np.array(fingerprint), done=np.array(done), curve=curve, **arrays)
 
 
-def _read_checkpoint(path: Path, fingerprint: str, like: Learner[Any]) -> tuple[int, Learner[Any], np.ndarray]:
+def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, Learner, np.ndarray]:
     like = like._replace(key=jax.random.key_data(like.key))
     leaves, structure = jax.tree.flatten(like)
     try:

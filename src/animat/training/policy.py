@@ -201,7 +201,9 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     path = Path(path)
     if not path.is_dir():
         return {path.stem: Policy.load(path)}
-    files = sorted(path.glob("*.safetensors"), key=lambda file: (len(file.name), file.name))
+    # Hidden files are unfinished ones: a process was killed while it wrote them.
+    whole = [file for file in path.glob("*.safetensors") if not file.name.startswith(".")]
+    files = sorted(whole, key=lambda file: (len(file.name), file.name))
     if not files:
         raise InvalidFile(f"{path}: expected policies (*.safetensors) in the folder, got none; train them first")
     return {file.stem: Policy.load(file) for file in files}

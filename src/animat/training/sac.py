@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ import optax
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from animat.animat import Environment, EpisodeState, RobotState
+from animat.animat import Environment, EpisodeState
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
 
@@ -94,7 +94,7 @@ class Trained(NamedTuple):
     log_alpha: Float[Array, ""]
 
 
-class Learner(NamedTuple, Generic[RobotState]):
+class Learner(NamedTuple):
     """One policy while it is trained: everything that the next iteration depends on, and the actor to be deployed."""
 
     trained: Trained
@@ -102,7 +102,7 @@ class Learner(NamedTuple, Generic[RobotState]):
     targets: Network
     optimiser: Any
     replay: Float[Array, "transitions row"]
-    episodes: EpisodeState[RobotState]
+    episodes: EpisodeState
     returns: Float[Array, " environments"]
     key: PRNGKeyArray
 
@@ -147,7 +147,7 @@ def initial_networks(key: PRNGKeyArray, *shapes: tuple[tuple[int, ...], tuple[in
     return networks
 
 
-def forward(network: Network, inputs: Float[Array, "*stack batch inputs"]) -> Float[Array, "*stack batch outputs"]:
+def forward(network: Network, inputs: Float[Array, "*_ batch inputs"]) -> Float[Array, "*_ batch outputs"]:
     """Hidden layers of rectified units, then a linear one."""
     hidden = inputs
     for layer in network[:-1]:
@@ -234,7 +234,7 @@ def continuous_losses(
 # --- acting and learning --------------------------------------------------------------------------------------------
 
 
-def begin(environment: Environment[RobotState], settings: SAC, key: PRNGKeyArray) -> Learner[RobotState]:
+def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
     """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
     n, n_actions, hidden = environment.n_observations, environment.n_actions, settings.hidden
@@ -256,13 +256,13 @@ def begin(environment: Environment[RobotState], settings: SAC, key: PRNGKeyArray
 
 
 def train_chunk(
-    environment: Environment[RobotState],
+    environment: Environment[Any],
     settings: SAC,
-    learner: Learner[RobotState],
+    learner: Learner,
     simulator: NeuronSimulator | None,
     first_round: Int[Array, ""],
     last_round: Int[Array, ""],
-) -> tuple[Learner[RobotState], Finished]:
+) -> tuple[Learner, Finished]:
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
     Args:
@@ -281,9 +281,7 @@ def train_chunk(
     learning = (settings.updates, 1 if environment.n_actions is not None else 3, settings.batch)
     n_acting = math.prod(acting)
 
-    def one_round(
-        index: Int[Array, ""], carry: tuple[Learner[RobotState], Finished]
-    ) -> tuple[Learner[RobotState], Finished]:
+    def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
         learner, before = carry
         key, use, reset_key = jax.random.split(learner.key, 3)
         uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
@@ -297,21 +295,19 @@ def train_chunk(
         return learner, jax.tree.map(jnp.add, before, finished)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
-    trained: tuple[Learner[RobotState], Finished] = jax.lax.fori_loop(
-        first_round, last_round, one_round, (learner, nothing)
-    )
+    trained: tuple[Learner, Finished] = jax.lax.fori_loop(first_round, last_round, one_round, (learner, nothing))
     return trained
 
 
 def _act(
-    environment: Environment[RobotState],
+    environment: Environment[Any],
     settings: SAC,
-    learner: Learner[RobotState],
+    learner: Learner,
     simulator: NeuronSimulator | None,
     written: Int[Array, ""],
     uniforms: Float[Array, "environments noise"],
     reset_key: PRNGKeyArray,
-) -> tuple[Learner[RobotState], Finished]:
+) -> tuple[Learner, Finished]:
     """One step of every environment, remembered in the replay; ended episodes start anew."""
     scales = environment.scales
 
@@ -335,7 +331,7 @@ def _act(
 
 
 def draw_action(
-    environment: Environment[RobotState],
+    environment: Environment[Any],
     actor: Network,
     observation: Float[Array, "batch observations"],
     uniforms: Float[Array, " batch"],
@@ -349,12 +345,12 @@ def draw_action(
 
 
 def _learn(
-    environment: Environment[RobotState],
+    environment: Environment[Any],
     settings: SAC,
-    learner: Learner[RobotState],
+    learner: Learner,
     available: Int[Array, ""],
     uniforms: Float[Array, "updates blocks batch"],
-) -> Learner[RobotState]:
+) -> Learner:
     """`settings.updates` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
     n = environment.n_observations

@@ -82,6 +82,8 @@ def train(
     ]
     _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
     shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
+    for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
+        leftover.unlink(missing_ok=True)
     return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
 
 
@@ -118,7 +120,7 @@ def _claim(folder: Path, manifest: dict[str, Any]) -> None:
         return
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
-    if folder.is_dir() and any(folder.glob("*.safetensors")):
+    if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     with written_whole(path) as beside:
         beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
@@ -207,6 +209,11 @@ def _start(group: Group, folder: Path, core: int, checkpoint_s: float) -> subpro
     with tempfile.TemporaryFile() as job:
         pickle.dump((group, folder, checkpoint, checkpoint_s), job)
         job.seek(0)
+        # In a process group of its own: Ctrl-C reaches this process alone, which then ends the worker without a word.
         return subprocess.Popen(
-            [sys.executable, "-m", "animat.training.worker", str(core)], stdin=job, stdout=subprocess.PIPE, bufsize=0
+            [sys.executable, "-m", "animat.training.worker", str(core)],
+            stdin=job,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            process_group=0,
         )
