@@ -177,6 +177,13 @@ def test_policies_of_a_folder_come_in_the_order_of_their_numbers(tmp_path: Path)
     assert list(load_policies(tmp_path / "p2.safetensors")) == ["p2"]
 
 
+def test_what_a_killed_process_left_half_written_is_no_policy(tmp_path: Path) -> None:
+    two_forces().save(tmp_path / "p0.safetensors")
+    whole = (tmp_path / "p0.safetensors").read_bytes()
+    (tmp_path / ".p1.safetensors.abcd.partial.safetensors").write_bytes(whole[: len(whole) // 2])
+    assert list(load_policies(tmp_path)) == ["p0"]
+
+
 # --- bad ones -------------------------------------------------------------------------------------------------------
 
 

@@ -103,6 +103,51 @@ def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_pat
     assert bits(folder) == bits(tmp_path / "undisturbed")
 
 
+def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path: Path) -> None:
+    leftovers = [
+        tmp_path / name for name in (".p1.safetensors.ab.partial.safetensors", ".training.json.ab.partial.json")
+    ]
+    for leftover in leftovers:
+        leftover.write_bytes(b"half of it")
+    train(replace(SHORT, policies=1, iterations=500), timeline_of(), tmp_path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["p0.safetensors", "training.json"]
+
+
+WATCHED = """
+import sys
+from pathlib import Path
+from animat.training.trainer import train
+from test_training import SHORT, Interrupting, replace, timeline_of
+train(replace(SHORT, policies=7, iterations=10_000_000), timeline_of(), Path(sys.argv[1]), progress=Interrupting())
+"""
+
+
+class Interrupting:
+    """A progress that interrupts the whole foreground group, as Ctrl-C in a terminal does, and says who is in it."""
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        print(*(os.getpgid(int(child)) == os.getpgrp() for child in children), flush=True)
+        os.killpg(os.getpgrp(), signal.SIGINT)
+
+
+def test_an_interrupt_from_the_keyboard_does_not_reach_the_workers(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run(
+        [sys.executable, "-c", WATCHED, str(tmp_path)],
+        env=environment,
+        start_new_session=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    in_its_group = done.stdout.splitlines()[0].split()
+    assert in_its_group
+    assert set(in_its_group) == {"False"}
+    assert done.stderr.count("Traceback") == 1, "the process's own, and none of a worker's"
+    assert done.stderr.rstrip().endswith("KeyboardInterrupt")
+
+
 def test_a_finished_folder_is_read_and_not_trained_again(tmp_path: Path) -> None:
     train(replace(SHORT, iterations=1_000), timeline_of(), tmp_path)
     before = {file: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
