@@ -54,6 +54,8 @@ def recording(**changes: Any) -> Recording:
         ({"duration_s": 1.0}, r"spike_times_s: expected times within the recording \(-1 to 0 s\)"),
         ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
         ({"start_s": np.nan}, "start_s, duration_s: expected finite seconds"),
+        ({"start_min": np.nan}, "start_min: expected finite minutes, got nan"),
+        ({"sampling_rate_hz": 0.0}, "sampling_rate_hz: expected a positive rate in Hz, or NaN"),
     ],
 )
 def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
@@ -133,6 +135,11 @@ def test_findings_travel_in_the_provenance_and_are_found_again() -> None:
         ("another", "note", "less odd"),
     ]
     assert [f.name for f in found[2:]] == ["presentation-unknown"]
+
+
+def test_two_findings_of_one_name_are_both_kept() -> None:
+    noted = (Finding("columns-left-out", "note", "x of a.csv"), Finding("columns-left-out", "note", "y of b.csv"))
+    assert as_provenance(noted) == {"note: columns-left-out": "x of a.csv; y of b.csv"}
 
 
 def test_what_is_seen_in_the_data_is_said() -> None:

@@ -15,9 +15,14 @@ from animat.recordings.recording import UNKNOWN, Recording
 def as_provenance(findings: Iterable[Finding]) -> dict[str, str]:
     """Findings as entries of `Recording.provenance`, so that they travel with the recording and its file.
 
-    An entry reads `"warning: silent-channels-unknown"` -> its sentence; `noticed` turns it back into a finding.
+    An entry reads `"warning: silent-channels-unknown"` -> its sentence; `noticed` turns it back into a finding. Those
+    of one name become one entry, with the sentences of all.
     """
-    return {f"{finding.severity}: {finding.name}": finding.sentence for finding in findings}
+    entries: dict[str, str] = {}
+    for finding in findings:
+        key = f"{finding.severity}: {finding.name}"
+        entries[key] = f"{entries[key]}; {finding.sentence}" if key in entries else finding.sentence
+    return entries
 
 
 def noticed(recording: Recording) -> tuple[Finding, ...]:

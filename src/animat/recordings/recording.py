@@ -146,6 +146,13 @@ class Recording:
             raise UnusableData(
                 f"start_s, duration_s: expected finite seconds, got {self.start_s:g} and {self.duration_s:g}"
             )
+        if not np.isfinite(self.start_min):
+            raise UnusableData(f"start_min: expected finite minutes, got {self.start_min:g}")
+        if self.sampling_rate_hz <= 0 or np.isinf(self.sampling_rate_hz):
+            raise UnusableData(
+                f"sampling_rate_hz: expected a positive rate in Hz, or NaN where it is not known, got "
+                f"{self.sampling_rate_hz:g}"
+            )
         for name, times in (("spike_times_s", self.spike_times_s), ("stimuli.time_s", self.stimuli.time_s)):
             if len(times) and (times[0] < self.start_s or times[-1] > self.stop_s):
                 raise UnusableData(
