@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Any, Literal, TypeAlias, final
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.responses import Responses
 
 Kind = Literal["histogram", "empirical"]
+
+Stored: TypeAlias = Array | np.ndarray[Any, Any]
+"""Arrays of a simulator: JAX's, or numpy's while it is on its way to another process."""
 
 PERCENTILES = tuple(range(0, 101, 10))
 """Which percentiles of the pooled non-burst responses a simulator carries: P0 (smallest), P10, ..., P100 (largest)."""
@@ -27,7 +30,7 @@ class NeuronSimulator(abc.ABC):
         percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,).
     """
 
-    percentiles: Float[Array, "*recordings percentiles"]
+    percentiles: Float[Stored, "*recordings percentiles"]
 
     @property
     @abc.abstractmethod
@@ -58,9 +61,9 @@ class HistogramSimulator(NeuronSimulator):
         percentiles: as in `NeuronSimulator`.
     """
 
-    cumulative: Float[Array, "*recordings conditions edges"]
-    edges_hz: Float[Array, "*recordings edges"]
-    percentiles: Float[Array, "*recordings percentiles"]
+    cumulative: Float[Stored, "*recordings conditions edges"]
+    edges_hz: Float[Stored, "*recordings edges"]
+    percentiles: Float[Stored, "*recordings percentiles"]
 
     @property
     def n_conditions(self) -> int:
@@ -88,9 +91,9 @@ class EmpiricalSimulator(NeuronSimulator):
         percentiles: as in `NeuronSimulator`.
     """
 
-    values_hz: Float[Array, "*recordings conditions values"]
-    counts: Int[Array, "*recordings conditions"]
-    percentiles: Float[Array, "*recordings percentiles"]
+    values_hz: Float[Stored, "*recordings conditions values"]
+    counts: Int[Stored, "*recordings conditions"]
+    percentiles: Float[Stored, "*recordings percentiles"]
 
     @property
     def n_conditions(self) -> int:
