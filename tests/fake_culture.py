@@ -13,15 +13,15 @@ from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.recordings.recording import Channels
 
 CHANNELS = 16
-STRENGTH = {5.0: 0.2, 10.0: 0.35, 20.0: 0.5, 40.0: 0.65, 80.0: 0.8}
-"""Share of channels that spike in the window after a pulse of each frequency."""
+STRENGTH = {5.0: 0.5, 10.0: 1.0, 20.0: 1.5, 40.0: 2.0, 80.0: 2.5}
+"""Mean number of spikes on a channel that answers a pulse of each frequency."""
 
 Fault = Callable[["FakeCulture", Observed], Observed]
 """Given what would be answered, answers something else, or raises, or never returns."""
 
 
 class FakeCulture(Culture):
-    """16 channels, of which a share spikes after each pulse; every 37th response is a burst of all of them.
+    """16 channels, of which half answer each pulse, the more the higher its frequency; every 37th is a burst of all.
 
     Args:
         seed: of its spikes.
@@ -90,8 +90,9 @@ class FakeCulture(Culture):
         times, channels = [self._rng.random(20) * duration_s], [self._rng.integers(0, CHANNELS, 20)]
         for i, stimulus in enumerate(admitted.stimuli):
             bursts = (self.pulses + i) % 37 == 0
-            share = 1.0 if bursts else STRENGTH.get(stimulus.frequency_hz, 0.5)
-            fired = np.flatnonzero(self._rng.random(CHANNELS) < share)
+            answering = np.arange(CHANNELS) if bursts else self._rng.permutation(CHANNELS)[: CHANNELS // 2]
+            mean = STRENGTH.get(stimulus.frequency_hz, 1.5)
+            fired = np.repeat(answering, 1 + self._rng.poisson(mean, len(answering)))
             first_s, length_s = (0.003, 0.006) if bursts else (0.0005, 0.011)
             times.append(stimulus.time_s + first_s + length_s * self._rng.random(len(fired)))
             channels.append(fired)

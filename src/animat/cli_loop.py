@@ -63,6 +63,16 @@ class Run(Stimulating):
     """all: random, constant, silent, shuffled and hand-made; random: only that one"""
     pulses: int | None = None
     """Pulses a presentation; default: as the policies' recordings had"""
+    simulator: Literal["histogram", "empirical"] = "histogram"
+    """That predicts; as for animat train"""
+    bins: int = 20
+    """Bins of a histogram"""
+    range_hz: float | None = None
+    """Upper end of a histogram's range, in Hz; default: from the first recording"""
+    burst_threshold: float | None = None
+    """Share of active channels above which a response is a burst; 1: none is; default: as in the recording"""
+    despite: tuple[str, ...] = ()
+    """Findings on the recordings to go on in spite of, by name"""
     real_time: bool = False
     """Hold a simulated culture back to real time; a living one always runs in it"""
     drawn: bool = False
@@ -165,9 +175,17 @@ class Run(Stimulating):
             recording = record_within(account, culture, protocol, self.seed, progress)
             recording.save(self.out / "calibration.nwb")
             recordings, at_min = [recording], recording.start_min
-        series = extract_series(recordings, window_ms=first.window_ms or (2.0, 10.0))
+        series = extract_series(
+            recordings,
+            window_ms=first.window_ms or (2.0, 10.0),
+            burst_threshold=self.burst_threshold,
+            despite=self.despite,
+        )
         usable = None if patterns is None else min(patterns, len(culture.patterns))
-        return Calibration.of_series(series, first, at_min=at_min), pulse, usable
+        calibration = Calibration.of_series(
+            series, first, at_min=at_min, kind=self.simulator, bins=self.bins, range_hz=self.range_hz
+        )
+        return calibration, pulse, usable
 
 
 @dataclass(frozen=True)

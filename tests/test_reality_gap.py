@@ -1,0 +1,274 @@
+"""Predicted against lived return: what is in the table is what the simulator and the session say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import mannwhitneyu
+
+from animat.animat import Animat
+from animat.cli import main
+from animat.closed_loop.contenders import lean
+from animat.closed_loop.session import read_session
+from animat.cultures.budget import Account, Budget
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.hand_made import hand_made
+from animat.evaluation.rollouts import networks_of, roll_out
+from animat.mapping import Thresholds
+from animat.neurons.responses import Responses, extract_responses
+from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, run_policies
+from animat.recordings.protocol import Presentation, Protocol
+from animat.recordings.recording import Recording
+from animat.robots import Cartpole, Navigation, Robot
+from animat.training.policy import Policy
+from fake_culture import FakeCulture
+
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
+
+
+@pytest.fixture(scope="module")
+def recordings() -> list[Recording]:
+    found = []
+    with FakeCulture() as culture:
+        for seed in range(2):
+            found.append(culture.record(PROTOCOL, seed))
+            culture.rest(60.0)
+    return found
+
+
+@pytest.fixture(scope="module")
+def series(recordings: list[Recording]) -> list[Responses]:
+    return [extract_responses(recording, burst_threshold=0.95) for recording in recordings]
+
+
+def policy_of(seed: int, series: list[Responses], robot: Robot[Any] | None = None, **changed: Any) -> Policy:
+    rng = np.random.default_rng(seed)
+    robot = robot or Navigation(episode_limit=8)
+    inputs = len(robot.quantities)
+    sizes = ((inputs, 16), (16, 16), (16, 5))
+    given: dict[str, Any] = {
+        "weights": tuple(rng.standard_normal(s).astype(np.float32) for s in sizes),
+        "biases": tuple(np.zeros(s[1], np.float32) for s in sizes),
+        "scales": np.ones(inputs, np.float32),
+        "robot": robot,
+        "mapping": Thresholds(1),
+        "conditions": series[0].conditions,
+        "window_ms": (2.0, 10.0),
+        "presentation": Presentation("mixed", 2),
+    }
+    return Policy(**(given | changed))
+
+
+def run(folder: Path, series: list[Responses], **changed: Any) -> tuple[RealityGap, dict[str, Policy]]:
+    policies = {"p0": policy_of(0, series), "p1": policy_of(1, series)}
+    with FakeCulture() as culture:
+        gap = run_policies(policies, culture, Calibration.of_series(series), folder, episodes=4, **changed)
+    return gap, policies
+
+
+def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, series: list[Responses]) -> None:
+    gap, policies = run(tmp_path, series)
+    rows = {row.name: row for row in gap.rows}
+    constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
+    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "hand-made"]
+    assert gap.session.ending.by == "plan"
+    assert gap.findings == Calibration.of_series(series).findings
+
+    lived: dict[str, list[float]] = {}
+    for tick in read_session(tmp_path).ticks:
+        assert tick.reward is not None
+        episodes = lived.setdefault(tick.contender, [])
+        if tick.iteration == 0:
+            episodes.append(0.0)
+        episodes[-1] += tick.reward
+    for name, returns in lived.items():
+        np.testing.assert_allclose(rows[name].lived, returns)
+        assert len(returns) == 4
+    np.testing.assert_allclose(np.sort(rows["policies"].lived), np.sort(lived["p0"] + lived["p1"]))
+
+    calibration = Calibration.of_series(series)
+    environment = Animat(policies["p0"].robot, Thresholds(1), 5)
+    for name, policy in policies.items():
+        rolled = roll_out(
+            environment,
+            calibration.simulator,
+            networks_of([policy], greedy=True),
+            1,
+            episodes=PREDICTED_EPISODES,
+            seed=1,
+        )
+        np.testing.assert_array_equal(rows[name].predicted, rolled.returns[0])
+    # A silent culture commands -1 throughout; the robot of the test has no noise: one return, and it is lived too.
+    assert np.ptp(rows["silent"].predicted) == 0
+    assert rows["silent"].pulses_per_action == 0
+    assert all(row.pulses_per_action == 2 for row in gap.rows if row.name != "silent")
+
+    for row in gap.rows[3:]:
+        expected = mannwhitneyu(rows["policies"].lived, row.lived, alternative="two-sided", method="asymptotic")
+        assert row.p == pytest.approx(min(1.0, expected.pvalue))
+        assert row.wins == pytest.approx(expected.statistic / (len(rows["policies"].lived) * len(row.lived)))
+    for row in gap.rows:
+        assert row.gap.value == pytest.approx(row.lived.mean() - row.predicted.mean())
+        assert row.gap.low <= row.gap.value + 1e-9
+        assert row.gap.value <= row.gap.high + 1e-9
+    told = json.loads(json.dumps(gap.to_dict()))
+    assert [row["name"] for row in told["rows"]] == list(rows)
+    text = gap.to_text()
+    assert all(name in text for name in rows)
+
+
+def test_an_interval_of_the_gap_covers_it_as_often_as_it_says(series: list[Responses], tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    gap, _ = run(tmp_path, series, with_controls=False)
+    assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
+    rng = np.random.default_rng(5)
+    covered = 0
+    for _ in range(200):
+        row = replace(gap.rows[0], predicted=rng.normal(10, 3, 200), lived=rng.normal(7, 5, 30))
+        interval = row.gap
+        covered += interval.low <= -3 <= interval.high
+    # 95 % of 200 is 190, standard deviation 3.1; a bootstrap of 30 is a little too narrow.
+    assert 178 <= covered <= 199
+
+
+def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
+    simulator = Calibration.of_series(series).simulator
+    rng = np.random.default_rng(1)
+    for robot, low, high in (
+        (Cartpole(), [-0.5, -2, -0.2, -3], [0.5, 2, 0.2, 3]),
+        (Navigation(), [0, 0, -np.pi], [1, 1, np.pi]),
+    ):
+        environment: Animat[Any] = Animat(robot, Thresholds(1), 5)
+        rule = hand_made(environment, simulator)
+        assert int(rule.right[0]) == 4
+        observed = rng.uniform(low, high, (500, len(low)))
+        predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros(500))
+        lived = np.where(np.array([lean(robot, o) for o in observed]) > 0, rule.right, rule.left)
+        np.testing.assert_array_equal(np.asarray(predicted), lived)
+
+
+def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: list[Responses]) -> None:
+    first, last = series[0].start_min, series[1].start_min
+    training = {"shadowing": True, "duration_min": 60.0, "chunks": 60, "percentiles": "moving"}
+
+    def calibrated(**changed: Any) -> Calibration:
+        return Calibration.of_series(series, policy_of(0, series, provenance={"training": training | changed}))
+
+    assert calibrated().start_min == last
+    assert calibrated(shadowing=False).start_min == first
+    assert calibrated(duration_min=last - first - 0.1).start_min == first
+    held = calibrated(percentiles="first")
+    assert held.start_min == last
+    np.testing.assert_array_equal(held.percentiles, calibrated(shadowing=False).percentiles)
+    assert calibrated().burst_threshold == series[1].threshold
+    assert Calibration.of_series(series).start_min == last
+    assert Calibration.of_series(series, at_min=first).start_min == first
+    # What a closed loop compares with is, bit for bit, what the simulator was trained with.
+    np.testing.assert_array_equal(
+        np.float32(calibrated().percentiles), np.percentile(series[1].non_burst_rate_hz, range(0, 101, 10)).astype("f4")
+    )
+
+
+def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series: list[Responses]) -> None:
+    calibration = Calibration.of_series(series)
+    one, other = policy_of(0, series), policy_of(0, series, presentation=Presentation("mixed", 5))
+    with FakeCulture() as culture:
+        with pytest.raises(InvalidArgument, match="at least one"):
+            run_policies({}, culture, calibration, tmp_path)
+        with pytest.raises(Mismatch, match="the same presentation as a"):
+            run_policies({"a": one, "b": other}, culture, calibration, tmp_path)
+        wrong = policy_of(0, series, conditions=tuple(reversed(series[0].conditions)))
+        with pytest.raises(Mismatch, match="80 Hz, 40 Hz"):
+            run_policies({"a": wrong}, culture, calibration, tmp_path)
+        gap = run_policies({"b": other}, culture, calibration, tmp_path, episodes=1, with_controls=False)
+    assert "from a recording presented mixed, 2 pulses" in gap.findings[0].sentence
+    assert gap.loop.pulses == 5
+
+
+def test_a_budget_that_ends_early_leaves_what_was_lived(tmp_path: Path, series: list[Responses]) -> None:
+    gap, _ = run(tmp_path, series, account=Account(Budget(pulses=60)), with_controls=False)
+    assert gap.session.ending.by == "budget"
+    assert gap.account.pulses <= 60
+    assert sum(len(row.lived) for row in gap.rows[1:]) < 12
+    assert "60 pulses" in gap.to_text()
+    gap, _ = run(tmp_path / "none", series, account=Account(Budget(pulses=0)), with_controls=False)
+    assert all(len(row.lived) == 0 for row in gap.rows)
+    assert gap.to_dict()["rows"][0]["lived"] is None
+    gap.to_text()
+
+
+class TestCommand:
+    """`animat run` and `animat recover`, on a replay of recordings: quick, and with no culture but theirs."""
+
+    @pytest.fixture
+    def folder(self, tmp_path: Path, recordings: list[Recording], series: list[Responses]) -> Path:
+        for i, recording in enumerate(recordings):
+            recording.save(tmp_path / "recordings" / f"r{i}.nwb")
+        for i in range(2):
+            policy_of(i, series).save(tmp_path / "policies" / f"p{i}.safetensors")
+        return tmp_path
+
+    def command(self, folder: Path, *more: str) -> int:
+        given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--out", str(folder / "session")]
+        return main(["run", *given, "--culture", "replay", "--episodes", "2", *more])
+
+    def test_run(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert self.command(folder, "--json") == 0
+        printed = capsys.readouterr()
+        told = json.loads(printed.out.splitlines()[-1])
+        assert len(told["rows"]) == 12
+        assert told["session"]["ended_by"] == "plan"
+        assert "hand-made" in printed.out
+        (folder / "session" / "session.nwb").unlink()
+        assert main(["recover", str(folder / "session"), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == told["session"]["ticks"]
+        assert main(["inspect", str(folder / "session" / "session.nwb")]) == 0
+
+    def test_a_session_that_is_there_is_not_overwritten(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert self.command(folder, "--controls", "random") == 0
+        before = (folder / "session" / "session.log").read_bytes()
+        assert self.command(folder) == 1
+        assert "a session is there already; choose another folder" in capsys.readouterr().err
+        assert (folder / "session" / "session.log").read_bytes() == before
+
+    def test_a_spent_budget_is_told_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert self.command(folder, "--budget-pulses", "50") == 1
+        printed = capsys.readouterr()
+        assert "budget.pulses: 50 of 50 pulses are spent, and 2 more were wanted" in printed.err
+        assert "50 of 50 pulses" in printed.out
+
+    def test_without_recordings_the_culture_is_recorded_first(
+        self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: FakeCulture())
+        out = folder / "new"
+        assert main(["run", str(folder / "policies" / "p0.safetensors"), "--episodes", "1", "--out", str(out)]) == 0
+        printed = capsys.readouterr()
+        assert "the culture is recorded first" in printed.err
+        assert (out / "calibration.nwb").is_file()
+        assert Recording.load(out / "calibration.nwb").presentation == Presentation("mixed", 2)
+        assert "other-presentation" not in printed.err
+
+    @pytest.mark.parametrize(
+        ("more", "words"),
+        [
+            (["--episodes", "0"], "--episodes: expected at least 1"),
+            (["--pulses", "0"], "pulses: expected at least 1"),
+            (["--pause-s", "-1"], "pause_s: expected a finite number from 0"),
+            (["--state", "nowhere.state"], "state: expected none for a culture of kind 'replay'"),
+            (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),
+        ],
+    )
+    def test_bad_settings_are_one_line(
+        self, folder: Path, more: list[str], words: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert self.command(folder, *more) == 1
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert words in said
+        assert main(["recover", str(folder / "nowhere")]) == 1
