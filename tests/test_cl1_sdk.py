@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -31,16 +32,24 @@ def tell(**what): print("TOLD" + json.dumps(what))
 """
 
 
-def told(script: str, folder: Path, timeout_s: float = 300, **settings: str) -> dict[str, Any]:
-    """What a script tells in its last line, run in a process of its own."""
-    ran = subprocess.run(
-        [sys.executable, "-c", HEAD + script],
-        env={**os.environ, **SETTINGS, **settings},
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-    )
+def told(script: str, folder: Path) -> dict[str, Any]:
+    """What a script tells in its last line, run in a process of its own.
+
+    In accelerated time the SDK gives up on a tick after 100 ms, which a busy machine can take: then it is run again.
+    """
+    for _ in range(4):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        ran = subprocess.run(
+            [sys.executable, "-c", HEAD + script],
+            env={**os.environ, **SETTINGS},
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        if ran.returncode == 0 or "Timeout waiting for timestamp" not in ran.stderr:
+            break
     assert ran.returncode == 0, ran.stderr[-3000:]
     line = [line for line in ran.stdout.splitlines() if line.startswith("TOLD")][-1]
     return dict(json.loads(line.removeprefix("TOLD")))
@@ -182,3 +191,36 @@ tell(window=float(np.mean(window)), rest=rest, stimuli=len(window))
     found = told(script, tmp_path)
     assert found["stimuli"] == 40
     assert found["window"] > 1.5 * found["rest"]
+
+
+def test_a_closed_loop_runs_on_it_and_the_sdks_own_file_has_the_same_pulses(tmp_path: Path) -> None:
+    script = """
+from animat.closed_loop.contenders import controls
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.mapping import mapping_named
+from animat.neurons.conditions import Condition
+from animat.robots.registry import robot_named
+use_simulated_culture(seed=1, neurons=300)
+pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
+frequencies = tuple(Condition(f"{f} Hz", float(f), "Hz") for f in (20, 40, 80))
+percentiles = np.linspace(0, 100, 11)
+loop = Loop(robot_named("cartpole"), mapping_named("1-threshold"), frequencies, percentiles, pulses=5, pulse=pulse)
+contenders = controls(loop.robot, [c.label for c in frequencies], strongest=2, weakest=0)[:1]
+with CL1Culture(record_to="rig") as culture:
+    session = run_session(culture, loop, contenders, "session", episodes=2)
+if session.ending.by != "plan":
+    sys.exit(session.ending.sentence)
+recording = session.recording()
+tell(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
+     hz=recording.stimuli.frequency_hz.tolist(), pattern=recording.stimuli.pattern.tolist())
+"""
+    found = told(script, tmp_path)
+    assert found["episodes"] == 2
+    (file,) = (tmp_path / "rig").glob("*.h5")
+    from animat.recordings.formats.cl1 import read_cl1
+
+    own = read_cl1(file).stimuli
+    assert own.frequency_hz.tolist() == found["hz"]
+    assert own.pattern.tolist() == found["pattern"]
+    np.testing.assert_allclose(np.diff(own.time_s), np.diff(found["times"]), atol=1e-6)
