@@ -21,6 +21,7 @@ import numpy as np
 
 from animat.errors import AnimatError
 from animat.neurons.inspection import inspect_recording
+from animat.recordings.apart import _reader
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
 from rig_files import (
@@ -38,6 +39,7 @@ from rig_files import (
 
 GIGABYTE = 2**30
 SECONDS = 10
+
 N = 400
 
 
@@ -209,7 +211,9 @@ def main(kind: str, seed: int, count: int, folder: Path) -> None:
         signal.alarm(0)
         if mark.exists():
             raise RuntimeError("code of the file ran")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # The process that reads HDF5 files counts once it has ended.
+    _reader.end()
+    peak = 1024 * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     print(f"{kind}: {read} read, {refused} refused, peak {peak / 2**20:.0f} MiB")
     if peak > GIGABYTE:
         raise RuntimeError(f"{peak:,} bytes of memory")

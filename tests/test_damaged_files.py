@@ -1,4 +1,4 @@
-"""Damaged and hostile files: read, or refused in one line, whatever they hold. Oracle: the operating system's limits."""
+"""Damaged and hostile files: read, or refused in one line. Oracle: the operating system's limits."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def find_response(recording: Recording, up_to_ms: float = 500.0) -> ResponseTime
     gap_ms = 1e3 * np.append(np.diff(table.time_s), np.inf)
     gap_ms = np.minimum(gap_ms, 1e3 * (recording.stop_s - table.time_s))
     if int(np.count_nonzero(read & (gap_ms >= up_to_ms))) < min(20, int(np.count_nonzero(read))):
-        up_to_ms = float(np.quantile(gap_ms[read], 0.75))
+        up_to_ms = min(up_to_ms, float(np.quantile(gap_ms[read], 0.75)))
     chosen = read & (gap_ms >= up_to_ms)
     per_ms = rate_hz * 1e-3 * np.count_nonzero(chosen)
     bin_ms = next((width for width in _BINS_MS if width * per_ms >= 5), _BINS_MS[-1])

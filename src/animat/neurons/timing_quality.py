@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from animat.neurons.psth import post_stimulus_histogram, spontaneous_rate
 from animat.recordings.findings import Finding
@@ -20,6 +20,9 @@ ARTEFACT_UNTIL_MS = 2.0
 """An artefact begins before this."""
 TIMES = 5.0
 """As many spikes as elsewhere, and more, are an artefact; as few, and fewer, were blanked."""
+AFTERWARDS = 6
+"""Bins after an artefact that tell whether a response follows."""
+TIMES_RESPONSE = 2.0
 ENOUGH = 10.0
 """Spikes expected without a blank, to tell one."""
 
@@ -27,10 +30,12 @@ ENOUGH = 10.0
 def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
     """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
 
-    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around 0,
-    or from less than 2 ms on, in which b is above five times both the spontaneous rate and the median of b from 3 to
-    20 ms after. The blank is the run of bins around 0, without the artefact, in which b is below a fifth of the
-    spontaneous rate; it is looked for where 10 spikes or more would be in it.
+    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around the
+    largest one before 2 ms in which b is above five times both the spontaneous rate and the median of b from 3 to 20 ms
+    after, above twice the upper quartile of the latter, which is the response where there is one, and, if the culture
+    goes on firing afterwards, above a third of the largest bin. The blank is the run of bins around 0, without the
+    artefact, in which b is below a fifth of the spontaneous rate; it is looked for where 10 spikes or more would be in
+    it.
 
     Args:
         recording: with stimuli.
@@ -50,8 +55,11 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
     count = histogram.count.astype(np.float64)
     rate_hz, quiet_s = spontaneous_rate(recording)
     spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * histogram.n_stimuli
-    usual = max(spontaneous, float(np.median(count[centre_ms > 3.0])), 1.0)
-    artefact = _artefact(centre_ms, count, usual)
+    later = count[centre_ms > 3.0]
+    usual = max(spontaneous, float(np.median(later)), 1.0)
+    # Responses can begin before 2 ms: what is no sharper than the response later on is one.
+    usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
+    artefact = _artefact(centre_ms, count, usual, max(spontaneous, 1.0))
     if artefact is not None:
         yield _artefact_finding(centre_ms, count, artefact, usual, recording, histogram.n_stimuli, window_ms)
     if quiet_s > 0 and spontaneous > 0:
@@ -59,15 +67,27 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
 
 
 def _artefact(
-    centre_ms: Float64[np.ndarray, " bins"], count: Float64[np.ndarray, " bins"], usual: float
+    centre_ms: Float64[np.ndarray, " bins"], count: Float64[np.ndarray, " bins"], usual: float, spontaneous: float
 ) -> tuple[int, int] | None:
     """First and last bin of the artefact; None where there is none."""
     above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
-    starts = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
-    if not len(starts):
+    early = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
+    if not len(early):
         return None
-    first = last = int(starts[0])
-    while last + 1 < len(above) and (above[last + 1] or (last + 2 < len(above) and above[last + 2])):
+    largest = int(early[np.argmax(count[early])])
+    first, last = _run(above, largest)
+    if np.mean(count[last + 1 : last + 1 + AFTERWARDS]) > spontaneous:
+        # A response may follow at once: the artefact ends where its spikes are a third as many as at its height.
+        first, last = _run(above & (count >= count[largest] / 3), largest)
+    return first, last
+
+
+def _run(flags: Bool[np.ndarray, " bins"], start: int) -> tuple[int, int]:
+    """First and last of the flags that are set around one, over gaps of one."""
+    first = last = start
+    while first > 0 and flags[max(first - 2, 0) : first].any():
+        first -= 1
+    while last + 1 < len(flags) and flags[last + 1 : last + 3].any():
         last += 1
     return first, last
 
@@ -95,7 +115,8 @@ def _artefact_finding(
         "warning" if reaches else "note",
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
         f"{count[first : last + 1].max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
-        f"as spikes ({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
+        f"as spikes{'' if from_ms < 0 or reaches else ', or neurons that the pulse itself fired'} "
+        f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
         spikes / n_stimuli,
     )
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.recordings.apart import read_hdf5_apart
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
-from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.npz import read_npz
 from animat.recordings.recording import Recording
 
@@ -64,7 +64,7 @@ def read_recording(
         raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
         if magic.startswith(HDF5):
-            recording = read_hdf5(path, part=part, stimuli=stimuli)
+            recording = read_hdf5_apart(path, part=part, stimuli=stimuli)
         elif magic.startswith(ZIP):
             recording = read_npz(path)
         elif magic.startswith(NPY):

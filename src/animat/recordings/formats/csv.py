@@ -42,7 +42,7 @@ STIMULUS_COLUMNS = {
 }
 MOST_ELECTRODES = 50_000_000
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
-UNPACKED_BYTES, UNPACKED_RATIO = 2**24, 20
+UNPACKED_BYTES, UNPACKED_RATIO = 2**22, 20
 SUFFIXES = (".csv", ".csv.gz")
 
 

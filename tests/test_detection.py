@@ -1,0 +1,321 @@
+"""Raw traces to spikes. Oracles: traces with known spikes, scipy's two-pass filter, a plain loop, SpikeInterface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import Float64, Int64
+from scipy import signal
+
+from animat.cultures.traces import Traces, record_traces
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.detection.artefacts import without_artefacts
+from animat.recordings.detection.band import band_pass
+from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
+from animat.recordings.detection.settings import Detection
+from animat.recordings.detection.troughs import find_troughs
+from animat.recordings.raw import ArrayTraces
+from animat.recordings.recording import Channels
+from animat.recordings.spikes_of_traces import read_traces
+from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
+from cultures import small_culture
+from rig_files import event_table, mapping_table, write_cl1, write_maxwell
+
+SCIPY = Detection(engine="scipy")
+RATE_HZ = 20_000.0
+SPIKE_UV = -60 * np.exp(-(((np.arange(-20, 41)) / 3.0) ** 2) / 2)
+
+
+def channels(n: int) -> Channels:
+    return Channels(np.arange(n).astype(str), np.arange(n), np.arange(n) * 17.5, np.zeros(n))
+
+
+def noisy(
+    n: int, seconds: float, seed: int = 0, step_uv: float = 0.1
+) -> tuple[np.ndarray, list[Int64[np.ndarray, " n"]]]:
+    """Whole numbers of noise of 5 uV with spikes of 60 uV at known samples, never closer than 3 ms."""
+    rng = np.random.default_rng(seed)
+    voltage = rng.normal(0, 5 / step_uv, (round(seconds * RATE_HZ), n))
+    truth = []
+    for column in range(n):
+        at = np.cumsum(rng.integers(60, 8000, round(seconds * 8))) + 100
+        at = at[at < len(voltage) - 100]
+        for sample in at:
+            voltage[sample - 20 : sample + 41, column] += SPIKE_UV / step_uv
+        truth.append(at)
+    return np.rint(voltage).astype(np.int16), truth
+
+
+def agreement(found: FoundSpikes, truth: list[Int64[np.ndarray, " n"]]) -> tuple[int, int, int]:
+    """Spikes found, missed and made up, within half a millisecond."""
+    hit = missed = false = 0
+    for column, at in enumerate(truth):
+        sample = np.rint(found.time_s[found.channel == column] * RATE_HZ)
+        near = np.abs(sample[:, None] - at[None, :]) <= 10
+        hit += int(near.any(axis=0).sum())
+        missed += int((~near.any(axis=0)).sum())
+        false += int((~near.any(axis=1)).sum())
+    return hit, missed, false
+
+
+@pytest.fixture(scope="module")
+def known() -> tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]:
+    voltage, truth = noisy(70, 6.0)
+    return ArrayTraces(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
+
+
+def test_known_spikes_are_found_and_few_others(known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]) -> None:
+    traces, truth = known
+    found = find_spikes(traces, None, SCIPY)
+    shifted = FoundSpikes(found.time_s + 1.0, found.channel, found.noise_uv, found.engine, found.findings)
+    hit, missed, false = agreement(shifted, truth)
+    assert hit > 1500
+    assert missed + false <= 0.01 * hit
+    # White noise of 5 uV keeps the share of its power that is in the band.
+    np.testing.assert_allclose(found.noise_uv, 5 * np.sqrt(2900 / 10_000), rtol=0.1)
+    assert np.all(np.diff(found.time_s) >= 0)
+
+
+@pytest.mark.parametrize(("chunk_s", "workers"), [(0.1, 1), (0.3, 3), (10.0, 2)])
+def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
+    known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]], chunk_s: float, workers: int
+) -> None:
+    whole = find_spikes(known[0], None, SCIPY, workers=1)
+    pieces = find_spikes(known[0], None, Detection(engine="scipy", chunk_s=chunk_s), workers=workers)
+    # A trough at the threshold itself can fall on either side by the rounding of single precision.
+    assert abs(len(pieces.time_s) - len(whole.time_s)) <= 2
+    both = set(zip(whole.time_s.tolist(), whole.channel.tolist(), strict=True)) & set(
+        zip(pieces.time_s.tolist(), pieces.channel.tolist(), strict=True)
+    )
+    assert len(both) >= len(whole.time_s) - 3
+
+
+def test_spikeinterface_and_scipy_find_the_same_spikes(
+    known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]],
+) -> None:
+    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
+    ours = find_spikes(known[0], np.arange(0.05, 4, 0.2), SCIPY)
+    theirs = find_spikes(known[0], np.arange(0.05, 4, 0.2), Detection(engine="spikeinterface"))
+    assert theirs.engine == "SpikeInterface"
+    sets = [set(zip(np.rint(f.time_s * RATE_HZ).tolist(), f.channel.tolist(), strict=True)) for f in (ours, theirs)]
+    assert len(sets[0] ^ sets[1]) <= 0.01 * len(sets[0])
+
+
+def test_without_spikeinterface_it_cannot_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    traces = ArrayTraces(np.zeros((4000, 1), np.int16), channels(1), RATE_HZ)
+    with pytest.raises(InvalidArgument, match=r"spikeinterface: pip install 'animat\[raw\]'"):
+        find_spikes(traces, None, Detection(engine="spikeinterface"))
+    assert find_spikes(traces).engine == "scipy"
+
+
+def test_the_filter_is_the_two_pass_butterworth() -> None:
+    rng = np.random.default_rng(1)
+    voltage = rng.normal(0, 10, (3, 9000)).astype(np.float32) + 500
+    sections = signal.butter(3, (100, 3000), "bandpass", fs=RATE_HZ, output="sos")
+    expected = signal.sosfiltfilt(sections, voltage.astype(np.float64), axis=1)
+    filtered = band_pass(voltage, (100.0, 3000.0), RATE_HZ)
+    np.testing.assert_allclose(filtered[:, 1000:-1000], expected[:, 1000:-1000], atol=2e-3)
+
+
+@settings(deadline=None, max_examples=60)
+@given(steps=st.lists(st.integers(-9, 3), min_size=1, max_size=60), apart=st.integers(1, 8), depth=st.integers(0, 8))
+def test_troughs_are_those_of_the_definition(steps: list[int], apart: int, depth: int) -> None:
+    trace = np.array(steps, dtype=np.float32)
+    expected = [
+        t
+        for t, v in enumerate(steps)
+        if v < -depth
+        and all(v < s for s in steps[max(t - apart, 0) : t])
+        and all(v <= s for s in steps[t + 1 : t + apart + 1])
+    ]
+    row, sample = find_troughs(trace[None, :], np.array([depth], np.float32), apart, 0, len(trace))
+    assert sample.tolist() == expected
+    assert set(row.tolist()) <= {0}
+
+
+# --- artefacts -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stimulated() -> tuple[Traces, ArrayTraces]:
+    with small_culture() as culture:
+        pulses = [Stimulus(0.2 + 0.1 * i, tuple(culture.patterns[i].tolist()), PUBLISHED_PULSE) for i in range(16)]
+        traces = record_traces(culture, 2.0, stimuli=pulses)
+        x_um, y_um = culture.selection.array.position_um(culture.selection.recording)
+    n = traces.voltage_uv.shape[1]
+    table = Channels(np.arange(n).astype(str), np.arange(n), x_um, y_um)
+    return traces, ArrayTraces(traces.voltage_uv, table, traces.sampling_rate_hz)
+
+
+def in_window(
+    time_s: Float64[np.ndarray, " spikes"], stimulus_s: Float64[np.ndarray, " stimuli"], window_ms: tuple[float, float]
+) -> np.ndarray:
+    since_ms = 1e3 * (time_s - stimulus_s[np.maximum(np.searchsorted(stimulus_s, time_s, side="right") - 1, 0)])
+    return (since_ms >= window_ms[0]) & (since_ms < window_ms[1])
+
+
+def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, ArrayTraces]) -> None:
+    traces, source = stimulated
+    found = find_spikes(source, traces.stimulus_time_s, SCIPY)
+    large = (traces.amplitude_uv > 8 * 2.4) & in_window(traces.spikes.time_s, traces.stimulus_time_s, (2, 10))
+    kept = in_window(found.time_s, traces.stimulus_time_s, (2, 10))
+    true_s, true_channel = traces.spikes.time_s, traces.spikes.channel
+    hit = sum(
+        bool(np.any((found.channel == c) & (np.abs(found.time_s - t) < 6e-4)))
+        for t, c in zip(true_s[large], true_channel[large], strict=True)
+    )
+    false = sum(
+        not np.any((true_channel == c) & (np.abs(true_s - t) < 6e-4))
+        for t, c in zip(found.time_s[kept], found.channel[kept], strict=True)
+    )
+    assert np.count_nonzero(large) > 300
+    assert hit >= 0.97 * np.count_nonzero(large)
+    assert false <= 0.02 * np.count_nonzero(kept)
+    assert not np.any(in_window(found.time_s, traces.stimulus_time_s, (0, 1.4)))
+    names = {finding.name: finding for finding in found.findings}
+    assert names["blanked"].severity == "note"
+    assert "are saturated on average" in names["saturated-channels"].sentence
+
+
+def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, ArrayTraces]) -> None:
+    traces, source = stimulated
+    naive = find_spikes(source, None, SCIPY)
+    removed = find_spikes(source, traces.stimulus_time_s, SCIPY)
+    count = [np.count_nonzero(in_window(f.time_s, traces.stimulus_time_s, (0, 10))) for f in (naive, removed)]
+    assert count[0] > 1.3 * count[1]
+
+
+def test_a_window_is_not_eaten_unasked() -> None:
+    assert Detection().blank_ms[1] <= 1.5
+    traces = ArrayTraces(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
+    found = find_spikes(traces, np.array([0.5]), Detection(engine="scipy", blank_ms=(0.5, 3.0)))
+    assert {f.name: f.severity for f in found.findings}["blanked"] == "warning"
+
+
+def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
+    voltage, _ = noisy(4, 0.2)
+    trace = np.ascontiguousarray(voltage.T * np.float32(0.1))
+    trace[1, 2000:2100] = -3200.0
+    noise = np.full(4, 5.0, np.float32)
+    cleaned = without_artefacts(trace, np.array([2000]), noise, RATE_HZ, Detection())
+    assert cleaned.is_blank is not None
+    assert cleaned.is_blank[1, 1990:2100].all()
+    assert not cleaned.is_blank[1, 2106:].any()
+    assert not cleaned.is_blank[0, 2030:].any()
+    assert (cleaned.saturated.tolist(), np.abs(cleaned.voltage_uv[1]).max() < 100) == ([1], True)
+    assert 5.0 <= cleaned.longest_ms[0] <= 5.5
+
+
+@pytest.mark.parametrize("tau_ms", [0.4, 1.0, 2.7, 6.0])
+@pytest.mark.parametrize("size_uv", [-3000.0, 150.0])
+def test_a_decay_is_taken_away_and_spikes_on_it_are_left(tau_ms: float, size_uv: float) -> None:
+    rng = np.random.default_rng(3)
+    t_ms = np.arange(4000) / 20 - 100
+    trace = rng.normal(0, 3, (1, 4000)).astype(np.float32)
+    spikes = np.zeros(4000, np.float32)
+    spikes[2080:2141] += SPIKE_UV.astype(np.float32)
+    decay = np.where(t_ms >= 0, size_uv * np.exp(-t_ms / tau_ms), 0)
+    before = trace[0] + spikes
+    cleaned = without_artefacts(
+        (before + decay)[None, :].astype(np.float32),
+        np.array([2000]),
+        np.array([3.0], np.float32),
+        RATE_HZ,
+        Detection(),
+    )
+    error = cleaned.voltage_uv[0, 2040:] - before[2040:]
+    # Beyond where it is followed (20 ms) what is left of the slowest is 3 % of 3 mV.
+    assert np.abs(error[:350]).max() < 6.0
+
+
+def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
+    traces = ArrayTraces(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
+    found = find_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), SCIPY)
+    assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
+
+
+def test_dead_and_noisy_channels_are_said() -> None:
+    voltage, _ = noisy(30, 1.0)
+    voltage[:, 3] = 7
+    voltage[:, 8] *= 20
+    found = find_spikes(ArrayTraces(voltage, channels(30), RATE_HZ, uv_per_step=0.1), None, SCIPY)
+    said = {finding.name: finding.value for finding in found.findings}
+    assert (said["dead-channels"], said["noisy-channels"]) == (1, 1)
+    assert 3 not in found.channel
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("band_hz", (300.0, 100.0)), ("threshold", 0.0), ("blank_ms", (0.0, -1.0)), ("chunk_s", 0.0), ("engine", "x")],
+)
+def test_settings_that_cannot_be_are_refused(setting: str, value: object) -> None:
+    with pytest.raises(InvalidArgument, match=setting):
+        Detection(**{setting: value})  # type: ignore[arg-type]
+
+
+def test_a_band_beyond_the_sampling_rate_is_refused() -> None:
+    traces = ArrayTraces(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
+    with pytest.raises(InvalidArgument, match="less than half the sampling rate of 5000 Hz, got 3000 Hz"):
+        find_spikes(traces, None, SCIPY)
+
+
+# --- from files ------------------------------------------------------------------------------------------------------
+
+
+def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
+    voltage, truth = noisy(3, 2.0, step_uv=6.3)
+    raw = (voltage.T + 512).astype("<u2")
+    path = write_maxwell(
+        tmp_path / "a.h5",
+        mapping=mapping_table([40, 9, 3], [26_399, 2000, 1000]),
+        spikes=None,
+        events=event_table([0.5], [""]),
+        recorded=[3, 9, 40],
+        raw=raw,
+    )
+    recording = read_traces(path, SCIPY)
+    assert recording.channels.label.tolist() == ["3", "9", "40"]
+    assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
+    assert (recording.duration_s, len(recording.stimuli)) == (2.0, 1)
+    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), "", ())
+    hit, missed, false = agreement(found, [at[np.abs(at - 10_000) > 60] for at in truth])
+    assert hit > 15
+    assert missed == 0
+    assert false <= 1
+    assert "by scipy" in recording.provenance["spikes"]
+
+
+def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
+    voltage, _ = noisy(64, 0.5, step_uv=0.195)
+    path = write_cl1(tmp_path / "a.h5", spikes=None, stims=[(5000, 9)], samples=voltage)
+    recording = read_traces(path, SCIPY)
+    assert len(recording.channels) == 64
+    assert len(recording.spike_times_s) > 60
+    assert recording.stimuli.electrodes.tolist() == [[9]]
+
+
+def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
+    voltage, truth = noisy(2, 1.0, step_uv=1.0)
+    with h5py.File(tmp_path / "a.nwb", "w") as file:
+        file.attrs["nwb_version"] = "2.7.0"
+        series = file.create_group("acquisition/traces")
+        series.attrs["neurodata_type"] = "ElectricalSeries"
+        series["data"] = voltage
+        series["data"].attrs["conversion"] = 1e-6
+        series["starting_time"] = 0.0
+        series["starting_time"].attrs["rate"] = RATE_HZ
+    recording = read_traces(tmp_path / "a.nwb", SCIPY)
+    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), "", ())
+    assert agreement(found, truth)[1] == 0
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        del file["acquisition/traces/data"]
+    with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
+        read_traces(tmp_path / "a.nwb", SCIPY)

@@ -1,0 +1,132 @@
+"""Quality in words: recordings made with one fault each, and real ones with theirs. Oracle: the fault that was made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat.neurons.inspection import inspect_recording
+from animat.neurons.responses import extract_responses
+from animat.recordings.findings import Finding
+from animat.recordings.made_up import MadeUpCulture
+from animat.recordings.noticed import noticed
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+from test_inspection import answering
+from test_responses import recording
+
+
+def with_spikes(source: Recording, spikes: np.ndarray) -> Recording:
+    """The same recording with these spikes (time, channel)."""
+    return recording(
+        spikes,
+        source.stimuli.time_s,
+        len(source.channels),
+        source.duration_s,
+        frequency_hz=source.stimuli.frequency_hz,
+    )
+
+
+def spikes_of(source: Recording) -> np.ndarray:
+    return np.column_stack([source.spike_times_s, source.spike_channels])
+
+
+def since_ms(source: Recording, time_s: np.ndarray) -> np.ndarray:
+    """Time from the nearest stimulus, negative before it."""
+    stimuli = source.stimuli.time_s
+    after = np.clip(np.searchsorted(stimuli, time_s), 1, len(stimuli) - 1)
+    before = time_s - stimuli[after - 1]
+    return 1e3 * np.where(before < stimuli[after] - time_s, before, time_s - stimuli[after])
+
+
+def findings(source: Recording, **options: object) -> dict[str, Finding]:
+    return {f.name: f for f in extract_responses(source, **options).findings}  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("until_ms", "severity"), [(1.5, "note"), (3.5, "warning")])
+def test_an_artefact_counted_as_spikes(until_ms: float, severity: str) -> None:
+    source = answering({5: 10.0, 10: 30.0})
+    rng = np.random.default_rng(1)
+    artefact = [(t + rng.uniform(0, until_ms) * 1e-3, c % 40) for t in source.stimuli.time_s for c in range(60)]
+    found = findings(with_spikes(source, np.vstack([spikes_of(source), artefact])))["artefact-spikes"]
+    assert found.severity == severity
+    assert found.value == pytest.approx(60, rel=0.05)
+    assert f"from 0 to {until_ms:g} ms there are 6" in found.sentence
+    assert ("begin it at 3.5 ms or later" in found.sentence) == (until_ms > 2)
+
+
+def test_a_strong_response_is_no_artefact() -> None:
+    assert "artefact-spikes" not in findings(answering({5: 60.0, 10: 90.0}))
+    assert "artefact-spikes" not in findings(MadeUpCulture(seed=2).record(0.0))
+
+
+@pytest.mark.parametrize(("until_ms", "severity"), [(2.0, "note"), (3.0, "note"), (6.0, "warning")])
+def test_a_blanked_stretch_is_told_from_a_quiet_culture(until_ms: float, severity: str) -> None:
+    source = answering({5: 30.0, 10: 60.0}, n=150)
+    spikes = spikes_of(source)
+    since = since_ms(source, spikes[:, 0])
+    found = findings(with_spikes(source, spikes[(since < -3) | (since > until_ms)]))["blanked-window"]
+    assert found.severity == severity
+    assert f"from -3 to {until_ms:g} ms around a stimulus next to nothing" in found.sentence
+    assert found.value == pytest.approx(max(until_ms - 2, 0) / 8, abs=0.08)
+    assert "blanked-window" not in findings(source)
+
+
+def drifting(change: float, blocked: bool, seed: int = 0) -> Recording:
+    """Responses that change by a share from start to end; conditions mixed or one after the other."""
+    rng = np.random.default_rng(seed)
+    frequencies = np.repeat([5.0, 10.0], 200)
+    if not blocked:
+        rng.shuffle(frequencies)
+    stimulus_s = 1 + 0.25 * np.arange(400)
+    mean = np.where(frequencies == 5, 10.0, 30.0) * (1 + change * np.linspace(-0.5, 0.5, 400))
+    spikes = [(t + rng.uniform(0.003, 0.009), int(rng.integers(40))) for t, m in zip(stimulus_s, mean, strict=True)
+              for _ in range(rng.poisson(m))]  # fmt: skip
+    return recording(spikes, stimulus_s, 40, 102.0, frequency_hz=frequencies)
+
+
+@pytest.mark.parametrize("blocked", [False, True])
+@pytest.mark.parametrize("change", [-0.6, 0.6])
+def test_drift_within_a_recording(change: float, blocked: bool) -> None:
+    found = findings(drifting(change, blocked), burst_threshold=1.0)["drift"]
+    assert found.severity == "warning"
+    assert found.value == pytest.approx(change, abs=0.2)
+    assert ("responses rise by" in found.sentence) == (change > 0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_conditions_that_differ_one_after_the_other_are_no_drift(seed: int) -> None:
+    assert "drift" not in findings(drifting(0.0, True, seed), burst_threshold=1.0)
+
+
+def test_channels_that_fire_as_no_neurons_do() -> None:
+    rng = np.random.default_rng(0)
+    usual = np.column_stack([rng.uniform(0, 10, 400), rng.integers(0, 30, 400)])
+    hum = np.column_stack([np.arange(0, 10, 0.008), np.full(1250, 39)])
+    found = {f.name: f for f in noticed(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
+    assert (found["noisy-channels"].severity, found["noisy-channels"].value) == ("warning", 1)
+    assert "1 of 40 channels (39) fire as no neurons do and hold 76 % of all spikes" in found["noisy-channels"].sentence
+    assert (found["silent-channels"].severity, found["silent-channels"].value) == ("note", 9)
+    found = {f.name: f for f in noticed(recording(usual[:20], [1], 40, 10.0))}
+    assert found["silent-channels"].severity == "warning"
+    assert "noisy-channels" not in found
+
+
+def test_the_organoid_on_a_maxone_can_be_used_with_care(real_data: Path) -> None:
+    inspection = inspect_recording(read_recording(real_data / "organoid_cartpole_maxone.npz"))
+    found = {f.name: f for f in inspection.findings}
+    assert inspection.verdict == "usable with care"
+    assert found["blanked-window"].severity == "note"
+    assert "to 3 ms around a stimulus next to nothing was recorded" in found["blanked-window"].sentence
+    assert "artefact-spikes" not in found
+
+
+def test_brainoware_cannot_be_used_in_the_papers_window(real_data: Path) -> None:
+    inspection = inspect_recording(read_recording(real_data / "brainoware_spikes.csv.gz"))
+    found = {f.name: f for f in inspection.findings}
+    assert inspection.verdict == "not usable"
+    assert found["dead-window"].severity == "refuse"
+    assert "an artefact counted as spikes" in found["artefact-spikes"].sentence
+    assert found["artefact-spikes"].severity == "warning"
