@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.filters import threshold_otsu
 
+from animat.errors import InvalidArgument
 from animat.neurons.bursts import otsu_threshold, separability, separate_bursts
 
 
@@ -86,6 +87,12 @@ def test_a_given_threshold_is_used_and_one_keeps_everything() -> None:
     kept = separate_bursts(ratio, 1.0)
     assert not kept.is_burst.any()
     assert kept.separability == 0
+
+
+@pytest.mark.parametrize("threshold", [math.nan, -0.1, 1.5, math.inf])
+def test_a_threshold_that_is_no_share_is_refused(threshold: float) -> None:
+    with pytest.raises(InvalidArgument, match="burst_threshold: expected a share of channels from 0 to 1"):
+        separate_bursts(np.array([0.1, 0.5]), threshold)
 
 
 def test_one_hump_has_the_separability_of_theory_and_no_valley() -> None:

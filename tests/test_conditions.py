@@ -148,6 +148,8 @@ def test_the_tolerance_can_be_typed_or_left_out() -> None:
         ("electrode:1+2,2+1", "expected each set of electrodes once"),
         ("pattern:1.5", "expected whole numbers"),
         ("pattern:3,3", "each once"),
+        ("pattern:99999999999999999999", "expected whole numbers of an electrode or a pattern"),
+        ("electrode:1+99999999999999999999", "expected whole numbers of an electrode or a pattern"),
     ],
 )
 def test_what_cannot_be_read_says_what_was_expected(text: str, said: str) -> None:

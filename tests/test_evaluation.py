@@ -177,6 +177,11 @@ def test_what_does_not_belong_together_is_refused() -> None:
         evaluate({"a": policy}, timeline, episodes=0)
     with pytest.raises(InvalidArgument, match="timeline"):
         evaluate({"a": policy}, None)
+    with pytest.raises(InvalidArgument, match="at_min: expected a minute"):
+        evaluate({"a": policy}, timeline, at_min=float("nan"))
+    for seed in (-1, 2**32):
+        with pytest.raises(InvalidArgument, match="seed: expected a whole number"):
+            evaluate({"a": policy}, timeline, seed=seed)
     with pytest.raises(Mismatch, match="robot: expected cartpole"):
         evaluate({"a": policy}, timeline, robot=Navigation())
     with pytest.raises(Mismatch, match="b: expected the same robot as a"):

@@ -268,6 +268,7 @@ def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:
         ({"iterations": 0}, "iterations"),
         ({"iterations": 2**31}, "iterations"),
         ({"seed": -1}, "seed"),
+        ({"seed": 2**32}, "seed"),
         ({"duration_min": 0.0}, "duration_min"),
         ({"duration_min": float("nan")}, "duration_min"),
         ({"percentiles": "last"}, "percentiles"),

@@ -144,10 +144,13 @@ def roll_out(
         seed: decides every random draw.
 
     Raises:
-        InvalidArgument: for fewer episodes than one.
+        InvalidArgument: for fewer episodes than one, or a seed of more than 32 bits.
     """
     if episodes < 1:
         raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
+    if not 0 <= seed < 2**32:
+        raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
     keys = jax.random.split(jax.random.key(seed), n_actors)
     returns, lengths, terminated = _roll_out(environment, episodes, simulator, actors, keys)
     return Episodes(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), np.asarray(terminated))

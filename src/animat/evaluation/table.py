@@ -132,7 +132,7 @@ def evaluate(
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
 
     Raises:
-        InvalidArgument: for no policies or fewer episodes than one.
+        InvalidArgument: for no policies, fewer episodes than one, or an `at_min` or a seed that is none.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
     if not policies:
@@ -156,6 +156,8 @@ def evaluate(
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
         findings = _check(first, timeline)
+        if at_min is not None and np.isnan(at_min):
+            raise InvalidArgument("at_min: expected a minute on the culture's clock, got nan")
         row = timeline.row_at(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
         simulator = timeline.at(minute)

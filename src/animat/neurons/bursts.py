@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from animat.errors import InvalidArgument
+
 
 @dataclass(frozen=True, eq=False)
 class BurstSeparation:
@@ -58,10 +60,15 @@ def separate_bursts(active_ratio: Float64[np.ndarray, " responses"], threshold: 
         active_ratio: the share of channels with at least one spike in the window, shape (responses,).
         threshold: a ratio to use in place of Otsu's threshold; 1 keeps every response.
 
+    Raises:
+        InvalidArgument: for a threshold that is no ratio from 0 to 1.
+
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording).
     """
     if threshold is None:
         threshold = otsu_threshold(active_ratio)
+    elif not 0 <= threshold <= 1:
+        raise InvalidArgument(f"burst_threshold: expected a share of channels from 0 to 1, got {threshold:g}")
     is_burst = active_ratio > threshold
     return BurstSeparation(threshold, separability(active_ratio, is_burst), _valley(active_ratio, is_burst), is_burst)
 

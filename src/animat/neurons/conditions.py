@@ -271,9 +271,12 @@ def _floats(text: str, listed: str) -> tuple[float, ...]:
 
 def _integers(text: str, listed: str, separator: str) -> tuple[int, ...]:
     try:
-        return tuple(int(part) for part in listed.split(separator)) if listed else ()
+        numbers = tuple(int(part) for part in listed.split(separator)) if listed else ()
     except ValueError:
         raise _unread(text, f"whole numbers with {separator!r} between them") from None
+    if any(abs(number) >= 2**63 for number in numbers):
+        raise _unread(text, "whole numbers of an electrode or a pattern")
+    return numbers
 
 
 def _unread(text: str, expected: str) -> InvalidArgument:

@@ -19,6 +19,9 @@ Kind = Literal["histogram", "empirical"]
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it is on its way to another process."""
 
+LARGEST_BINS = 10_000
+"""Of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
+
 PERCENTILES = tuple(range(0, 101, 10))
 """Which percentiles of the pooled non-burst responses a simulator carries: P0 (smallest), P10, ..., P100 (largest)."""
 
@@ -125,11 +128,11 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
             count into the last bin, and `fidelity` says how many they are.
 
     Raises:
-        InvalidArgument: for fewer bins than one or a range that is not positive.
+        InvalidArgument: for fewer bins than one or more than `LARGEST_BINS`, or a range that is not positive.
         UnusableData: if a condition has no non-burst response.
     """
-    if bins < 1:
-        raise InvalidArgument(f"bins: expected at least 1, got {bins}")
+    if not 1 <= bins <= LARGEST_BINS:
+        raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS}, got {bins}; the empirical simulator has none")
     upper = histogram_range_hz(responses) if range_hz is None else range_hz
     if not (np.isfinite(upper) and upper > 0):
         raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {upper:g}")

@@ -60,8 +60,9 @@ class Training:
             raise InvalidArgument(
                 f"iterations: expected at most 2e9, as they are counted in int32, got {self.iterations}"
             )
-        if self.seed < 0:
-            raise InvalidArgument(f"seed: expected a whole number from 0 on, got {self.seed}")
+        # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
+        if not 0 <= self.seed < 2**32:
+            raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {self.seed}")
         if not (math.isfinite(self.duration_min) and self.duration_min > 0):
             raise InvalidArgument(f"duration_min: expected positive minutes, got {self.duration_min:g}")
         for name, allowed in (("percentiles", get_args(Percentiles)), ("delivery", get_args(Delivery))):
