@@ -1,0 +1,209 @@
+"""A live run: recordings on time, simulators swapped under a training that never stops, a budget that is kept."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.cultures.budget import Account, Budget
+from animat.errors import AnimatError, BudgetSpent, InvalidArgument, Mismatch, UnusableData
+from animat.live.exchange import Exchange
+from animat.live.shadowing import LOG_FILE, Lived, Pace, live
+from animat.mapping import Thresholds
+from animat.neurons.made_up import made_up_simulator
+from animat.neurons.responses import extract_responses
+from animat.neurons.timeline import fit_timeline
+from animat.reality_gap import Calibration
+from animat.recordings.protocol import Protocol
+from animat.recordings.reading import read_recordings
+from animat.robots import Navigation
+from animat.training.policy import load_policies
+from animat.training.sac import SAC
+from animat.training.specification import Training
+from fake_culture import FakeCulture
+
+SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
+TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iterations=6000, seed=3, algorithm=SMALL)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
+PULSES = 5 * 40 * 2
+QUICK = Pace(interval_min=10, duration_min=30, speed=1e6)
+
+
+def lines(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lived, Path, int]:
+    folder = tmp_path_factory.mktemp("live") / "live"
+    with FakeCulture() as culture:
+        found = live(TRAINING, culture, PROTOCOL, folder, pace=QUICK, episodes=3)
+        return found, folder, culture.delivered
+
+
+def test_the_culture_is_recorded_every_interval(lived: tuple[Lived, Path, int]) -> None:
+    found, folder, _ = lived
+    assert [file.name for file in found.recordings] == [f"recording_{m}_min.nwb" for m in ("00.2", "10.2", "20.2")]
+    recordings = read_recordings([folder / "recordings"])
+    np.testing.assert_allclose(np.diff([r.start_min for r in recordings]), 10, atol=1e-9)
+    orders = [recording.stimuli.frequency_hz.tolist() for recording in recordings]
+    assert orders[0] != orders[1] != orders[2]
+    assert found.culture_min == pytest.approx(30.0)
+
+
+def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(lived: tuple[Lived, Path, int]) -> None:
+    found, folder, _ = lived
+    starts_min = [r.start_min for r in read_recordings([folder / "recordings"])]
+    assert [swap["recorded_at_min"] for swap in found.swaps] == pytest.approx(starts_min[1:])
+    assert all(swap["members"] == [0, 1] for swap in found.swaps)
+    # The training went on: each swap at a later chunk, and iterations counted on through all.
+    chunks = [swap["chunk"] for swap in found.swaps]
+    assert 0 < chunks[0] < chunks[1]
+    policies = load_policies(folder / "policies")
+    assert list(policies) == list(found.policies) == ["p0", "p1"]
+    for policy in policies.values():
+        iterations = policy.learning_curve[:, 0]
+        assert np.all(np.diff(iterations) > 0)
+        assert iterations[-1] == found.iterations
+        assert len(iterations) > chunks[1]
+        told = policy.provenance["swaps"]
+        assert [swap["recorded_at_min"] for swap in told] == pytest.approx(starts_min)
+        assert told[0]["chunk"] == 0
+        assert policy.provenance["training"]["duration_min"] == 30.0
+        assert policy.presentation == PROTOCOL.presentation
+
+
+def test_what_happened_is_in_the_log_in_order(lived: tuple[Lived, Path, int]) -> None:
+    found, folder, _ = lived
+    told = lines(folder)
+    whats = [line["what"] for line in told]
+    assert whats == [
+        "recording", "training", "training began", "recording", "swap", "recording", "swap",
+        "trained", "closed loop", "end",
+    ]  # fmt: skip
+    for name in ("at", "wall_s", "culture_min"):
+        assert all(one[name] <= next_[name] for one, next_ in pairwise(told))
+    assert not (folder / ".exchange").exists()
+    json.dumps(found.to_dict())
+
+
+def test_the_loop_runs_with_what_was_trained_on_last(lived: tuple[Lived, Path, int]) -> None:
+    found, folder, delivered = lived
+    gap = found.gap
+    assert gap.session.ending.by == "plan"
+    assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
+    series = [extract_responses(recording) for recording in read_recordings([folder / "recordings"])]
+    expected = fit_timeline(series).simulators.percentiles[-1]
+    np.testing.assert_array_equal(gap.loop.percentiles, np.asarray(expected))
+    # A later run of these policies takes the same.
+    again = Calibration.of_series(series, found.policies["p0"])
+    np.testing.assert_array_equal(again.percentiles, gap.loop.percentiles)
+    assert gap.account.pulses == delivered == 3 * PULSES + sum(e.pulses for e in gap.session.episodes)
+
+
+def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Path) -> None:
+    account = Account(Budget(pulses=2 * PULSES + 100))
+    with FakeCulture() as culture:
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1, account=account)
+        assert culture.delivered == account.pulses <= 2 * PULSES + 100
+    assert len(found.recordings) == 2
+    assert len(found.swaps) == 1
+    assert found.culture_min == pytest.approx(30.0)
+    assert [line["what"] for line in lines(tmp_path / "live")].count("budget") == 1
+    assert found.gap.session.ending.by in ("plan", "budget")
+    with FakeCulture() as culture, pytest.raises(BudgetSpent, match="0 of 10 pulses are spent, and 400 more"):
+        live(TRAINING, culture, PROTOCOL, tmp_path / "none", account=Account(Budget(pulses=10)))
+
+
+def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path) -> None:
+    with FakeCulture() as culture:
+        refused = iter([False, True, False])
+
+        def extract(recordings: Any, *given: Any, **more: Any) -> Any:
+            if next(refused):
+                raise UnusableData("a dead window")
+            return [extract_responses(recording) for recording in recordings]
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("animat.live.shadowing.extract_series", extract)
+            found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+    assert len(found.recordings) == 3
+    assert len(found.swaps) == 1
+    assert [line["sentence"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
+
+
+class Pressing:
+    """A progress at which a person presses Ctrl-C once there was a swap."""
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        if "1 swaps" in note:
+            raise KeyboardInterrupt
+
+
+def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Path) -> None:
+    with FakeCulture() as culture:
+        with pytest.raises(KeyboardInterrupt):
+            live(
+                TRAINING,
+                culture,
+                PROTOCOL,
+                tmp_path / "live",
+                pace=Pace(interval_min=10, duration_min=1000, speed=1e4),
+                progress=Pressing(),
+            )
+        assert culture.is_stopped
+        assert culture.after_halt == 0
+    assert list(load_policies(tmp_path / "live" / "policies")) == ["p0", "p1"]
+    assert len(read_recordings([tmp_path / "live" / "recordings"])) >= 2
+    assert lines(tmp_path / "live")[-1]["what"] == "interrupted"
+
+
+def test_a_training_that_fails_ends_the_run_with_its_recordings_kept(tmp_path: Path) -> None:
+    impossible = Training(Navigation(), Thresholds(1), policies=1, iterations=600, algorithm=SMALL)
+    with FakeCulture() as culture, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Exchange, "publish", lambda *_: None)
+        with pytest.raises(AnimatError, match="expected a simulator in the exchange"):
+            live(impossible, culture, PROTOCOL, tmp_path / "live", pace=QUICK)
+    assert len(read_recordings([tmp_path / "live" / "recordings"])) == 1
+
+
+def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> None:
+    with FakeCulture() as culture:
+        with pytest.raises(InvalidArgument, match="through neurons"):
+            live(Training(Navigation(), None), culture, PROTOCOL, tmp_path / "live")
+        with pytest.raises(InvalidArgument, match="interval_min: expected at least"):
+            live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=Pace(interval_min=0.1))
+        (tmp_path / "full").mkdir()
+        (tmp_path / "full" / "something").touch()
+        with pytest.raises(Mismatch, match="an empty folder"):
+            live(TRAINING, culture, PROTOCOL, tmp_path / "full")
+        for wrong in ({"speed": 0.0}, {"interval_min": -1.0}, {"duration_min": float("nan")}):
+            with pytest.raises(InvalidArgument, match=next(iter(wrong))):
+                Pace(**wrong)
+        assert culture.delivered == 0
+    assert main(["live", "cartpole", "--culture", "cl1", "--speed", "2"]) == 1
+    assert main(["live", "cartpole", "--duration-min", "-1"]) == 1
+
+
+def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None:
+    exchange = Exchange(tmp_path / "exchange")
+    assert exchange.newest(-1) is None
+    simulator = made_up_simulator()
+    for number in (0, 1, 2):
+        exchange.publish(number, 10.0 * number, simulator)
+    newest = exchange.newest(0)
+    assert newest is not None
+    assert newest[:2] == (2, 20.0)
+    np.testing.assert_array_equal(newest[2].percentiles, simulator.percentiles)
+    assert exchange.newest(2) is None
+    (exchange.folder / ".000003.simulator.abc.partial.simulator").write_bytes(b"half")
+    assert exchange.newest(2) is None
+    assert not exchange.is_finished
+    exchange.finish()
+    assert exchange.is_finished
