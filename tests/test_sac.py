@@ -221,8 +221,23 @@ def test_a_stack_of_networks_is_each_of_them() -> None:
 
 @pytest.mark.parametrize("name", ["environments", "updates", "batch", "replay", "hidden"])
 def test_settings_refuse_counts_below_one(name: str) -> None:
-    with pytest.raises(InvalidArgument, match=f"^{name}: expected at least 1, got 0"):
+    with pytest.raises(InvalidArgument, match=f"^{name}: expected a whole number from 1 on, got 0"):
         replace(SAC(), **{name: 0})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[(name, value) for name in ("learning_rate", "reward_scale", "first_alpha") for value in (0.0, math.inf)],
+        *[(name, value) for name in ("discount", "follow", "entropy_share") for value in (-0.1, 1.1)],
+        ("entropy_nats", math.nan),
+        ("learning_rate", math.nan),
+        ("discount", math.nan),
+    ],
+)
+def test_settings_refuse_rates_and_shares_that_cannot_be(name: str, value: float) -> None:
+    with pytest.raises(InvalidArgument, match=f"^{name}: expected a .*number.*, got {value}"):
+        replace(SAC(), **{name: value})
 
 
 def test_settings_refuse_a_replay_that_would_split_a_round() -> None:

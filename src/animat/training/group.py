@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -177,7 +176,9 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
                 raise InvalidFile(f"{path}: expected a checkpoint of this training, got one of another; remove it")
             read = [jnp.asarray(file[f"leaf{i}"]) for i in range(len(leaves))]
             done, curve = int(file["done"]), file["curve"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except InvalidFile:
+        raise
+    except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
         raise InvalidFile(
             f"{path}: expected a checkpoint, got a file that cannot be read ({error}); remove it"
         ) from error

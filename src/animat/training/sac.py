@@ -47,7 +47,8 @@ class SAC:
         entropy_nats: the entropy that a continuous action keeps.
 
     Raises:
-        InvalidArgument: for a count below 1, or a replay that is no multiple of the environments.
+        InvalidArgument: for a count below 1, a rate or a share outside what it may be, or a replay that is no multiple
+            of the environments.
     """
 
     environments: int = 32
@@ -68,8 +69,16 @@ class SAC:
         if self.replay > 2**23:
             raise InvalidArgument(f"replay: expected at most 8388608, as float32 numbers no more, got {self.replay}")
         for name in ("environments", "updates", "batch", "replay", "hidden", "averaging"):
-            if getattr(self, name) < 1:
-                raise InvalidArgument(f"{name}: expected at least 1, got {getattr(self, name)}")
+            if not (getattr(self, name) >= 1 and float(getattr(self, name)).is_integer()):
+                raise InvalidArgument(f"{name}: expected a whole number from 1 on, got {getattr(self, name)}")
+        for name in ("learning_rate", "reward_scale", "first_alpha"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")
+        for name in ("discount", "follow", "entropy_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InvalidArgument(f"{name}: expected a number from 0 to 1, got {getattr(self, name)}")
+        if not math.isfinite(self.entropy_nats):
+            raise InvalidArgument(f"entropy_nats: expected a finite number, got {self.entropy_nats}")
         if self.replay % self.environments:
             raise InvalidArgument(
                 f"replay: expected a multiple of environments ({self.environments}), got {self.replay}"
