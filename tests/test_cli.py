@@ -34,7 +34,19 @@ def policies(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def last_json(printed: str) -> dict[str, object]:
-    return json.loads(printed.splitlines()[-1])  # type: ignore[no-any-return]
+    """The last line as JSON, which has no NaN: `jq` and every other language would stumble over one."""
+    return json.loads(printed.splitlines()[-1], parse_constant=pytest.fail)  # type: ignore[no-any-return]
+
+
+def test_what_is_not_known_is_null_in_json(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # So short that no episode ends in the last chunk.
+    short = ["train", "cartpole", "--recordings", str(recordings), "--policies", "1", "--iterations", "32"]
+    assert main([*short, "--out", str(tmp_path), "--json"]) == 0
+    printed = capsys.readouterr().out
+    assert last_json(printed)["last_returns"] == {"p0": None}
+    assert "no episode ended" in printed
 
 
 def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,6 +130,17 @@ BAD = {
     "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
     "unknown parameter": (nothing, [*TRAIN, "{recordings}", "--parameters", "wheels=3"], ["cartpole", "wheels"]),
     "parameter without a number": (nothing, [*TRAIN, "{recordings}", "--parameters", "force_n"], ["--parameters"]),
+    "a seed beyond 32 bits": (
+        nothing,
+        ["evaluate", "{policies}", "--recordings", "{recordings}", "--seed", "99999999999999999999"],
+        ["seed", "4294967295"],
+    ),
+    "a minute that is none": (
+        nothing,
+        ["evaluate", "{policies}", "--recordings", "{recordings}", "--at-min", "nan"],
+        ["at_min"],
+    ),
+    "bins without end": (nothing, [*TRAIN, "{recordings}", "--bins", "100000000"], ["bins", "10000"]),
     "zero episodes": (
         nothing,
         ["evaluate", "{policies}", "--recordings", "{recordings}", "--episodes", "0"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -254,8 +255,9 @@ class Train(Fitting):
                 sources=[str(path) for path in self.recordings],
             )
         last = {name: policy.learning_curve[-1, 2].item() for name, policy in trained.items()}
-        print(f"{len(trained)} policies in {self.out}; mean return at the end of training, over policies: ", end="")
-        print(f"{sum(last.values()) / len(last):.1f}")
+        known = [mean for mean in last.values() if math.isfinite(mean)]
+        ended = f"{sum(known) / len(known):.1f}" if known else "not known, as no episode ended then"
+        print(f"{len(trained)} policies in {self.out}; mean return at the end of training, over policies: {ended}")
         return {"policies": [str(self.out / f"{name}.safetensors") for name in trained], "last_returns": last}
 
 
@@ -339,7 +341,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return 141
     if command.json:
-        print(json.dumps(results))
+        print(json.dumps(_as_json(results)))
     return 0
 
 
@@ -375,6 +377,15 @@ def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
         except ValueError:
             raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
     return numbers
+
+
+def _as_json(value: Any) -> Any:
+    """The same with null for numbers that JSON has no word for (NaN, infinite)."""
+    if isinstance(value, dict):
+        return {key: _as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_json(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _say_findings(findings: Sequence[Finding]) -> None:
