@@ -111,7 +111,11 @@ class Stream:
         pass
 
     def take(self, start: int, stop: int) -> Any:
-        answers = [(pulse.frame + 100, 7) for pulse in self.rig.delivered] + self.extra
+        answers = list(self.extra)
+        for pulse in reversed(self.rig.delivered):
+            if pulse.frame + 100 < start:
+                break
+            answers.append((pulse.frame + 100, 7))
         table = np.array(sorted(s for s in answers if start <= s[0] < stop), dtype=np.int64).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
