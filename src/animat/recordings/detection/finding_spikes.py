@@ -24,7 +24,7 @@ from animat.recordings.raw import RawTraces
 
 BLOCK = 64
 """Channels that are filtered at a time: few enough to stay near the processor."""
-NOISE_PIECES, NOISE_PIECE_S = 20, 0.25
+NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
 DEAD, NOISY = 0.1, 5.0
 """Of the median channel's noise: a channel below is dead, one above is noisy."""
 
@@ -80,7 +80,7 @@ def find_spikes(
         raise InvalidArgument("engine: expected an installed package, got spikeinterface: pip install 'animat[raw]'")
     stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
     workers = workers or len(os.sched_getaffinity(0))
-    noise_uv = _noise_uv(traces, stimulus, settings)
+    noise_uv = _noise_uv(traces, stimulus, settings, workers)
     use_spikeinterface = settings.engine == "spikeinterface" or (settings.engine == "auto" and installed)
     if use_spikeinterface:
         from animat.recordings.detection.with_spikeinterface import detect
@@ -117,15 +117,16 @@ def blocks(channels: int) -> Iterator[slice]:
 
 
 def _noise_uv(
-    traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection
+    traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection, workers: int
 ) -> Float32[np.ndarray, " channels"]:
     """The noise of each channel: the median over pieces from all over the recording."""
     rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
     length, margin = round(NOISE_PIECE_S * rate_hz), round(MARGIN_S * rate_hz)
     n = max(1, min(NOISE_PIECES, traces.samples // max(length, 1)))
     starts = np.linspace(0, max(traces.samples - length, 0), n).astype(np.int64)
-    found = np.zeros((n, channels), np.float32)
-    for i, start in enumerate(starts.tolist()):
+
+    def of_piece(start: int) -> np.ndarray:
+        found = np.zeros(channels, np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
             rows = np.ascontiguousarray(piece.voltage_uv[:, columns].T)
@@ -136,7 +137,11 @@ def _noise_uv(
                 cleaned = piece.cleaned(columns, rough, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
                 first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
-            found[i, columns] = first
+            found[columns] = first
+        return found
+
+    with ThreadPoolExecutor(workers) as pool:
+        found = list(pool.map(of_piece, starts.tolist()))
     return np.asarray(np.median(found, axis=0), dtype=np.float32)
 
 

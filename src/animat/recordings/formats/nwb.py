@@ -4,7 +4,8 @@
     /general/extracellular_ephys   /electrodes: label, electrode_id, rel_x, rel_y (um); one row a channel
                                    (both are absent where a recording has no channel)
     /stimulus/presentation/stimuli TimeIntervals, one row a pulse: start_time, frequency_hz, pattern, presentation,
-                                   electrode_ids (ragged: ids on the array, which need not be recorded electrodes)
+                                   electrode_ids (ragged: ids on the array, which need not be recorded electrodes;
+                                   absent where none is known)
     /processing/ecephys            /animat_recording: one row, the scalars of `Recording` and its presentation;
                                    /animat_provenance: one row a key (absent where there is none)
 
@@ -167,14 +168,18 @@ def _provenance(file: Hdf5File) -> dict[str, str]:
 
 
 def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
-    flat = file.read(f"{STIMULI_TABLE}/electrode_ids")
-    lengths = _counts(file, f"{STIMULI_TABLE}/electrode_ids_index", len(flat))
+    time_s = file.read(f"{STIMULI_TABLE}/start_time")
+    if file.has(f"{STIMULI_TABLE}/electrode_ids"):
+        flat = file.read(f"{STIMULI_TABLE}/electrode_ids")
+        lengths = _counts(file, f"{STIMULI_TABLE}/electrode_ids_index", len(flat))
+    else:
+        flat, lengths = np.empty(0, np.int64), np.zeros(len(time_s), np.int64)
     if not 0 <= columns <= LARGEST_VALUES // max(len(lengths), 1):
         raise UnusableData(f"stimulus_electrode_columns: expected the width of a table, got {columns}")
     electrodes = np.full((len(lengths), columns), UNKNOWN, dtype=np.int64)
     electrodes[np.arange(columns)[None, :] < lengths[:, None]] = flat
     return Stimuli(
-        time_s=file.read(f"{STIMULI_TABLE}/start_time"),
+        time_s=time_s,
         frequency_hz=file.read(f"{STIMULI_TABLE}/frequency_hz"),
         pattern=file.read(f"{STIMULI_TABLE}/pattern"),
         electrodes=electrodes,

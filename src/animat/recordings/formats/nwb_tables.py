@@ -134,9 +134,11 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
         VectorData(
             name="presentation", description="presentation that the pulse belongs to", data=stimuli.presentation
         ),
-        electrodes,
-        VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths).astype(np.int64), target=electrodes),
     ]
+    if len(electrodes.data):
+        # A column without any value is valid, but other programs stumble over it.
+        index = VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths).astype(np.int64), target=electrodes)
+        columns += [electrodes, index]
     return TimeIntervals(
         name="stimuli",
         description="Stimulation pulses, one row a pulse.",

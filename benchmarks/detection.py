@@ -1,0 +1,153 @@
+"""How fast spikes are found in raw traces against real time, beside SpikeInterface's own detection in the same run.
+
+    python benchmarks/detection.py [--channels 1024] [--seconds 20] [--json results.json]
+
+The traces are made up: noise of 5 uV with spikes of 60 uV at known times, 16-bit whole numbers at 20 kHz, in an HDF5
+file as a rig writes it, so that reading counts. Each row is a process of its own on all cores; its memory is the
+largest resident memory of the process. Reading and finding count, importing does not. Beside the time on the wall
+is the processor time, which other programs on the machine change less: with c cores, c / (processor seconds a second
+of traces) is the most that can be reached. SpikeInterface is optional (`animat[raw]`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+RATE_HZ = 20_000.0
+STEP_UV = 0.5
+SPIKES_PER_S = 5.0
+ENGINES = ("scipy", "spikeinterface", "spikeinterface alone")
+
+
+def write_traces(path: Path, channels: int, seconds: float) -> None:
+    """Traces (samples, channels) and the true spikes of each channel, second by second to save memory."""
+    rng = np.random.default_rng(1)
+    shape = -60 / STEP_UV * np.exp(-((np.arange(-20, 41) / 3.0) ** 2) / 2)
+    samples = round(seconds * RATE_HZ)
+    with h5py.File(path, "w") as file:
+        raw = file.create_dataset("raw", (samples, channels), "i2", chunks=(500, channels))
+        truth_sample, truth_channel = [], []
+        for start in range(0, samples, round(RATE_HZ)):
+            stop = min(start + round(RATE_HZ), samples)
+            piece = rng.normal(0, 5 / STEP_UV, (stop - start, channels)).astype(np.float32)
+            for channel in range(channels):
+                # No two within 3 ms, none at the ends of the second.
+                at = 100 + np.cumsum(60 + rng.exponential(RATE_HZ / SPIKES_PER_S - 60, 20).astype(int))
+                at = at[at < stop - start - 100]
+                for sample in at:
+                    piece[sample - 20 : sample + 41, channel] += shape
+                truth_sample.append(start + at)
+                truth_channel.append(np.full(len(at), channel))
+            raw[start:stop] = np.rint(piece)
+        file["truth/sample"] = np.concatenate(truth_sample)
+        file["truth/channel"] = np.concatenate(truth_channel)
+
+
+def measure(engine: str, path: Path) -> dict[str, float]:
+    """One row, in this process."""
+    from animat.recordings.detection.finding_spikes import find_spikes
+    from animat.recordings.detection.settings import Detection
+    from animat.recordings.raw import Hdf5Traces
+    from animat.recordings.recording import Channels
+
+    with h5py.File(path, "r") as file:
+        samples, n = file["raw"].shape
+        truth = set(zip(file["truth/sample"][:].tolist(), file["truth/channel"][:].tolist(), strict=True))
+    table = Channels(np.arange(n).astype(str), np.arange(n), np.arange(n) % 220 * 17.5, np.arange(n) // 220 * 17.5)
+    traces = Hdf5Traces(path, "raw", np.arange(n), False, table, samples, RATE_HZ, STEP_UV)
+    if engine != "scipy":
+        import spikeinterface.sortingcomponents.peak_detection  # noqa: F401
+    began, began_processor = time.perf_counter(), time.process_time()
+    if engine == "spikeinterface alone":
+        sample, channel = alone(path, n)
+    else:
+        found = find_spikes(traces, None, Detection(engine=engine))  # type: ignore[arg-type]
+        sample, channel = np.rint(found.time_s * RATE_HZ).astype(int), found.channel
+    took_s, processor_s = time.perf_counter() - began, time.process_time() - began_processor
+    spikes = {(s + d, c) for s, c in zip(sample.tolist(), channel.tolist(), strict=True) for d in (-1, 0, 1)}
+    return {
+        "times_real_time": samples / RATE_HZ / took_s,
+        "processor_s_per_s": processor_s / (samples / RATE_HZ),
+        "memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "found": len(truth & spikes),
+        "true": len(truth),
+        "detected": len(sample),
+    }
+
+
+def alone(path: Path, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """SpikeInterface's own noise, filter and detection as they come, on the same samples in memory."""
+    import spikeinterface.core as core
+    import spikeinterface.preprocessing as preprocessing
+    from spikeinterface.sortingcomponents.peak_detection import detect_peaks
+
+    with h5py.File(path, "r") as file:
+        recording = core.NumpyRecording([file["raw"][:]], RATE_HZ)
+    recording.set_dummy_probe_from_locations(np.column_stack([np.arange(channels) * 1e3, np.zeros(channels)]))
+    recording.set_channel_gains(STEP_UV)
+    recording.set_channel_offsets(0.0)
+    filtered = preprocessing.bandpass_filter(recording, freq_min=100, freq_max=3000, dtype="float32")
+    peaks = detect_peaks(
+        filtered,
+        method="by_channel",
+        method_kwargs={"peak_sign": "neg", "detect_threshold": 5, "exclude_sweep_ms": 1.0},
+        job_kwargs={
+            "n_jobs": len(os.sched_getaffinity(0)),
+            "pool_engine": "thread",
+            "chunk_duration": "0.5s",
+            "progress_bar": False,
+        },
+    )
+    return peaks["sample_index"], peaks["channel_index"]
+
+
+def main() -> None:
+    """Measure and print."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
+    arguments.add_argument("--channels", type=int, default=1024)
+    arguments.add_argument("--seconds", type=float, default=20.0, help="of traces")
+    arguments.add_argument("--json", type=Path, help="file for the figures")
+    arguments.add_argument("--measure", help=argparse.SUPPRESS)
+    arguments.add_argument("--path", type=Path, help=argparse.SUPPRESS)
+    options = arguments.parse_args()
+    if options.measure:
+        print(json.dumps(measure(options.measure, options.path)))
+        return
+    rows = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "traces.h5"
+        write_traces(path, options.channels, options.seconds)
+        print(f"{options.channels} channels x {options.seconds:g} s at 20 kHz on {len(os.sched_getaffinity(0))} cores")
+        for engine in ENGINES:
+            if engine != "scipy" and importlib.util.find_spec("spikeinterface") is None:
+                print(f"{engine}: not installed")
+                continue
+            command = [sys.executable, __file__, "--measure", engine, "--path", str(path)]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            row = rows[engine] = json.loads(done.stdout.splitlines()[-1])
+            print(
+                f"{engine}: {row['times_real_time']:.2f} times real time ({row['processor_s_per_s']:.2f} s of "
+                f"processor time a second), {row['memory_gib']:.2f} GiB; "
+                f"{row['found']:,} of {row['true']:,} true spikes found, {row['detected']:,} detected"
+            )
+    if "spikeinterface alone" in rows:
+        ratio = rows["scipy"]["times_real_time"] / rows["spikeinterface alone"]["times_real_time"]
+        print(f"scipy against SpikeInterface alone: {ratio:.2f} times as fast")
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

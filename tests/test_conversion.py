@@ -1,0 +1,139 @@
+"""Any recording to NWB. Oracles: nwbinspector, pynwb, the recording that went in, raw traces with known spikes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.conversion import Origin, convert_recording
+from animat.recordings.reading import read_recording
+from rig_files import event_table, mapping_table, spike_table, write_cl1, write_maxwell
+from test_detection import noisy
+from test_rig_readers import other_nwb
+
+WHO = Origin(
+    subject_id="culture-1",
+    species="Rattus norvegicus",
+    age="P42D",
+    experimenter="Doe, Jane",
+    institution="An Institute",
+    keywords="culture, stimulation",
+    recorded_at="2024-05-31T14:00:00+09:00",
+    experiment_description="Responses to stimuli.",
+)
+
+
+def rig_file(kind: str, folder: Path) -> Path:
+    path = folder / kind
+    if kind == "maxwell":
+        table = mapping_table([3, 9], [1000, 2000])
+        events = event_table([0.2, 0.4], ["frequency 5", "frequency 20"])
+        return write_maxwell(
+            path, mapping=table, spikes=spike_table([0.3, 0.5], [9, 3]), events=events, recorded=[3, 9]
+        )
+    if kind == "cl1":
+        return write_cl1(path, spikes=[(50_001, 8), (25_002, 63)], stims=[(1000, 9)])
+    if kind == "other nwb":
+        return other_nwb(path.with_suffix(".nwb"))
+    times = {
+        "spike_time_s": np.array([0.1, 0.2]),
+        "spike_channel": np.array([4, 5]),
+        "stimulus_time_s": np.array([0.05]),
+    }
+    np.savez(path.with_suffix(".npz"), **times)
+    return path.with_suffix(".npz")
+
+
+@pytest.mark.parametrize("kind", ["maxwell", "cl1", "other nwb", "npz"])
+def test_what_is_converted_is_what_was_read(kind: str, tmp_path: Path) -> None:
+    path = rig_file(kind, tmp_path)
+    source = read_recording(path)
+    convert_recording(path, tmp_path / "out.nwb", WHO, start_min=30.0)
+    written = read_recording(tmp_path / "out.nwb")
+    assert written.start_min == 30.0
+    assert written.provenance["experimenter"] == "Doe, Jane"
+    assert written.provenance["format"] == source.provenance["format"]
+    for name in ("spike_times_s", "spike_channels"):
+        np.testing.assert_array_equal(getattr(written, name), getattr(source, name))
+    for name in ("time_s", "frequency_hz", "electrodes", "presentation"):
+        np.testing.assert_array_equal(getattr(written.stimuli, name), getattr(source.stimuli, name))
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("kind", ["maxwell", "cl1", "other nwb", "npz"])
+def test_nwbinspector_finds_nothing_critical(kind: str, tmp_path: Path) -> None:
+    pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
+    from nwbinspector import Importance, inspect_nwbfile
+
+    convert_recording(rig_file(kind, tmp_path), tmp_path / "out.nwb", WHO)
+    messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "out.nwb")))
+    grave = (Importance.CRITICAL, Importance.ERROR, Importance.PYNWB_VALIDATION)
+    assert [m.message for m in messages if m.importance in grave] == []
+
+
+def test_the_command_finds_spikes_in_raw_traces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    voltage, truth = noisy(64, 0.5, step_uv=0.195)
+    path = write_cl1(tmp_path / "a.h5", spikes=[], stims=None, samples=voltage)
+    arguments = ["convert", str(path), "--out", str(tmp_path / "out.nwb"), "--raw", "--engine", "scipy"]
+    assert main([*arguments, "--subject-id", "c", "--experimenter", "Doe, Jane", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert said["spikes"] >= 0.5 * sum(map(len, truth))
+    with h5py.File(tmp_path / "out.nwb") as file:
+        assert file["general/experimenter"][0] == b"Doe, Jane"
+        assert file["general/subject/subject_id"][()] == b"c"
+
+
+def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = rig_file("maxwell", tmp_path)
+    assert main(["convert", str(path), "--out", str(tmp_path / "out.nwb"), "--raw"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "expected raw traces at /wells/well000/rec0000/groups, found none: the rig kept spikes only" in said
+    assert not (tmp_path / "out.nwb").exists()
+    assert main(["inspect", str(path), "--part", "well7"]) == 1
+    assert "expected one of well000/rec0000; got well7" in capsys.readouterr().err
+
+
+def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
+    path = rig_file("maxwell", tmp_path)
+    before = path.read_bytes()
+    with pytest.raises(InvalidArgument, match="--out: expected another file"):
+        convert_recording(path, path)
+    assert path.read_bytes() == before
+
+
+def test_spikeinterface_is_asked_for_by_the_formats_name(tmp_path: Path) -> None:
+    path = rig_file("maxwell", tmp_path)
+    installed = True
+    try:
+        import spikeinterface  # noqa: F401
+    except ImportError:
+        installed = False
+    message = "reader: expected one of" if installed else r"pip install 'animat\[raw\]'"
+    with pytest.raises(InvalidArgument, match=message):
+        convert_recording(path, tmp_path / "out.nwb", reader="nosuchformat")
+    with pytest.raises(InvalidFile, match="no such file"):
+        convert_recording(tmp_path / "none", tmp_path / "out.nwb", reader="intan")
+
+
+def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:
+    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
+    voltage, truth = noisy(3, 1.0)
+    path = write_maxwell(
+        tmp_path / "a.h5",
+        mapping=mapping_table([0, 1, 2], [1000, 2000, 3000]),
+        spikes=None,
+        recorded=[0, 1, 2],
+        raw=(voltage.T / 63 + 512).astype("<u2"),
+    )
+    (tmp_path / "a_stimuli.csv").write_text("0.5\n")
+    written = convert_recording(path, tmp_path / "out.nwb", reader="maxwell")
+    assert len(written.channels) == 3
+    assert written.stimuli.time_s.tolist() == [0.5]
+    assert abs(len(written.spike_times_s) - sum(map(len, truth))) <= 3
