@@ -243,19 +243,20 @@ def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> Non
         assert_safe(session, culture, 0)
 
 
-def test_ctrl_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_a_polite_kill(tmp_path: Path, number: signal.Signals) -> None:
     def press(culture: FakeCulture, observed: Observed) -> Observed:
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
         time.sleep(0.3)
         return observed
 
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     with FakeCulture(fault=press, at=8) as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "person"
         assert_safe(session, culture, 7)
         assert culture.deliveries <= 10
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
 
 
 @pytest.mark.parametrize("kind", ["pulses", "electrode", "session"])

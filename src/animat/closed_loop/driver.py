@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.closed_loop.answers import in_words, wrong_with
 from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import Contender
 from animat.closed_loop.log import Record
@@ -19,7 +20,6 @@ from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.observed import Observed
 from animat.errors import BudgetSpent, UnsafeStimulus
 from animat.neurons.windows import read_windows
 from animat.recordings.recording import UNKNOWN, Channels
@@ -99,7 +99,7 @@ class Driver:
         except Stop as stop:
             return stop.ending
         except Exception as error:
-            return Ending("crash", f"an error of the loop itself: {_words(error)}")
+            return Ending("crash", f"an error of the loop itself: {in_words(error)}")
         return Ending("plan", f"all {len(self._turns)} episodes were run")
 
     def _run_episode(self, episode: int, contender: Contender) -> None:
@@ -129,7 +129,7 @@ class Driver:
         try:
             chosen = int(contender.controller.act(observation, self._rng))
         except Exception as error:
-            raise Stop(Ending("controller", f"{contender.name} raised {_words(error)}")) from error
+            raise Stop(Ending("controller", f"{contender.name} raised {in_words(error)}")) from error
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{contender.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -217,7 +217,7 @@ class Driver:
         try:
             moved = self._body.step(self._last_command)
         except Exception as error:
-            raise Stop(Ending("robot", f"the robot raised {_words(error)}")) from error
+            raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
             raise Stop(Ending("robot", f"the robot came to {moved.observation.tolist()} with reward {moved.reward:g}"))
         return {
@@ -273,7 +273,13 @@ class Driver:
         finally:
             self.expected_by = float("inf")
         account.spend(stimuli)
-        wrong = self._wrong_with(observed, len(stimuli), duration_s)
+        wrong = wrong_with(
+            observed,
+            n_stimuli=len(stimuli),
+            duration_s=duration_s,
+            from_s=self._zero_s + self._seen_until_s - 1.5 / self._rate_hz,
+            n_channels=len(self._channels),
+        )
         if wrong is not None:
             words = {"kind": "event", "what": "culture", "sentence": wrong, "got": repr(observed)[:2000]}
             self.records.append(Record(words))
@@ -304,33 +310,6 @@ class Driver:
         # The same numbers that a recording of the session holds: only then are windows the same to the last bit.
         return np.asarray(np.rint(times_s * self._rate_hz) / self._rate_hz)
 
-    def _wrong_with(self, observed: Observed, n_stimuli: int, duration_s: float) -> str | None:
-        """What a backend's answer cannot be, in a sentence; None for an answer that can be."""
-        try:
-            times_s, channel = observed.spikes
-            pulses_s, start_s, seen_s = observed.stimulus_time_s, observed.start_s, observed.duration_s
-            if len(times_s) != len(channel):
-                return f"the culture answered {len(times_s)} spike times for {len(channel)} channels"
-            if pulses_s.shape != (n_stimuli,):
-                return f"the culture answered {pulses_s.shape} stimulus times for {n_stimuli} stimuli"
-            if not (np.isfinite(start_s) and np.isfinite(seen_s) and seen_s >= duration_s - 1e-6):
-                return f"the culture answered a stretch of {seen_s} s from {start_s} s where {duration_s} s were asked"
-            if start_s - self._zero_s < self._seen_until_s - 1.5 / self._rate_hz:
-                return f"the culture's clock went back to {start_s} s"
-            for name, given_s in (("spike", times_s), ("stimulus", pulses_s)):
-                # Not (a <= b): a NaN fails it too.
-                if len(given_s) and not (given_s[0] >= -1e-9 and given_s[-1] <= seen_s + 1e-9):
-                    return f"the culture answered {name} times outside of the {seen_s:g} s that were seen"
-                if not bool((given_s[1:] >= given_s[:-1]).all()):
-                    return f"the culture answered {name} times that are no rising numbers"
-            if len(channel) and not (channel.min() >= 0 and channel.max() < len(self._channels)):
-                return f"the culture answered channel {int(channel.max())} of {len(self._channels)}"
-            if channel.dtype.kind not in "iu":
-                return f"the culture answered channels that are no whole numbers ({channel.dtype})"
-        except Exception as error:
-            return f"the culture answered something that cannot be read: {_words(error)}"
-        return None
-
 
 def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
     if is_stopped:
@@ -340,7 +319,7 @@ def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
     if isinstance(error, UnsafeStimulus) and culture.is_stopped:
         return Ending("culture", f"the culture was stopped: {error}")
     lost = "the connection to the culture is lost: " if isinstance(error, OSError) else "the culture raised "
-    return Ending("culture", lost + _words(error))
+    return Ending("culture", lost + in_words(error))
 
 
 def _span(stretch: Stretch) -> dict[str, float]:
@@ -350,7 +329,3 @@ def _span(stretch: Stretch) -> dict[str, float]:
 def _rows(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     """What was stimulated; when is in the tick."""
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
-
-
-def _words(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no words'}"

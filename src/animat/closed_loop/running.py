@@ -51,7 +51,7 @@ def run_session(
     Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, and once this
     returns, or `recover_session` did its work, `session.nwb` is a recording like any other. Unless the plan was done
     or the budget spent, the culture is then stopped: it delivers nothing until it is closed and opened again.
-    `ending` says what happened; nothing is raised for it, Ctrl-C included.
+    `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included.
 
     Args:
         culture: open; it stays open.
@@ -161,7 +161,7 @@ class _Supervisor:
 
     def _stop_for_a_person(self) -> None:
         self._driver.is_stopped = True
-        self._halt(Ending("person", "stopped by a person (Ctrl-C)"))
+        self._halt(Ending("person", "stopped by a person (Ctrl-C, or a polite kill)"))
 
     def _halt(self, ending: Ending) -> None:
         """Stop the culture, from a thread of its own: a backend that hangs must not hang the end as well."""
@@ -177,15 +177,17 @@ class _Supervisor:
 
 @contextlib.contextmanager
 def _interrupts(stop: Any) -> Iterator[None]:
-    """Let Ctrl-C end the session in place of raising somewhere; only the main thread can."""
+    """Let Ctrl-C and a polite kill end the session in place of raising somewhere; only the main thread can."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda *_: stop())
+    asking = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop()) for number in asking]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(asking, before, strict=True):
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,48 @@
+"""Whether what a backend answers can be: a closed loop believes nothing that it did not look at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from animat.cultures.observed import Observed
+
+
+def wrong_with(observed: Observed, *, n_stimuli: int, duration_s: float, from_s: float, n_channels: int) -> str | None:
+    """What is wrong with an answer, in a sentence; None for one that can be.
+
+    Args:
+        observed: the answer.
+        n_stimuli: that were delivered.
+        duration_s: that was asked for.
+        from_s: the soonest time on the culture's clock that it can begin at.
+        n_channels: of the culture.
+    """
+    try:
+        times_s, channel = observed.spikes
+        pulses_s, start_s, seen_s = observed.stimulus_time_s, observed.start_s, observed.duration_s
+        if len(times_s) != len(channel):
+            return f"the culture answered {len(times_s)} spike times for {len(channel)} channels"
+        if pulses_s.shape != (n_stimuli,):
+            return f"the culture answered {pulses_s.shape} stimulus times for {n_stimuli} stimuli"
+        if not (np.isfinite(start_s) and np.isfinite(seen_s) and seen_s >= duration_s - 1e-6):
+            return f"the culture answered a stretch of {seen_s} s from {start_s} s where {duration_s} s were asked"
+        if start_s < from_s:
+            return f"the culture's clock went back to {start_s} s"
+        for name, given_s in (("spike", times_s), ("stimulus", pulses_s)):
+            # Not (a <= b): a NaN fails it too.
+            if len(given_s) and not (given_s[0] >= -1e-9 and given_s[-1] <= seen_s + 1e-9):
+                return f"the culture answered {name} times outside of the {seen_s:g} s that were seen"
+            if not bool((given_s[1:] >= given_s[:-1]).all()):
+                return f"the culture answered {name} times that are no rising numbers"
+        if channel.dtype.kind not in "iu":
+            return f"the culture answered channels that are no whole numbers ({channel.dtype})"
+        if len(channel) and not (channel.min() >= 0 and channel.max() < n_channels):
+            return f"the culture answered channel {int(channel.max())} of {n_channels}"
+    except Exception as error:
+        return f"the culture answered something that cannot be read: {in_words(error)}"
+    return None
+
+
+def in_words(error: BaseException) -> str:
+    """An error in one line, with its type."""
+    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no words'}"

@@ -1,0 +1,86 @@
+"""What a closed loop takes from recordings: percentiles, the burst threshold, and the simulator that predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.neurons.conditions import Condition
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import Kind, NeuronSimulator
+from animat.neurons.timeline import fit_timeline
+from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
+from animat.training.policy import Policy
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a closed loop takes from a recording, and what its prediction is made with.
+
+    Attributes:
+        simulator: of the recording.
+        burst_threshold: ratio of active channels above which its responses were bursts.
+        start_min: of the recording on the culture's clock.
+        conditions, window_ms, presentation: of the recording.
+        findings: what was noticed.
+    """
+
+    simulator: NeuronSimulator
+    burst_threshold: float
+    start_min: float
+    conditions: tuple[Condition, ...]
+    window_ms: tuple[float, float]
+    presentation: Presentation | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def percentiles(self) -> Float64[np.ndarray, " percentiles"]:
+        """P0, P10, ..., P100 of the non-burst responses, Hz."""
+        return np.asarray(self.simulator.percentiles, np.float64)
+
+    @classmethod
+    def of_series(
+        cls,
+        series: Sequence[Responses],
+        policy: Policy | None = None,
+        *,
+        at_min: float | None = None,
+        kind: Kind = "histogram",
+        bins: int = 20,
+        range_hz: float | None = None,
+    ) -> Self:
+        """From the responses of a culture's recordings.
+
+        Args:
+            series: in any order.
+            policy: its last simulator in training is the one that is taken, its percentiles held if they were then.
+            at_min: the minute whose newest recording is taken instead; None without a policy: the last.
+            kind, bins, range_hz: of the simulator, see `fit_timeline`.
+
+        Raises:
+            InvalidArgument, Mismatch, UnusableData: as `fit_timeline` does.
+        """
+        timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
+        trained = {} if policy is None else policy.provenance.get("training", {})
+        if trained.get("percentiles") == "first":
+            timeline = timeline.with_first_percentiles()
+        if at_min is None:
+            at_min = float(timeline.start_min[-1] if policy is None else timeline.start_min[0])
+            if trained.get("shadowing"):
+                at_min += trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"]
+        row = timeline.row_at(at_min)
+        start_min = float(timeline.start_min[row])
+        return cls(
+            simulator=timeline.at(start_min),
+            burst_threshold=next(r.threshold for r in series if r.start_min == start_min),
+            start_min=start_min,
+            conditions=timeline.conditions,
+            window_ms=timeline.window_ms,
+            presentation=timeline.presentation,
+            findings=tuple(f for f in timeline.findings if f.sentence.startswith(f"at {start_min:g} min: ")),
+        )

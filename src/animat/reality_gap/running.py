@@ -1,0 +1,186 @@
+"""Policies and the controls of the study, first on the simulator, then between each other on the culture."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+
+from animat.animat import Animat
+from animat.closed_loop.contenders import Contender, Greedy, controls
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.closed_loop.session import Session
+from animat.cultures.base import Culture
+from animat.cultures.budget import Account
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.hand_made import hand_made
+from animat.evaluation.rollouts import Actor, Constant, Uniform, networks_of, roll_out
+from animat.evaluation.statistics import compare
+from animat.neurons.simulator import silenced
+from animat.progress import Progress
+from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.table import RealityGap, Row
+from animat.recordings.findings import Finding
+from animat.training.policy import Policy
+
+PREDICTED_EPISODES = 200
+"""Of each policy and control on the simulator."""
+
+
+def run_policies(
+    policies: Mapping[str, Policy],
+    culture: Culture,
+    calibration: Calibration,
+    folder: str | os.PathLike[str],
+    *,
+    episodes: int = 5,
+    with_controls: bool = True,
+    greedy: bool = True,
+    seed: int = 1,
+    pulses: int | None = None,
+    account: Account | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> RealityGap:
+    """Run policies, and the controls of the study between them, in closed loop, and compare with the prediction.
+
+    Episodes of all of them are interleaved in random order on the one culture, so that drift hits all alike. The silent
+    and the shuffled control are the first policy's.
+
+    Args:
+        policies: by name, of one robot, mapping and set of conditions.
+        culture: open.
+        calibration: percentiles, burst threshold and prediction.
+        folder: for the session.
+        episodes: of each policy and control.
+        with_controls: all of them; if not, only the random one.
+        greedy: whether policies take the most probable action, or draw as in training.
+        seed: decides every random draw, but what the culture does.
+        pulses: of a presentation; None: as in the policies' recordings.
+        account: of a stimulation budget.
+        progress: told after each episode.
+        settings: other attributes of `Loop`.
+
+    Raises:
+        InvalidArgument: for no policies.
+        Mismatch: if they differ from each other, or from the calibration's conditions.
+        UnusableData: for policies without neurons.
+    """
+    first = _check(policies, calibration)
+    settings = {"burst_threshold": calibration.burst_threshold, **settings}
+    loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
+    if calibration.presentation is not None and calibration.presentation != first.presentation:
+        sentence = (
+            f"the prediction is from a recording presented {calibration.presentation}, the policies' recordings were "
+            f"{first.presentation or 'unknown'}"
+        )
+        findings += (Finding("other-calibration", "warning", sentence),)
+    account = account or Account()
+
+    environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
+    simulator = calibration.simulator
+    acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
+    contenders = [Contender(name, "as trained", controller) for name, controller in acting.items()]
+    rule = None
+    if with_controls:
+        rule = hand_made(environment, simulator)
+        contenders += controls(
+            loop.robot,
+            [condition.label for condition in loop.conditions],
+            strongest=int(np.ravel(rule.right)[0]),
+            weakest=int(np.ravel(rule.left)[0]),
+            policy=acting[next(iter(policies))],
+        )
+    else:
+        contenders += controls(loop.robot, [c.label for c in loop.conditions], strongest=0, weakest=0)[:1]
+
+    def predict(contender: Contender) -> Float64[np.ndarray, " episodes"]:
+        """The same contender on the simulator."""
+        in_, on = environment, simulator
+        actor: Actor = networks_of([policies.get(contender.name, first)], greedy=greedy)
+        if contender.name == "random":
+            actor = Uniform()
+        elif contender.name.startswith("constant "):
+            actor = Constant(jnp.array([contender.controller.act(np.empty(0), np.random.default_rng())]))
+        elif contender.name == "hand-made" and rule is not None:
+            actor = rule
+        elif contender.name == "silent":
+            on = silenced(simulator)
+        elif contender.name == "shuffled":
+            in_ = replace(environment, delivery="shuffled")
+        returns: Float64[np.ndarray, " episodes"] = roll_out(
+            in_, on, actor, 1, episodes=PREDICTED_EPISODES, seed=seed
+        ).returns[0]
+        return returns
+
+    predicted = {contender.name: predict(contender) for contender in contenders}
+    session = run_session(
+        culture, loop, contenders, folder, episodes=episodes, seed=seed, account=account, progress=progress
+    )
+    rows = _rows(contenders, tuple(policies), predicted, session)
+    return RealityGap(
+        loop.robot.name,
+        loop.mapping.name,
+        loop,
+        calibration.start_min,
+        rows,
+        session,
+        account,
+        (*findings, *calibration.findings),
+    )
+
+
+def _check(policies: Mapping[str, Policy], calibration: Calibration) -> Policy:
+    if not policies:
+        raise InvalidArgument("policies: expected at least one, got none")
+    first_name, first = next(iter(policies.items()))
+    for name, policy in policies.items():
+        for attribute in ("robot", "mapping", "conditions", "presentation", "window_ms"):
+            if getattr(policy, attribute) != getattr(first, attribute):
+                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; run it alone")
+    if first.mapping is not None and first.conditions != calibration.conditions:
+        raise Mismatch(
+            f"conditions: expected {', '.join(c.label for c in first.conditions)}, which the policies pick from, got "
+            f"recordings with {', '.join(c.label for c in calibration.conditions)}"
+        )
+    return first
+
+
+def _rows(
+    contenders: Sequence[Contender], names: tuple[str, ...], predicted: Mapping[str, Any], session: Session
+) -> tuple[Row, ...]:
+    def row(name: str, meaning: str, of: Sequence[str]) -> Row:
+        whole = [episode for episode in session.episodes if episode.contender in of and episode.is_whole]
+        ticks = [tick for tick in session.ticks if tick.contender in of]
+        actions = max(1, sum(tick.command is not None for tick in ticks))
+        return Row(
+            name=name,
+            meaning=meaning,
+            predicted=np.concatenate([predicted[each] for each in of]),
+            lived=np.array([episode.total for episode in whole], np.float64),
+            pulses_per_action=sum(len(tick.pulse_time_s) for tick in ticks) / actions,
+            seconds_per_action=sum(session.log.header["loop"]["pulses"] / tick.frequency_hz for tick in ticks)
+            / actions,
+            bursts=sum(tick.is_burst for tick in ticks) / max(1, len(ticks)),
+            late=sum(tick.late_s > 0 for tick in ticks) / max(1, len(ticks)),
+        )
+
+    policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
+    rows = [policies]
+    for contender in contenders:
+        if contender.name in names:
+            if len(names) > 1:
+                rows.append(row(contender.name, contender.meaning, [contender.name]))
+            continue
+        control = row(contender.name, contender.meaning, [contender.name])
+        if len(control.lived) and len(policies.lived):
+            comparison = compare(control.lived, policies.lived)
+            control = replace(control, p=comparison.p_normal, wins=(comparison.effect.value + 1) / 2)
+        rows.append(control)
+    return tuple(rows)

@@ -1,0 +1,148 @@
+"""The table of predicted and lived returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.session import Session
+from animat.cultures.budget import Account
+from animat.evaluation.statistics import Interval
+from animat.recordings.findings import Finding
+
+CONFIDENCE = 0.95
+_RESAMPLES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        name, meaning: who acted.
+        predicted: returns on the simulator, shape (episodes,).
+        lived: returns of whole episodes on the culture, shape (episodes,).
+        pulses_per_action: that the culture was given.
+        seconds_per_action: of the culture's time.
+        bursts: share of responses that were.
+        late: share of presentations that came late.
+        p: that the policies' lived returns are no other than these (two-sided, by rank); None for the policies.
+        wins: share of pairs in which the policies' lived return is larger, ties half; None for the policies.
+    """
+
+    name: str
+    meaning: str
+    predicted: Float64[np.ndarray, " predicted"]
+    lived: Float64[np.ndarray, " lived"]
+    pulses_per_action: float
+    seconds_per_action: float
+    bursts: float
+    late: float
+    p: float | None = None
+    wins: float | None = None
+
+    @property
+    def gap(self) -> Interval:
+        """Mean lived less mean predicted return, with its bootstrap interval: both are drawn anew."""
+        rng = np.random.default_rng(0)
+        means = [_resampled_means(returns, rng) for returns in (self.predicted, self.lived)]
+        low, high = np.quantile(means[1] - means[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+        return Interval(float(self.lived.mean() - self.predicted.mean()), float(low), float(high), CONFIDENCE)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The line as plain data."""
+        lived = bool(len(self.lived))
+        return {
+            "name": self.name,
+            "meaning": self.meaning,
+            "predicted": float(self.predicted.mean()),
+            "lived": float(self.lived.mean()) if lived else None,
+            "gap": self.gap.to_dict() if lived else None,
+            "episodes": len(self.lived),
+            "lived_returns": self.lived.tolist(),
+            "pulses_per_action": self.pulses_per_action,
+            "seconds_per_action": self.seconds_per_action,
+            "bursts": self.bursts,
+            "late": self.late,
+            "p": self.p,
+            "wins": self.wins,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RealityGap:
+    """Policies and controls, predicted and lived.
+
+    Attributes:
+        robot, mapping: names.
+        loop: the settings of the closed loop.
+        calibrated_at_min: of the recording that predicted.
+        rows: all policies together first, then each of them where there are several, then the controls.
+        session: as it was lived.
+        account: of the stimulation.
+        findings: where loop, recording and policy differ, and what was noticed.
+    """
+
+    robot: str
+    mapping: str
+    loop: Loop
+    calibrated_at_min: float
+    rows: tuple[Row, ...]
+    session: Session
+    account: Account
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "robot": self.robot,
+            "mapping": self.mapping,
+            "presentation": str(self.loop.presentation),
+            "calibrated_at_min": self.calibrated_at_min,
+            "rows": [row.to_dict() for row in self.rows],
+            "session": self.session.to_dict(),
+            "folder": str(self.session.folder),
+            "budget": self.account.to_dict(),
+            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
+        }
+
+    def to_text(self) -> str:
+        """A table for a terminal."""
+        lines = [
+            f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
+            f"{self.calibrated_at_min:g} min",
+            f"  {'':16} {'predicted':>9} {'lived':>8} {'gap':>7}  {'95 % interval':>16} {'episodes':>8} "
+            f"{'pulses/action':>13} {'p':>8}",
+        ]
+        for row in self.rows:
+            told = row.to_dict()
+            lived = "         -        -                  "
+            if told["gap"] is not None:
+                gap = told["gap"]
+                between = f"{gap['low']:+.1f} to {gap['high']:+.1f}"
+                lived = f"{told['lived']:8.1f} {gap['value']:+7.1f}  {between:>16}"
+            p = "" if row.p is None else f"{row.p:.2g}"
+            lines.append(
+                f"  {row.name:16} {told['predicted']:9.1f} {lived} {len(row.lived):8} {row.pulses_per_action:13.1f} "
+                f"{p:>8}  {row.meaning}"
+            )
+        outline = self.session.to_dict()
+        lines.append(f"  p: that the policies live no other returns than this control; stimulation: {self.account}")
+        lines.append(
+            f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
+            f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"
+        )
+        return "\n".join(lines)
+
+
+def _resampled_means(
+    returns: Float64[np.ndarray, " episodes"], rng: np.random.Generator
+) -> Float64[np.ndarray, " resamples"]:
+    n = len(returns)
+    often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
+    means: Float64[np.ndarray, " resamples"] = often @ returns / n
+    return means
