@@ -126,6 +126,18 @@ def test_greedy_takes_the_most_probable_action() -> None:
     assert actions.tolist() == [policy.act_greedily(o) for o in observations]
 
 
+def test_on_a_changed_robot_a_policy_sees_what_it_would_when_deployed() -> None:
+    timeline = timeline_of()
+    policy = policy_of(timeline)
+    single = jax.tree.map(lambda leaf: leaf[0], networks_of([policy], greedy=True))
+    # A longer track has another scale of positions; the policy was trained with that of its own.
+    longer = Animat(Cartpole(track_length_m=4.0, angle_limit_rad=0.5), policy.mapping, 3)
+    assert not np.array_equal(longer.scales, policy.scales)
+    observations = np.random.default_rng(0).normal(0, 0.3, (64, 4)).astype(np.float32)
+    actions = single.act(longer, jnp.asarray(observations / longer.scales), jnp.zeros(64))
+    assert actions.tolist() == [policy.act_greedily(o) for o in observations]
+
+
 def test_the_table_has_every_control_beside_the_policies() -> None:
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, seed=1), "b": policy_of(timeline, seed=2)}

@@ -34,12 +34,19 @@ class Actor(abc.ABC):
 
 
 @final
-@partial(jax.tree_util.register_dataclass, data_fields=["network"], meta_fields=["greedy"])
+@partial(jax.tree_util.register_dataclass, data_fields=["network", "scales"], meta_fields=["greedy"])
 @dataclass(frozen=True)
 class Networks(Actor):
-    """Trained policies: their networks, stacked; drawn from, or the most probable action taken."""
+    """Trained policies: their networks, stacked; drawn from, or the most probable action taken.
+
+    Attributes:
+        network: their layers.
+        scales: what each was trained to see observations divided by, whatever robot it now drives.
+        greedy: whether the most probable action is taken.
+    """
 
     network: Network
+    scales: Float[Array, "*actors observations"]
     greedy: bool = False
 
     def act(
@@ -48,6 +55,8 @@ class Networks(Actor):
         observation: Float[Array, "episodes observations"],
         uniforms: Float[Array, " episodes"],
     ) -> Array:
+        # Exactly 1 on the robot it was trained on.
+        observation = observation * (environment.scales / self.scales)
         if not self.greedy:
             return draw_action(environment, self.network, observation, uniforms)
         outputs = forward(self.network, observation)
@@ -107,7 +116,7 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
     """Stack the networks of policies that share one shape.
 
     Raises:
-        InvalidArgument: if there are none, or their shapes or scales differ.
+        InvalidArgument: if there are none, or their shapes differ.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
@@ -119,7 +128,7 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
         Layer(jnp.stack([p.weights[i] for p in policies]), jnp.stack([p.biases[i][None] for p in policies]))
         for i in range(len(first.weights))
     )
-    return Networks(tuple(layers), greedy)
+    return Networks(tuple(layers), jnp.stack([jnp.asarray(p.scales, jnp.float32) for p in policies]), greedy)
 
 
 def roll_out(
