@@ -10,8 +10,10 @@ import pytest
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
 from animat.cultures.replay import ReplayCulture
+from animat.errors import DeviceFailed
 from animat.recordings.made_up import make_up_recording
 from cultures import small_culture
+from fake_culture import FakeCulture
 
 
 class TestVirtualCulture(CultureContract):
@@ -44,6 +46,24 @@ def test_the_contract_finds_a_backend_that_breaks_it() -> None:
 
     with pytest.raises(AssertionError):
         OfLeaky().test_its_clock_runs_forward_by_at_least_what_was_asked()
+
+
+def test_a_device_that_fails_while_it_is_opened_is_let_go_of() -> None:
+    class Broken(FakeCulture):
+        closed = 0
+
+        @property
+        def stimulation_electrodes(self) -> tuple[int, ...]:
+            raise DeviceFailed("the wiring cannot be asked for")
+
+        def _close(self) -> None:
+            self.closed += 1
+
+    culture = Broken()
+    with pytest.raises(DeviceFailed, match="wiring"):
+        culture.open()
+    assert not culture.is_open
+    assert culture.closed == 1
 
 
 def test_the_contract_needs_no_pytest_and_no_compiled_tissue() -> None:

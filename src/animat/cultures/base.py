@@ -123,10 +123,10 @@ class Culture(abc.ABC):
             self._asked_limits.check_within(self.device_limits)
         try:
             self._open()
+            self._guard = Guard(self.limits, self.stimulation_electrodes)
         except BaseException:
             self._close()
             raise
-        self._guard = Guard(self.limits, self.stimulation_electrodes)
         return self
 
     @final
