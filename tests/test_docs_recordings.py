@@ -13,7 +13,7 @@ from animat.recordings.reading import read_recording
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[1] / "docs" / "recordings.md").read_text()
     examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(examples) == 5
+    assert len(examples) == 7
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for example in examples:

@@ -20,7 +20,7 @@ from animat.recordings.recording import Recording
 HDF5 = b"\x89HDF\r\n\x1a\n"
 ZIP = b"PK"
 NPY = b"\x93NUMPY"
-IN_FOLDERS = ("*.nwb", "*.npz", "*_spikes.csv", "*_spikes.csv.gz")
+IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz")
 """Names that are taken from a folder for recordings."""
 
 
@@ -84,7 +84,7 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
     """Read recordings from files and folders, in the order of the culture's clock.
 
     Args:
-        paths: files, or folders that hold `*.nwb`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`; or one of them.
+        paths: files, or folders that hold `*.nwb`, `*.h5`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`; one or more.
 
     Returns:
         The recordings, sorted by `start_min`.
