@@ -15,6 +15,7 @@ import pytest
 
 from animat.cli import main
 from animat.recordings.made_up import write_made_up_series
+from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
 QUICK = ["--policies", "2", "--iterations", "2000"]
 
@@ -69,6 +70,27 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     told = last_json(capsys.readouterr().out)
     assert told["recorded_at_min"] == 0.0
     assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
+
+
+def test_one_of_several_recordings_in_a_file_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = (("well000", "rec0000"), ("well001", "rec0000"))
+    table = mapping_table([3, 9], [100, 200])
+    events = event_table([0.1, 0.6, 1.1], ["", "", ""])
+    spikes = spike_table([0.105, 0.5, 0.606, 1.104], [9, 3, 9, 9])
+    file = write_maxwell(tmp_path / "a.h5", mapping=table, spikes=spikes, events=events, parts=parts, recorded=[3, 9])
+    assert main(["inspect", str(file), "--part", "well001/rec0000", "--out", str(tmp_path / "f"), "--json"]) == 0
+    assert Path(last_json(capsys.readouterr().out)["figures"][0]).is_file()  # type: ignore[index]
+
+
+@pytest.mark.parametrize("names", [("a.npz", "a.nwb"), ("series.npz",)])
+def test_figures_that_would_overwrite_each_other_are_refused(
+    names: tuple[str, ...], recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in names:
+        shutil.copy(next(recordings.glob("*.nwb")), tmp_path / name)
+    assert main(["inspect", *(str(tmp_path / name) for name in names), "--out", str(tmp_path / "figures")]) == 1
+    assert "would all be called" in capsys.readouterr().err
+    assert not (tmp_path / "figures").exists()
 
 
 def nothing(folder: Path, recordings: Path, policies: Path) -> None:

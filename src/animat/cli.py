@@ -154,13 +154,19 @@ class Inspect(Responding):
         from animat.neurons.conditions import conditions_named
         from animat.neurons.inspection import inspect_recording
         from animat.recordings.reading import list_recordings, read_recording
-        from animat.report.inspection import draw_inspection, inspection_text
+        from animat.report.inspection import draw_inspection, figure_stem, inspection_text
         from animat.report.series import draw_series
 
         by = None if self.conditions is None else conditions_named(self.conditions)
         files = list_recordings(self.recordings)
-        if self.out is not None and len({file.name for file in files}) < len(files):
-            raise InvalidArgument("--out: expected recordings of different names, got two alike; inspect them apart")
+        # The figures of the series have a name of their own.
+        stems = ["series", *(figure_stem(file.name) for file in files)]
+        if self.out is not None and len(set(stems)) < len(stems):
+            alike = next(stem for stem in stems if stems.count(stem) > 1)
+            raise InvalidArgument(
+                f"--out: expected recordings of different names, got figures that would all be called {alike}-...; "
+                "inspect them apart, or rename one"
+            )
         inspected, series = [], []
         for file in files:
             recording = read_recording(file, stimuli=self.stimuli, part=self.part)
@@ -174,7 +180,7 @@ class Inspect(Responding):
                 series.append((recording.start_min, file, inspection.responses))
         if self.out is None or not series:
             return {"recordings": inspected}
-        first = read_recording(min(series, key=lambda one: one[0])[1])
+        first = read_recording(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
         try:
             figures = [str(figure) for figure in draw_series(first, [one[2] for one in series], self.out, self.format)]
         except Mismatch as unlike:

@@ -74,7 +74,7 @@ def draw_inspection(
         InvalidFile: if a file cannot be written.
     """
     responses = inspection.responses
-    stem = Path(inspection.name).name.removesuffix(".gz").rsplit(".", 1)[0]
+    stem = figure_stem(inspection.name)
     figures = {"raster": draw_raster(recording, responses)}
     if inspection.n_presentations:
         figures["psth"] = draw_psth(
@@ -84,6 +84,11 @@ def draw_inspection(
         figures["burst-separation"] = draw_burst_separation(responses)
         figures["responses"] = draw_response_histograms(responses)
     return [save_figure(figure, Path(folder) / f"{stem}-{what}.{file_format}") for what, figure in figures.items()]
+
+
+def figure_stem(name: str) -> str:
+    """What the figures' names of a recording begin with: its file's name without ending."""
+    return Path(name).name.removesuffix(".gz").rsplit(".", 1)[0]
 
 
 def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHistogram:
