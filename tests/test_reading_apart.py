@@ -1,0 +1,66 @@
+"""HDF5 files are read in a process of their own. Oracles: the same reading here, and processes that were killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings import apart
+from animat.recordings.formats.hdf5_formats import read_hdf5
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.reading import read_recording
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("apart") / "a.nwb"
+    make_up_recording(5, patterns=4, channels=16, start_min=20.0).save(file)
+    return file
+
+
+def test_it_is_the_recording_that_this_process_reads(path: Path) -> None:
+    assert apart.read_hdf5_apart(path).equals(read_hdf5(path))
+    assert not apart.read_hdf5_apart(path).spike_times_s.flags.writeable
+
+
+def test_errors_come_through_as_they_are(path: Path) -> None:
+    with pytest.raises(InvalidArgument, match="part: expected only for MaxWell files"):
+        apart.read_hdf5_apart(path, part="well000")
+    path.with_name("b.nwb").write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(InvalidFile, match=r"b\.nwb: expected a whole HDF5 recording, but it is cut off"):
+        apart.read_hdf5_apart(path.with_name("b.nwb"))
+
+
+def test_a_process_that_died_is_started_anew(path: Path) -> None:
+    before = read_recording(path)
+    process = apart._reader._process
+    assert process is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert read_recording(path).equals(before)
+
+
+def test_a_file_that_the_library_crashes_on_is_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read_recording(path)
+    process = apart._reader._process
+    assert process is not None
+    os.kill(process.pid, signal.SIGSTOP)
+    monkeypatch.setattr(apart, "WAIT_S", 0.2)
+    with pytest.raises(InvalidFile, match=r"a\.nwb: .*the HDF5 library crashed on it, or took more time or memory"):
+        read_recording(path)
+    assert process.poll() is not None
+    monkeypatch.undo()
+    assert len(read_recording(path).channels) == 16
+
+
+def test_memory_and_processor_time_are_limited(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read_recording(path)
+    process = apart._reader._process
+    assert process is not None
+    limits = {line[:25].strip(): line.split() for line in Path(f"/proc/{process.pid}/limits").read_text().splitlines()}
+    assert int(limits["Max address space"][3]) < 4 * 2**30
+    assert int(limits["Max cpu time"][3]) < 60
