@@ -112,8 +112,8 @@ def grid_of_panels(
     panels = figure.subplots(rows, columns, squeeze=False, sharex=share_x, sharey=share_y).reshape(-1)
     for axes in panels[n:]:
         axes.set_visible(False)
-    for axes in panels[max(0, n - columns) : n]:
-        # The lowest panel of a column that is not full shows its ticks too.
+    for axes in panels[:n]:
+        # A shared axis has its numbers at every panel all the same.
         axes.tick_params(labelbottom=True)
     return figure, list(panels[:n])
 

@@ -70,8 +70,6 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
         comparisons=COMPARISONS,
         policies=4,
         seed=seed,
-        episodes=50,
-        episodes_over_time=10,
         limit_resolution=0.5,
         limit_episodes=1000,
         paper=True,

@@ -82,7 +82,7 @@ def _short(study: Study, folder: Path) -> Section:
         "rank-biserial correlation, +1 where every policy of the second condition is better, with its 95 % bootstrap "
         "interval."
     )
-    paper = ("paper's U", "paper's p", "as in the paper") if study.paper else ()
+    paper = ("the paper", "same") if study.paper else ()
     tests = Table(
         "Comparisons",
         ("comparison", "robot", "at (min)", "n", "U", "p", "p exact", "p corrected", "effect", "outcome", *paper),
@@ -98,7 +98,7 @@ def _short(study: Study, folder: Path) -> Section:
                 row["p_holm"],
                 f"{cell(row['effect'])} [{cell(row['effect_low_95'])}, {cell(row['effect_high_95'])}]",
                 row["outcome"],
-                *((row["paper_u"], row["paper_p"], row["as_in_paper"]) if study.paper else ()),
+                *((_printed(row), row["as_in_paper"]) if study.paper else ()),
             )
             for row in rows
         ),
@@ -139,6 +139,10 @@ def _short(study: Study, folder: Path) -> Section:
         beside="tables/comparisons.csv",
     )
     return Section("Results in short", tuple(paragraphs), tables=(tests, returns) if rows else ())
+
+
+def _printed(row: dict[str, Any]) -> str | None:
+    return None if row["paper_p"] is None else f"U {cell(row['paper_u'])}, p {cell(row['paper_p'])}"
 
 
 _SCORE_NOTE = (

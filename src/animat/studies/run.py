@@ -85,12 +85,19 @@ def _kept(jobs: list[Job], folder: Path, study: str) -> dict[str, Receipt]:
     """Receipts of the jobs that are done, on inputs as they are now, and whose files are whole."""
     receipts: dict[str, Receipt] = {}
     for job in jobs:
-        receipt = Receipt.load(folder, job.name)
-        if receipt is None or receipt.study != study or not all(need in receipts for need in job.needs):
-            continue
-        if receipt.inputs == _inputs(job, receipts) and receipt.is_kept(folder):
-            receipts[job.name] = receipt
+        if all(need in receipts for need in job.needs):
+            receipt = _kept_receipt(job, folder, study, receipts)
+            if receipt is not None:
+                receipts[job.name] = receipt
     return receipts
+
+
+def _kept_receipt(job: Job, folder: Path, study: str, receipts: dict[str, Receipt]) -> Receipt | None:
+    """The receipt of a job whose needs are done, if it is good for what they left."""
+    receipt = Receipt.load(folder, job.name)
+    if receipt is None or receipt.study != study or receipt.inputs != _inputs(job, receipts):
+        return None
+    return receipt if receipt.is_kept(folder) else None
 
 
 def _inputs(job: Job, receipts: dict[str, Receipt]) -> dict[str, str]:
@@ -117,12 +124,18 @@ class _Run:
         """Run everything that waits."""
         while self._waiting or self._running:
             for job in [job for job in self._waiting if all(need in self._receipts for need in job.needs)]:
-                if executor.free:
+                # What it needs may have been made again, with the same bytes as before.
+                kept = _kept_receipt(job, self._folder, self._fingerprint, self._receipts)
+                if kept is not None:
+                    self._waiting.remove(job)
+                    self._receipts[job.name] = kept
+                    self._done_s += job.cost_s
+                elif executor.free:
                     self._waiting.remove(job)
                     self._running[job.name] = (0.0, "")
                     executor.start(job, self._study, self._folder)
             self._tell()
-            for event in executor.wait():
+            for event in executor.wait() if self._running else ():
                 self._take(event)
         self._tell()
 

@@ -1,0 +1,427 @@
+"""Studies: the same files whatever happens, folders that are not mixed up, results that other code agrees with."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import mannwhitneyu
+
+from animat.cli import main
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
+from animat.recordings.made_up import make_up_recording, write_made_up_series
+from animat.recordings.reading import read_recording
+from animat.report.html import cell
+from animat.studies.captions import CULTURE, ROBOT
+from animat.studies.executor import Event, Executor
+from animat.studies.identity import settle_identity
+from animat.studies.jobs import Job, Report, Task, in_order
+from animat.studies.paper import PRINTED, paper_study
+from animat.studies.plan import plan_study
+from animat.studies.run import Ran, run_study
+from animat.studies.simulating import load_timeline
+from animat.studies.specification import Body, Compared, Condition, Culture, Study
+from animat.studies.toml import read_study, study_to_toml
+from animat.training.policy import Policy
+
+TINY = Path(__file__).parent / "tiny_study.toml"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny study, run through the command line with two workers."""
+    folder = tmp_path_factory.mktemp("studies") / "tiny"
+    assert main(["study", str(TINY), "--out", str(folder), "--workers", "2"]) == 0
+    return folder
+
+
+def files(folder: Path) -> dict[str, str]:
+    """Every file of a folder, hidden ones too, with a hash over its bytes."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# --- the folder -----------------------------------------------------------------------------------------------------
+
+
+def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    kills = kill_and_go_on(folder, [6.0, 9.0, 14.0])
+    assert kills >= 1
+    assert files(folder) == files(finished)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_at_any_moment_it_ends_in_the_same_files(finished: Path, tmp_path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    kill_and_go_on(tmp_path / "killed", [rng.uniform(3.0, 12.0) for _ in range(12)])
+    assert files(tmp_path / "killed") == files(finished)
+
+
+def kill_and_go_on(folder: Path, after_s: list[float]) -> int:
+    """Run the tiny study with one worker, killed after each of these times, then to its end; how often it was."""
+    command = [sys.executable, "-m", "animat", "study", str(TINY), "--out", str(folder), "--workers", "1"]
+    kills = 0
+    for seconds in [*after_s, None]:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        try:
+            assert process.wait(seconds) == 0
+            break
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+            # The kernel takes the workers along, which takes it a moment.
+            time.sleep(0.3)
+    return kills
+
+
+def test_a_finished_folder_is_left_alone_and_said_to_be_so(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
+    assert main(["study", str(TINY), "--out", str(finished), "--json"]) == 0
+    said = capsys.readouterr().out
+    assert "nothing to do" in said
+    assert json.loads(said.splitlines()[-1])["done_now_cpu_s"] == {}
+    assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
+
+
+def test_what_is_lost_or_damaged_is_made_again(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "damaged"
+    shutil.copytree(finished, folder)
+    (folder / "policies/navigation/1-threshold/p1.safetensors").write_bytes(b"damaged")
+    (folder / "tables/scores.csv").unlink()
+    ran = run_study(read_study(TINY), folder, base=TINY.parent, workers=1)
+    assert set(ran.done_now) == {"train/navigation/1-threshold/p0", "tables"}
+    assert files(folder) == files(finished)
+
+
+def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) -> None:
+    before = files(finished)
+    with pytest.raises(Mismatch, match=r"another \(study\.policies: 2 there, 3 now\)"):
+        run_study(replace(read_study(TINY), policies=3), finished)
+    assert files(finished) == before
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("mine")
+    with pytest.raises(Mismatch, match="other files in it"):
+        run_study(read_study(TINY), tmp_path / "full")
+    (tmp_path / "a-file").write_text("mine")
+    with pytest.raises(InvalidFile, match="got a file"):
+        run_study(read_study(TINY), tmp_path / "a-file")
+
+
+def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
+    made = tmp_path / "made"
+    write_made_up_series(1, made, sessions=2, patterns=5, channels=16)
+    study = Study(culture=Culture("files", files=("made",)), robots=(Body("navigation", iterations=100),))
+    with pytest.raises(AnimatError, match="halted"):
+        run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
+    make_up_recording(2, start_min=0.0, patterns=5, channels=16).save(sorted(made.glob("*.nwb"))[0])
+    with pytest.raises(Mismatch, match="sources"):
+        run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
+
+
+class Halts(Executor):
+    """An executor whose first job fails."""
+
+    def __init__(self) -> None:
+        self._job = ""
+
+    @property
+    def free(self) -> int:
+        return int(not self._job)
+
+    def start(self, job: Job, study: Study, folder: Path) -> None:
+        self._job = job.name
+
+    def wait(self) -> list[Event]:
+        return [Event(self._job, "failed", words="halted")]
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+# --- the results ----------------------------------------------------------------------------------------------------
+
+
+def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
+    (told,) = rows(finished / "tables/comparisons.csv")
+    means = []
+    for slug in ("before-training", "1-threshold"):
+        returns = defaultdict(list)
+        for row in rows(finished / f"episodes/navigation/{slug}.csv"):
+            if float(row["at_min"]) == 0.0:
+                returns[row["actor"]].append(float(row["return"]))
+        assert {len(of_policy) for of_policy in returns.values()} == {5}
+        means.append([np.mean(of_policy) for of_policy in returns.values()])
+    ours = mannwhitneyu(*means, alternative="two-sided", method="asymptotic")
+    assert float(told["p_normal"]) == pytest.approx(min(1.0, ours.pvalue))
+    assert float(told["u"]) == min(ours.statistic, 4 - ours.statistic)
+    assert float(told["mean_second"]) == pytest.approx(np.mean(means[1]))
+    assert (float(told["paper_p"]), told["as_in_paper"]) == (PRINTED[told["comparison"], "navigation"].p, "no")
+
+
+def test_scores_lie_between_random_and_the_limit_as_they_say(finished: Path) -> None:
+    controls = rows(finished / "tables/controls.csv")
+    for row in rows(finished / "tables/scores.csv"):
+        mean, random_, limit = (float(row[name]) for name in ("mean_return", "random", "limit"))
+        assert float(row["normalised_score"]) == pytest.approx((mean - random_) / (limit - random_))
+        (same,) = [
+            c
+            for c in controls
+            if (c["mapping"], c["control"]) == (row["mapping"], "random") and c["at_min"] == row["at_min"]
+        ]
+        assert random_ == pytest.approx(float(same["mean_return"]))
+    names = {row["control"] for row in controls if row["mapping"] == "1-threshold"}
+    assert {"random", "silent", "shuffled", "made by hand", "constant 80 Hz"} <= names
+
+
+def test_policies_before_training_are_those_that_training_starts_from(finished: Path) -> None:
+    trained, before = (
+        Policy.load(finished / f"policies/navigation/{slug}/p0.safetensors")
+        for slug in ("1-threshold", "before-training")
+    )
+    assert before.learning_curve.shape == (0, 3)
+    assert trained.learning_curve[-1, 0] >= 3000
+    assert not np.array_equal(before.weights[0], trained.weights[0])
+    # All but undecided.
+    assert before.probabilities(np.zeros(3, np.float32)) == pytest.approx(np.full(5, 0.2), abs=0.01)
+
+
+def test_simulators_are_kept_whole(finished: Path) -> None:
+    timeline = load_timeline(finished / "simulators/timeline.safetensors")
+    assert timeline.start_min.tolist() == [0.0, 140.0]
+    assert [c.label for c in timeline.conditions] == ["5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz"]
+    assert float(timeline.at(0.0).percentiles[5]) > 0
+    (finished.parent / "cut").write_bytes((finished / "simulators/timeline.safetensors").read_bytes()[:50])
+    with pytest.raises(InvalidFile, match="cut: expected a study's simulators"):
+        load_timeline(finished.parent / "cut")
+
+
+def test_the_same_recording_is_the_same_file(tmp_path: Path) -> None:
+    recording = make_up_recording(1, patterns=5, channels=16)
+    for name in ("a.nwb", "b.nwb"):
+        recording.save(tmp_path / name)
+    assert (tmp_path / "a.nwb").read_bytes() != (tmp_path / "b.nwb").read_bytes()
+    for name in ("a.nwb", "b.nwb"):
+        settle_identity(tmp_path / name)
+    settled = (tmp_path / "a.nwb").read_bytes()
+    assert settled == (tmp_path / "b.nwb").read_bytes()
+    assert read_recording(tmp_path / "a.nwb").equals(recording)
+    settle_identity(tmp_path / "a.nwb")
+    assert (tmp_path / "a.nwb").read_bytes() == settled
+    other = make_up_recording(2, patterns=5, channels=16)
+    other.save(tmp_path / "c.nwb")
+    settle_identity(tmp_path / "c.nwb")
+    ids = [set(re.findall(rb"[0-9a-f]{8}-[0-9a-f]{4}-5[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}", data))
+           for data in (settled, (tmp_path / "c.nwb").read_bytes())]  # fmt: skip
+    assert ids[0] and not ids[0] & ids[1]
+
+
+# --- the report -----------------------------------------------------------------------------------------------------
+
+
+def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
+    page = (finished / "report.html").read_text()
+    expected = [f"culture-{name}" for name in CULTURE] + [f"navigation-{name}" for name in ROBOT]
+    for stem in expected:
+        for ending in ("png", "svg", "pdf"):
+            assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
+        assert f'href="figures/{stem}.svg"' in page
+    assert page.count("<img ") == page.count("data:image/png;base64,") == len(expected)
+    for title in ("Comparisons", "Every condition", "Controllability of every recording", "Controls at 140 min"):
+        assert f"<caption>{title}</caption>" in page
+    for decision in ("Nine levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range"):
+        assert f"<dt>{decision}</dt>" in page
+    assert "before and after training, navigation" in page
+    assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
+        "scores", "comparisons", "controls", "learning-curves", "limits", "controllability", "findings",
+    }  # fmt: skip
+
+
+def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:
+    page = (finished / "report.html").read_text()
+    without_data = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", page)
+    assert not re.search(r"https?:|//[a-z]|<script|<link|@import|url\(", without_data)
+    for target in re.findall(r'href="([^"]+)"', without_data):
+        assert (f'id="{target[1:]}"' in page) if target.startswith("#") else (finished / target).is_file(), target
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [(None, "–"), (3.0, "3"), (-1.0, "−1"), (0.00018264, "0.000183"), (-79.4567, "−79.5"), ("<b>", "<b>")],
+)
+def test_cells_are_short(value: object, written: str) -> None:
+    assert cell(value) == written
+
+
+# --- the specification ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("study", [paper_study(), paper_study(3, quick=True), read_study(TINY)])
+def test_a_study_written_as_toml_is_read_as_the_same(study: Study, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(study_to_toml(study))
+    assert read_study(tmp_path / "study.toml") == study
+
+
+def test_the_paper_is_kept_to() -> None:
+    study = paper_study()
+    assert (study.policies, study.culture.sessions, study.culture.interval_min) == (10, 15, 10.0)
+    assert [body.trained_for for body in study.robots] == [800_000, 500_000]
+    assert {(c.at_min, c.episodes) for c in study.comparisons} == {(0.0, 30), (140.0, 100)}
+    assert {(c.name, body.name) for c in study.comparisons for body in study.robots} == set(PRINTED)
+    assert {job.name.split("/")[0] for job in plan_study(paper_study(quick=True), Path())} == {
+        job.name.split("/")[0] for job in plan_study(study, Path())
+    }
+
+
+@pytest.mark.parametrize(
+    ("toml", "said"),
+    [
+        ("policies = 0", "policies: expected at least 1, got 0"),
+        ("policies = 2.5", "policies: expected a whole number, got 2.5"),
+        ("polices = 2", "polices: no such setting at the top"),
+        ("policies = ", "expected TOML"),
+        ("seed = true", "seed: expected a whole number, got True"),
+        ("conditions = []", "conditions: expected at least one"),
+        ("robots = 'cartpole'", "robots: expected a list"),
+        ("[[robots]]\nname = 'cart'", "robot: expected one of cartpole, navigation, got 'cart'"),
+        ("[[robots]]\niterations = 3", "robots.name: expected to be given"),
+        ("[[robots]]\nname = 'cartpole'\nparameters = { mass = 1 }", "expected parameters among"),
+        ("[[conditions]]\nname = 'a/b'", "conditions.name: expected letters"),
+        ("[[conditions]]\nname = '10'", "which in a table would be a number"),
+        ("[[conditions]]\nname = 'a'\n[[conditions]]\nname = 'A'", "expected each name once"),
+        ("[[conditions]]\nname = 'a'\nmapping = '2'", "conditions.mapping: expected one of"),
+        ("[[conditions]]\nname = 'a'\ndelivery = 'none'", "conditions.delivery: expected one of chosen, shuffled"),
+        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the conditions"),
+        ("[culture]\nkind = 'alive'", "culture.kind: expected one of virtual, made-up, files"),
+        ("[culture]\nkind = 'files'", "culture.files: expected some"),
+        ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
+        ("[culture]\ninterval_min = inf", "culture.interval_min: expected a positive number"),
+        ("[simulators]\nwindow_ms = [2]", "simulators.window_ms: expected 2 values"),
+        ("[algorithm]\nhiden = 8", "algorithm: expected settings among"),
+        ("[algorithm]\nhidden = 'x'", "algorithm.hidden: expected a number"),
+    ],
+)
+def test_mistakes_in_a_specification_are_told_in_one_line(
+    toml: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(toml)
+    assert main(["study", str(path), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert said in error and "study.toml: " in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_file_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["study", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err.endswith("none.toml: no such file\n")
+    with pytest.raises(InvalidArgument, match="workers"):
+        run_study(read_study(TINY), tmp_path / "out", workers=0)
+
+
+# --- jobs -----------------------------------------------------------------------------------------------------------
+
+
+class Nothing(Task):
+    """Does nothing."""
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        return []
+
+
+def test_jobs_come_after_what_they_need_and_long_chains_first() -> None:
+    jobs = [
+        Job("short", Nothing(), (), 1.0),
+        Job("end", Nothing(), ("long",), 5.0),
+        Job("long", Nothing(), (), 2.0),
+        Job("middle", Nothing(), (), 4.0),
+    ]
+    assert [job.name for job in in_order(jobs)] == ["long", "end", "middle", "short"]
+
+
+def test_every_need_of_a_plan_is_a_job_of_it() -> None:
+    for study in (paper_study(), read_study(TINY), Study(conditions=(Condition("direct", mapping="none"),))):
+        jobs = in_order(plan_study(study, Path()))
+        names = [job.name for job in jobs]
+        assert len(set(names)) == len(names)
+        for place, job in enumerate(jobs):
+            assert set(job.needs) <= set(names[:place]), job.name
+
+
+class HereAndNow(Executor):
+    """Runs jobs in this process: another engine needs no more than this."""
+
+    def __init__(self) -> None:
+        self._told: list[Event] = []
+
+    @property
+    def free(self) -> int:
+        return int(not self._told)
+
+    def start(self, job: Job, study: Study, folder: Path) -> None:
+        ran = job.task.run(study, folder, lambda share, words: None)
+        self._told = [Event(job.name, "done", files=tuple(str(file) for file in ran))]
+
+    def wait(self) -> list[Event]:
+        told, self._told = self._told, []
+        return told
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path: Path) -> None:
+    write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
+    study = replace(
+        read_study(TINY),
+        culture=Culture("files", files=("made",)),
+        conditions=(Condition("held", percentiles="first"),),
+        comparisons=(),
+        policies=1,
+        paper=False,
+    )
+    ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=HereAndNow())
+    assert len(ran.done_now) == ran.jobs
+    page = ran.report.read_text()
+    assert "The study compares no conditions" in page
+    assert "Differences from the paper" not in page
+
+
+def test_a_comparison_knows_what_its_limit_says() -> None:
+    from animat.studies.differences import explain
+
+    row = {
+        "n": 10, "first": "a", "second": "b", "limit_first": 90.0, "limit_second": 80.0, "random_second": -80.0,
+        "score_first": 0.5, "score_second": 0.6,
+    }  # fmt: skip
+    assert "other way round" in explain(row)
+    assert "take more policies" in explain(row | {"n": 4})
+    assert "no room is left" in explain(row | {"limit_second": 90.0, "score_first": 0.97})
+    assert "at its limit" in explain(row | {"limit_second": 90.0, "score_second": 0.99})
+    assert "leaves room" in explain(row | {"limit_second": 100.0})
+    assert "nothing to learn" in explain(row | {"limit_second": -80.0})
+    assert Compared("x", "a", "b").episodes == 100
