@@ -115,7 +115,7 @@ def _artefact_finding(
         "warning" if reaches else "note",
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
         f"{count[first : last + 1].max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
-        f"as spikes{'' if from_ms < 0 or reaches else ', or neurons that the pulse itself fired'} "
+        f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
         f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
         spikes / n_stimuli,
     )
