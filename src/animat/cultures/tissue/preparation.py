@@ -76,6 +76,7 @@ def block_polynomial() -> tuple[np.float32, ...]:
 
 
 def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> kernel.Wiring:
+    """The network as the kernel takes it, with each neuron's key of its noise and its need of availability."""
     rng = np.random.default_rng([seed, 7])
     is_e, step_ms = network.is_excitatory, parameters.step_ms
     membrane_ms = np.where(is_e, parameters.membrane_e_ms, parameters.membrane_i_ms)
