@@ -21,16 +21,18 @@ from animat.closed_loop.contenders import (
     interleaved,
     lean,
 )
+from animat.closed_loop.following import Following
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
+from animat.cultures.observed import Observed, Spikes
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.mapping import Linear, Thresholds
 from animat.neurons.conditions import ByFrequency, Condition
 from animat.neurons.responses import extract_responses
-from animat.recordings.protocol import Presentation
+from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
 from animat.robots import Cartpole, Navigation
@@ -316,3 +318,81 @@ def test_a_budget_is_kept_to_the_pulse() -> None:
     with pytest.raises(InvalidArgument, match="pulses"):
         Budget(pulses=-1)
     assert replace(Budget(), pulses=3) == Budget(3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_percentiles_follow_the_newest_of_each_condition_and_of_nothing_else(data: st.DataObject) -> None:
+    sizes = data.draw(st.lists(st.integers(1, 6), min_size=1, max_size=4))
+    rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
+    history = [rng.gamma(5.0, 2.0, n).tolist() for n in sizes]
+    following = Following([np.array(each) for each in history])
+    for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
+        x = float(rng.gamma(5.0, 1.0))
+        history[condition].append(x)
+        following.add(condition, x)
+    pooled = np.concatenate([each[-n:] for each, n in zip(history, sizes, strict=True)])
+    expected = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
+    np.testing.assert_array_equal(following.percentiles(), expected)
+
+
+def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> None:
+    reference = tuple(np.full(4, 100.0) for _ in HZ)
+    loop = loop_of(following=reference, mapping=Linear(), burst_threshold=0.95)
+    contenders = [
+        RANDOM,
+        Contender("always", "", OneCondition(4), calibrates=False),
+        Contender("no", "", OneCondition(4), "silent"),
+    ]
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, contenders, tmp_path, episodes=6)
+    in_force = {record.words["episode"]: record.words["percentiles_hz"] for record in session.log.records
+                if record.words["kind"] == "percentiles"}  # fmt: skip
+    history = [list(each) for each in reference]
+    percentiles = loop.percentiles
+    for tick in session.ticks:
+        if tick.iteration == 0 and any(len(each) > 4 for each in history):
+            pooled = np.concatenate([each[-4:] for each in history])
+            percentiles = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
+            np.testing.assert_array_equal(np.float32(in_force[tick.episode]), percentiles)
+        assert tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), percentiles))
+        if tick.contender == "random" and not tick.is_burst:
+            history[tick.delivered].append(tick.rate_hz)
+    assert sum(len(each) for each in history) > 20 + 20
+    assert_read_alike(tmp_path, loop)
+    for wrong in (reference[:3], (*reference[:4], np.empty(0))):
+        with pytest.raises(InvalidArgument, match="following"):
+            loop_of(following=wrong)
+
+
+class Tiring(FakeCulture):
+    """Its responses to all conditions fade: halved in ten minutes."""
+
+    def _deliver(self, admitted: Any, duration_s: float) -> Observed:
+        observed = super()._deliver(admitted, duration_s)
+        kept = np.random.default_rng(self.deliveries).random(len(observed.spikes.time_s)) < 2 ** (-self.now_s / 600)
+        return replace(observed, spikes=Spikes(observed.spikes.time_s[kept], observed.spikes.channel[kept]))
+
+
+def test_following_keeps_half_of_the_responses_above_the_median_of_a_culture_that_tires(tmp_path: Path) -> None:
+    above: dict[str, float] = {}
+    protocol = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
+    for how in ("held", "follow"):
+        with Tiring() as culture:
+            responses = extract_responses(culture.record(protocol), burst_threshold=0.95)
+            percentiles = np.percentile(responses.non_burst_rate_hz, range(0, 101, 10))
+            reference = tuple(responses.rates_of(i) for i in range(5)) if how == "follow" else None
+            culture.rest(600.0)
+            loop = loop_of(
+                robot=Navigation(episode_limit=25),
+                mapping=Thresholds(1),
+                percentiles=percentiles,
+                following=reference,
+                burst_threshold=0.95,
+            )
+            session = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=16)
+        # The last quarter of the session.
+        above[how] = float(np.mean([tick.command == 1.0 for tick in session.ticks[-100:]]))
+    # Half of a binomial of 100: standard deviation 0.05. Ties at the median count as above it.
+    assert above["held"] < 0.25
+    assert 0.38 < above["follow"] < 0.72

@@ -35,6 +35,8 @@ class Stimulating:
     """Most pulses in all, recordings included; default: no end, but the culture's limits"""
     budget_per_electrode: int | None = None
     """Most pulses on any one electrode"""
+    thresholds: Literal["follow", "held"] = "follow"
+    """The mapping's percentiles in closed loop: following the culture's newest responses, or held from the recording"""
     on_burst: Literal["use", "repeat", "skip"] = "use"
     """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
     on_late: Literal["continue", "stop"] = "continue"
@@ -109,6 +111,7 @@ class Run(Stimulating):
                 episodes=self.episodes,
                 with_controls=self.controls == "all",
                 greedy=not self.drawn,
+                follow=self.thresholds == "follow",
                 seed=self.seed,
                 pulses=self.pulses,
                 account=account,
@@ -278,6 +281,7 @@ class Live(Stimulating):
                 kind=self.simulator,
                 account=account,
                 progress=progress,
+                follow=self.thresholds == "follow",
                 on_burst=self.on_burst,
                 on_late=self.on_late,
                 pause_s=self.pause_s,

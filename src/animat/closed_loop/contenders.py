@@ -111,12 +111,15 @@ class Contender:
         controller: who chooses.
         delivery: `"chosen"`: the culture gets what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
             `"silent"`: no pulse, and what the culture fires by itself is read where the response would be.
+        calibrates: whether its responses count where percentiles follow the culture; one condition presented over
+            and over is answered otherwise than between others.
     """
 
     name: str
     meaning: str
     controller: Controller
     delivery: Delivery = "chosen"
+    calibrates: bool = True
 
 
 def controls(
@@ -132,7 +135,7 @@ def controls(
     """
     found = [Contender("random", "any condition, equally likely", AnyCondition(len(labels)))]
     for i, label in enumerate(labels):
-        found.append(Contender(f"constant {label}", "this one always", OneCondition(i)))
+        found.append(Contender(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
     if policy is not None:
         found.append(Contender("silent", "no pulse; the culture's own activity is read", policy, "silent"))
         found.append(Contender("shuffled", "the delivered condition is drawn anew", policy, "shuffled"))

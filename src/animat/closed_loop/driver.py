@@ -14,6 +14,7 @@ from jaxtyping import Float64, Int64
 from animat.closed_loop.answers import in_words, wrong_with
 from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import Contender
+from animat.closed_loop.following import Following
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.tick import Ending, Handled, Tick
@@ -81,6 +82,8 @@ class Driver:
         self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         usable = culture.patterns[: loop.patterns]
+        self._following = None if loop.following is None else Following(loop.following)
+        self._percentiles = loop.percentiles
         self._patterns = [tuple(int(e) for e in row if e != UNKNOWN) for row in usable]
         self._deck: list[int] = []
         self._presented = 0
@@ -107,6 +110,11 @@ class Driver:
         observation = self._body.reset()
         self._last_command = 0.0
         self._see((), loop.pause_s, pause=True)
+        if self._following is not None and self._following.seen:
+            # Between episodes only: within one the robot's world stays as it is, and no tick pays for it.
+            self._percentiles = self._following.percentiles()
+            told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
+            self.records.append(Record(told))
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._culture.now_s
         for iteration in range(loop.robot.episode_limit):
@@ -189,6 +197,8 @@ class Driver:
             "decided_s": handed_over_s - self._data_at_s,
         }
         self._presented += 1
+        if self._following is not None and stimuli and contender.calibrates and not is_burst:
+            self._following.add(delivered, float(rate_hz[0]))
         self._data_at_s = self._clock.now_s()
         tick["wall_s"] = self._data_at_s - self._wall_zero_s
         try:
@@ -213,7 +223,7 @@ class Driver:
         handled: Handled = "skipped" if is_burst and loop.on_burst == "skip" else "used"
         if handled == "used":
             # In float32, as when it was trained: a response that lies on a percentile is then on it here as well.
-            self._last_command = float(loop.mapping.command(np.float32(rate_hz), loop.percentiles))
+            self._last_command = float(loop.mapping.command(np.float32(rate_hz), self._percentiles))
         try:
             moved = self._body.step(self._last_command)
         except Exception as error:

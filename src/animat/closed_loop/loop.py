@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, Self, get_args
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from numpy.typing import ArrayLike
 
 from animat.errors import InvalidArgument, UnusableData
@@ -60,6 +60,8 @@ class Loop:
         mapping: from a response to a command.
         conditions: what is chosen from: frequencies.
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,).
+        following: non-burst responses of each condition in that recording, Hz, in the order of time; where given, the
+            percentiles follow the culture (see `animat.closed_loop.following`). None: they are held.
         pulses: of a presentation.
         window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
@@ -82,6 +84,7 @@ class Loop:
     mapping: Mapping
     conditions: tuple[Condition, ...]
     percentiles: Float32[np.ndarray, " percentiles"] = field(repr=False)
+    following: tuple[Float64[np.ndarray, " responses"], ...] | None = field(default=None, repr=False)
     pulses: int = 1
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
     burst_threshold: float = 1.0
@@ -110,6 +113,13 @@ class Loop:
                     f"condition {condition.label}: expected a frequency, as a closed loop presents by frequency; train "
                     "on recordings whose conditions are frequencies"
                 )
+        if self.following is not None and (
+            len(self.following) != len(self.conditions) or not all(len(x) for x in self.following)
+        ):
+            raise InvalidArgument(
+                f"following: expected some responses of each of {len(self.conditions)} conditions, got "
+                f"{[len(x) for x in self.following]}"
+            )
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
@@ -164,6 +174,7 @@ class Loop:
             "mapping": self.mapping.name,
             "conditions": [condition.label for condition in self.conditions],
             "percentiles": self.percentiles.tolist(),
+            "following": self.following is not None,
             "pulse": self.pulse.to_list(),
         }
 

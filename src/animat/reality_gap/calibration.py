@@ -24,6 +24,7 @@ class Calibration:
 
     Attributes:
         simulator: of the recording.
+        responses_hz: non-burst responses of each condition, in the order of time.
         burst_threshold: ratio of active channels above which its responses were bursts.
         start_min: of the recording on the culture's clock.
         conditions, window_ms, presentation: of the recording.
@@ -31,6 +32,7 @@ class Calibration:
     """
 
     simulator: NeuronSimulator
+    responses_hz: tuple[Float64[np.ndarray, " responses"], ...]
     burst_threshold: float
     start_min: float
     conditions: tuple[Condition, ...]
@@ -75,9 +77,11 @@ class Calibration:
                 at_min += trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"]
         row = timeline.row_at(at_min)
         start_min = float(timeline.start_min[row])
+        responses = next(each for each in series if each.start_min == start_min)
         return cls(
             simulator=timeline.at(start_min),
-            burst_threshold=next(r.threshold for r in series if r.start_min == start_min),
+            responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
+            burst_threshold=responses.threshold,
             start_min=start_min,
             conditions=timeline.conditions,
             window_ms=timeline.window_ms,

@@ -42,6 +42,7 @@ def run_policies(
     episodes: int = 5,
     with_controls: bool = True,
     greedy: bool = True,
+    follow: bool = True,
     seed: int = 1,
     pulses: int | None = None,
     account: Account | None = None,
@@ -61,6 +62,8 @@ def run_policies(
         episodes: of each policy and control.
         with_controls: all of them; if not, only the random one.
         greedy: whether policies take the most probable action, or draw as in training.
+        follow: whether the mapping's percentiles follow the culture (`animat.closed_loop.following`) from where the
+            calibration left them, or are held.
         seed: decides every random draw, but what the culture does.
         pulses: of a presentation; None: as in the policies' recordings.
         account: of a stimulation budget.
@@ -74,6 +77,8 @@ def run_policies(
     """
     first = _check(policies, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
+    if follow:
+        settings["following"] = calibration.responses_hz
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     if calibration.presentation is not None and calibration.presentation != first.presentation:
         sentence = (
