@@ -1,0 +1,94 @@
+"""The headline table: predicted against lived return by how recordings and loop present, over cultures and both robots.
+
+    python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation] [--policies 2] [--episodes 20]
+        [--thresholds follow held] [--controls] [--out gap/]
+
+For each virtual culture and presentation - the paper's blocks with one pulse, mixed with one, mixed with five - the
+culture is recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same culture from where
+the last recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from animat.cli import main as animat
+
+PRESENTATIONS = (("blocked", 1), ("mixed", 1), ("mixed", 5))
+
+
+def main() -> None:
+    """Record, train, run, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
+    parser.add_argument("--robots", nargs="+", default=["cartpole", "navigation"])
+    parser.add_argument("--thresholds", nargs="+", default=["follow", "held"])
+    parser.add_argument("--policies", type=int, default=2)
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--iterations", type=int, help="default: the paper's")
+    parser.add_argument("--controls", action="store_true", help="all controls, not the random one only")
+    parser.add_argument("--out", type=Path, default=Path("gap"))
+    options = parser.parse_args()
+
+    lines = []
+    for seed in options.seeds:
+        for order, pulses in PRESENTATIONS:
+            folder = options.out / f"culture{seed}-{order}-{pulses}"
+            recordings = str(folder / "recordings")
+            presented = ["--order", order, "--pulses", str(pulses)]
+            expect(["record", "--seed", str(seed), "--sessions", "2", *presented, "--out", recordings])
+            for robot in options.robots:
+                policies = str(folder / robot / "policies")
+                given = ["--recordings", recordings, "--policies", str(options.policies), "--duration-min", "20"]
+                given += ["--iterations", str(options.iterations)] if options.iterations else []
+                expect(["train", robot, *given, "--out", policies])
+                for thresholds in options.thresholds:
+                    table = folder / robot / f"{thresholds}.json"
+                    if not table.exists():
+                        run = ["run", policies, "--recordings", recordings, "--episodes", str(options.episodes)]
+                        run += ["--controls", "all" if options.controls else "random", "--thresholds", thresholds]
+                        run += ["--out", str(folder / robot / thresholds)]
+                        table.write_text(json.dumps(ran(run)) + "\n")
+                    rows = json.loads(table.read_text())["rows"]
+                    lines.append((seed, robot, f"{order}, {pulses}", thresholds, rows))
+                    print(told(*lines[-1]), flush=True)
+    print("\n| culture | robot | presentation | percentiles | predicted | lived | gap, 95 % | random | pulses/action |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for line in lines:
+        print(told(*line))
+
+
+def told(seed: int, robot: str, presentation: str, thresholds: str, rows: list[dict[str, Any]]) -> str:
+    """A line of the table."""
+    policies, random = rows[0], next(row for row in rows if row["name"] == "random")
+    gap = policies["gap"]
+    between = f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})"
+    return (
+        f"| {seed} | {robot} | {presentation} | {thresholds} | {policies['predicted']:.1f} | {policies['lived']:.1f} | "
+        f"{between} | {random['lived']:.1f} | {policies['pulses_per_action']:.0f} |"
+    )
+
+
+def expect(arguments: list[str]) -> None:
+    """Run a command that must succeed."""
+    status = animat(arguments)
+    if status:
+        raise SystemExit(status)
+
+
+def ran(arguments: list[str]) -> dict[str, Any]:
+    """Run a command and return its line of JSON."""
+    import contextlib
+    import io
+
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        expect([*arguments, "--json"])
+    return json.loads(printed.getvalue().splitlines()[-1])  # type: ignore[no-any-return]
+
+
+if __name__ == "__main__":
+    main()
