@@ -93,6 +93,22 @@ def test_figures_that_would_overwrite_each_other_are_refused(
     assert not (tmp_path / "figures").exists()
 
 
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes")])
+def test_too_little_memory_is_one_line(
+    error: Exception,
+    policies: Path,
+    recordings: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def roll_out(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("animat.evaluation.table.roll_out", roll_out)
+    assert main(["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "2"]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("animat: out of memory: ask for fewer episodes")
+
+
 def nothing(folder: Path, recordings: Path, policies: Path) -> None:
     """No preparation."""
 

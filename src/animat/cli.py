@@ -346,6 +346,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read the output closed it; Python would complain once more while exiting.
         sys.stderr.close()
         return 141
+    except Exception as error:
+        # JAX has an error of its own for it, which is not imported for this.
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print("animat: out of memory: ask for fewer episodes, policies or stimuli at once", file=sys.stderr)
+        return 1
     if command.json:
         print(json.dumps(_as_json(results)))
     return 0
