@@ -16,24 +16,33 @@ from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
+from animat.animat import Animat
 from animat.cli import main
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
+from animat.evaluation.hand_made import hand_made
+from animat.mapping import mapping_named
+from animat.neurons.made_up import made_up_simulator
+from animat.neurons.series import extract_series
+from animat.neurons.timeline import fit_timeline
 from animat.recordings.made_up import make_up_recording, write_made_up_series
-from animat.recordings.reading import read_recording
+from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell
+from animat.robots import Cartpole, Navigation
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
 from animat.studies.identity import settle_identity
 from animat.studies.jobs import Job, Report, Task, in_order
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.plan import plan_study
+from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
-from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Compared, Condition, Culture, Study
+from animat.studies.simulating import Fit, load_timeline
+from animat.studies.specification import Body, Compared, Condition, Culture, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import Policy
 
@@ -67,7 +76,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
-    kills = kill_and_go_on(folder, [6.0, 9.0, 14.0])
+    kills = kill_and_go_on(folder, [5.0, 9.0])
     assert kills >= 1
     assert files(folder) == files(finished)
 
@@ -394,6 +403,25 @@ class HereAndNow(Executor):
         """Nothing runs."""
 
 
+def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
+    write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
+    study = Study(culture=Culture("files", files=("made",)), simulators=Simulators(kind="empirical"))
+    folder = tmp_path / "study"
+    copies = Record(tmp_path).run(study, folder, lambda share, words: None)
+    assert [path.name for path in copies] == ["recording_0000_min.nwb", "recording_0030_min.nwb"]
+    for copy in copies:
+        assert read_recording(copy).equals(read_recording(tmp_path / "made" / copy.name))
+    kept, responses = Fit().run(study, folder, lambda share, words: None)
+    timeline = load_timeline(kept)
+    fitted = fit_timeline(extract_series(read_recordings(tmp_path / "made")), kind="empirical")
+    for one, other in zip(jax.tree.leaves(timeline.simulators), jax.tree.leaves(fitted.simulators), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for name in ("conditions", "window_ms", "presentation", "findings"):
+        assert getattr(timeline, name) == getattr(fitted, name)
+    assert len(rows(responses)) == 2 * 5 * 10
+
+
+@pytest.mark.oracle
 def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path: Path) -> None:
     write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     study = replace(
@@ -409,6 +437,26 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
     page = ran.report.read_text()
     assert "The study compares no conditions" in page
     assert "Differences from the paper" not in page
+
+
+@pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
+def test_the_rule_made_by_hand_goes_where_it_should(mapping: str) -> None:
+    simulator = made_up_simulator()
+    for robot, lean_right in (
+        (Cartpole(), [0.0, 0.0, 0.05, 0.0]),
+        # At the top, looking right: the goal is below, which is clockwise.
+        (Navigation(), [0.5, 0.0, 0.0]),
+    ):
+        environment = Animat(robot, mapping_named(mapping), 5)
+        rule = hand_made(environment, simulator)
+        seen = np.array([lean_right, lean_right]) / environment.scales
+        if isinstance(robot, Cartpole):
+            seen[1] *= -1
+        else:
+            seen[1, 1] = 0.95  # below the goal
+        actor = jax.tree.map(lambda leaf: leaf[0], rule)
+        # The made-up means rise with the frequency.
+        assert actor.act(environment, seen, np.zeros(2)).tolist() == [4, 0]
 
 
 def test_a_comparison_knows_what_its_limit_says() -> None:

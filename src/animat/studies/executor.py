@@ -62,7 +62,7 @@ class Executor(abc.ABC):
 
 @final
 class Processes(Executor):
-    """Processes on this machine, each pinned to a core of its own; they stay for the next job.
+    """Processes on this machine, each pinned to a core of its own; they stay for more jobs until they are too large.
 
     Args:
         workers: how many, at most one a core; None: one a core.
@@ -104,6 +104,8 @@ class Processes(Executor):
                 raise self._ended(core)
             words = json.loads(line)
             words["files"] = tuple(words.get("files", ()))
+            if words.pop("leaves", False):
+                self._dismiss(core)
             event = Event(job=self._jobs[core], **words)
             if event.kind != "progress":
                 del self._jobs[core]
@@ -121,6 +123,15 @@ class Processes(Executor):
                         pipe.close()
         self._processes.clear()
         self._selector.close()
+
+    def _dismiss(self, core: int) -> None:
+        """Let a worker go that has grown too large; the core's next job gets a new one."""
+        process = self._processes.pop(core)
+        assert process.stdin is not None and process.stdout is not None
+        self._selector.unregister(process.stdout)
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
 
     def _spawn(self, core: int) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "animat.studies.worker", str(core)]

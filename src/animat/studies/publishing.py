@@ -66,12 +66,12 @@ def _short(study: Study, folder: Path) -> Section:
             f"{same} of {len(rows)} comparisons came out as in the paper: the same condition better, at p < {LEVEL:g}. "
             + ("The others are marked, and explained under Differences from the paper." if same < len(rows) else "")
         )
-        smallest = p_of_u(0.0, study.policies, study.policies)
-        if smallest >= LEVEL:
-            paragraphs.append(
-                f"With {study.policies} policies a side no p can fall below {smallest:.2g}: these are the figures of a "
-                "first look, and no results."
-            )
+    smallest = p_of_u(0.0, study.policies, study.policies)
+    if rows and smallest >= LEVEL:
+        paragraphs.append(
+            f"With {study.policies} policies a side no p can fall below {smallest:.2g}: these are the figures of a "
+            "first look, and no results."
+        )
     if not rows:
         paragraphs.append("The study compares no conditions; how each did is under Scores.")
     paragraphs.append(

@@ -20,6 +20,9 @@ from animat.training.worker import end_with_parent
 
 _TELL_EVERY_S = 0.2
 
+_LARGEST_MIB = 800
+"""A worker that has grown beyond it makes way for a new one: compiled programs and tables of past jobs stay in it."""
+
 
 def main() -> int:
     """Run tasks until standard input ends."""
@@ -55,8 +58,17 @@ def main() -> int:
             files = task.run(study, folder, report)
         except AnimatError as error:
             tell(kind="failed", words=str(error))
-        else:
-            tell(kind="done", files=[str(file) for file in files], cpu_s=time.process_time() - began_s)
+            continue
+        leaves = _resident_mib() > _LARGEST_MIB
+        cpu_s = time.process_time() - began_s
+        tell(kind="done", files=[str(file) for file in files], cpu_s=cpu_s, leaves=leaves)
+        if leaves:
+            return 0
+
+
+def _resident_mib() -> float:
+    resident_pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return resident_pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 if __name__ == "__main__":
