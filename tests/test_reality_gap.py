@@ -16,14 +16,17 @@ from animat.cli import main
 from animat.closed_loop.contenders import lean
 from animat.closed_loop.session import read_session
 from animat.cultures.budget import Account, Budget
+from animat.cultures.kinds import culture_of, pulse_for
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.mapping import Thresholds
 from animat.neurons.responses import Responses, extract_responses
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, run_policies
+from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.recording import Recording
+from animat.recordings.selection import Selection
 from animat.robots import Cartpole, Navigation, Robot
 from animat.training.policy import Policy
 from fake_culture import FakeCulture
@@ -272,3 +275,25 @@ class TestCommand:
         said = capsys.readouterr().err.splitlines()[-1]
         assert words in said
         assert main(["recover", str(folder / "nowhere")]) == 1
+
+
+def test_another_kind_of_culture_is_another_word(tmp_path: Path, recordings: list[Recording]) -> None:
+    assert culture_of("virtual", seed=3).name == "virtual"
+    assert culture_of("replay", recordings=recordings).name == "replay"
+    assert culture_of("cl1").name == "cl1"
+    electrodes = np.arange(0, 20_000, 200)
+    Selection(MAXONE, electrodes, electrodes[:8], electrodes[:8].reshape(4, 2)).save(tmp_path / "electrodes.json")
+    assert culture_of("maxone", selection=tmp_path / "electrodes.json").name == "maxone"
+    for kind in ("cl1", "maxone", "virtual"):
+        culture = culture_of(kind, selection=tmp_path / "electrodes.json" if kind == "maxone" else None)
+        limits = culture.device_limits
+        pulse = pulse_for(kind)
+        assert pulse.kind == limits.kind
+        assert abs(pulse.net_charge) <= limits.net_charge
+        assert all(abs(phase.charge) <= limits.charge_per_phase for phase in pulse.phases)
+    with pytest.raises(InvalidArgument, match="a file of electrodes for a maxone"):
+        culture_of("maxone")
+    with pytest.raises(InvalidArgument, match="none for others"):
+        culture_of("virtual", selection=tmp_path / "electrodes.json")
+    with pytest.raises(InvalidArgument, match="expected one of"):
+        culture_of("human")  # type: ignore[arg-type]

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 class Stimulating:
     """On which culture, and how much it may be stimulated; the same in every command that does."""
 
-    culture: Literal["virtual", "replay", "cl1"] = "virtual"
-    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1: a CL1 (needs cl-sdk)"""
+    culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1 and maxone: the devices"""
+    selection: Path | None = None
+    """For a maxone: the file of its electrodes"""
     culture_seed: int | None = None
     """Which virtual culture; default: the one of the recordings, else 1"""
     budget_pulses: int | None = None
@@ -140,7 +142,9 @@ class Run(Stimulating):
         seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
         if state is not None:
             print(f"the culture goes on from {state}", file=sys.stderr)
-        return culture_of(self.culture, seed=seed, state=state, recordings=recordings, progress=progress)
+        return culture_of(
+            self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
+        )
 
     def _calibrate(
         self,
@@ -243,7 +247,7 @@ class Live(Stimulating):
         from animat.robots.registry import robot_named
         from animat.training.specification import Training
 
-        simulated = self.culture != "cl1"
+        simulated = self.culture in ("virtual", "replay")
         if self.speed is not None and self.speed != 1 and not simulated:
             raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
         pace = Pace(self.interval_min, self.duration_min, self.speed or (30.0 if simulated else 1.0))
@@ -262,7 +266,9 @@ class Live(Stimulating):
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
             Bar("live") as progress,
-            culture_of(self.culture, seed=seed, recordings=recordings, progress=progress) as culture,
+            culture_of(
+                self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
+            ) as culture,
         ):
             lived = live(
                 training,

@@ -11,9 +11,9 @@ from animat.cultures.base import Culture
 from animat.errors import InvalidArgument
 from animat.progress import Progress
 from animat.recordings.recording import Recording
-from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
 
-CultureKind = Literal["virtual", "replay", "cl1"]
+CultureKind = Literal["virtual", "replay", "cl1", "maxone"]
 
 
 def culture_of(
@@ -22,24 +22,30 @@ def culture_of(
     seed: int = 1,
     state: str | os.PathLike[str] | None = None,
     recordings: Sequence[Recording] = (),
+    selection: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
 ) -> Culture:
     """A culture of a kind, closed.
 
     Args:
-        kind: `"virtual"`, `"replay"` or `"cl1"`.
+        kind: `"virtual"`, `"replay"`, `"cl1"` or `"maxone"`.
         seed: which virtual culture; of the draws of a replay; of a CL1's patterns.
         state: of a virtual culture, to go on from (`VirtualCulture.save_state`).
         recordings: that a replay answers from.
+        selection: file of the electrodes of a MaxOne (`Selection.save`).
         progress: told about a virtual culture's scan.
 
     Raises:
-        InvalidArgument: for another kind, or a state for one that has none.
+        InvalidArgument: for another kind, a state or a selection for one that has none, or a MaxOne without one.
         InvalidFile, Mismatch: if the state is damaged, or another culture's.
         DeviceFailed: for a device whose package is not installed.
     """
     if state is not None and kind != "virtual":
         raise InvalidArgument(f"state: expected none for a culture of kind {kind!r}, got {state}")
+    if (selection is not None) != (kind == "maxone"):
+        raise InvalidArgument(
+            f"selection: expected a file of electrodes for a maxone and none for others, got {selection} for {kind!r}"
+        )
     if kind == "virtual":
         from animat.cultures.virtual import VirtualCulture
 
@@ -55,6 +61,11 @@ def culture_of(
         from animat.cultures.cl1 import CL1Culture
 
         return CL1Culture(seed=seed)
+    if kind == "maxone" and selection is not None:
+        from animat.cultures.maxone import MaxOneCulture
+        from animat.recordings.selection import Selection
+
+        return MaxOneCulture(Selection.load(selection))
     raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")
 
 
@@ -64,7 +75,8 @@ def pulse_for(kind: CultureKind) -> Pulse:
         from animat.cultures.cl1 import CL1_PULSE
 
         return CL1_PULSE
-    return PUBLISHED_PULSE
+    # The published pulse as printed is not balanced: a living culture is given one that is.
+    return BALANCED_PULSE if kind == "maxone" else PUBLISHED_PULSE
 
 
 def recorded_culture(recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
