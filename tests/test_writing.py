@@ -1,0 +1,62 @@
+"""Files that are complete or absent, whatever happens while they are written."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from animat.errors import InvalidFile
+from animat.writing import written_whole
+
+
+def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b.txt"
+    for content in ("old", "new"):
+        with written_whole(path) as beside:
+            assert beside.parent == path.parent
+            assert beside.suffix == ".txt"
+            beside.write_text(content)
+            assert not path.exists() or path.read_text() == "old"
+    assert path.read_text() == "new"
+    (tmp_path / "plain").write_text("")
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+    assert [file.name for file in path.parent.iterdir()] == ["b.txt"]
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(28, "No space left on device"), ValueError("something else"), KeyboardInterrupt()]
+)
+def test_on_any_error_the_old_file_stays_and_nothing_lies_beside_it(tmp_path: Path, error: BaseException) -> None:
+    path = tmp_path / "b.txt"
+    path.write_text("old")
+    expected = InvalidFile if isinstance(error, OSError) else type(error)
+    with pytest.raises(expected) as raised, written_whole(path) as beside:
+        beside.write_text("half")
+        raise error
+    if expected is InvalidFile:
+        assert str(raised.value) == (
+            f"{path}: cannot be written: No space left on device; what stood there before is unchanged"
+        )
+    assert path.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["b.txt"]
+
+
+def test_both_the_content_and_the_name_are_on_disk_before_it_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = []
+    fsync = os.fsync
+
+    def watched(descriptor: int) -> None:
+        synced.append((Path(f"/proc/self/fd/{descriptor}").readlink(), (tmp_path / "b.txt").exists()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    with written_whole(tmp_path / "b.txt") as beside:
+        beside.write_text("new")
+    assert [is_renamed for _, is_renamed in synced] == [False, True]
+    assert synced[0][0] == beside
+    assert synced[1][0] == tmp_path
