@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import signal
 import sys
 import time
 from pathlib import Path
@@ -29,6 +30,8 @@ def main() -> int:
     # Before JAX or BLAS are loaded: they size their threads by the cores they may use.
     os.sched_setaffinity(0, {int(sys.argv[1])})
     end_with_parent()
+    # Ctrl-C goes to all processes of a terminal; the one that started this one ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     # What libraries print must not end up among the events.
     events = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
