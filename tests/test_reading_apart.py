@@ -27,6 +27,12 @@ def test_it_is_the_recording_that_this_process_reads(path: Path) -> None:
     assert not apart.read_hdf5_apart(path).spike_times_s.flags.writeable
 
 
+def test_a_path_is_counted_from_where_the_program_is_now(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = read_recording(path)
+    monkeypatch.chdir(path.parent)
+    assert read_recording("a.nwb").equals(before)
+
+
 def test_errors_come_through_as_they_are(path: Path) -> None:
     with pytest.raises(InvalidArgument, match="part: expected only for MaxWell files"):
         apart.read_hdf5_apart(path, part="well000")

@@ -52,7 +52,8 @@ def read_hdf5_apart(path: Path, *, part: str | None = None, stimuli: str | None 
         InvalidFile: as there; also if the HDF5 library crashes on the file, or needs more time or memory than it may.
         InvalidArgument: as there.
     """
-    return _reader.read({"path": str(path), "part": part, "stimuli": stimuli}, path)
+    # Messages name the path as it was given, so it goes with the folder that it is counted from.
+    return _reader.read({"folder": str(Path.cwd()), "path": str(path), "part": part, "stimuli": stimuli}, path)
 
 
 class _Reader:
@@ -203,6 +204,7 @@ def _serve(requests: BinaryIO, answers: BinaryIO) -> None:
         request = json.loads(line)
         path = Path(request["path"])
         try:
+            os.chdir(request["folder"])
             _limit(path)
             kind, payload = b"R", _packed(read_hdf5(path, part=request["part"], stimuli=request["stimuli"]))
         except AnimatError as error:
