@@ -13,7 +13,6 @@ from jaxtyping import install_import_hook
 install_import_hook(
     [
         "animat.neurons.simulator",
-        "animat.neurons.bursts",
         "animat.robots.cartpole",
         "animat.robots.navigation",
         "animat.animat",
