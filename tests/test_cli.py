@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from animat.cli import main
+from animat.cli import _say_findings, main
+from animat.recordings.findings import Finding
 from animat.recordings.made_up import write_made_up_series
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
@@ -269,7 +270,8 @@ def test_a_real_culture_trains_a_controller_of_two_conditions(
 
 LITTLE_ROOM = """
 import resource, signal, sys
-from animat.cli import main
+from animat.cli import _say_findings, main
+from animat.recordings.findings import Finding
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (8_192, 8_192))
 sys.exit(main())
@@ -293,3 +295,12 @@ def test_a_full_disk_while_training_leaves_what_was_there_whole(recordings: Path
     assert "Traceback" not in ran.stderr
     assert not list((tmp_path / "out").rglob("*.partial*"))
     assert not list((tmp_path / "out").glob("*.safetensors"))
+
+
+def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    found = [Finding("binning", "warning", f"at {m} min: lost", m / 100) for m in (0, 20, 10)]
+    _say_findings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: at 20 min: lost (and 2 more like it)",
+        "warning: 12 only",
+    ]

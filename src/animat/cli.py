@@ -401,10 +401,18 @@ def _as_json(value: Any) -> Any:
 
 
 def _say_findings(findings: Sequence[Finding]) -> None:
-    """Warnings go to standard error, so that they are seen and results stay readable; notes are for `inspect`."""
+    """Warnings go to standard error, so that they are seen and results stay readable; notes are for `inspect`.
+
+    What is found in several recordings is told once, where it is largest, with how many others there are.
+    """
+    warnings: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.severity != "note":
-            print(f"warning: {finding.sentence}", file=sys.stderr)
+            warnings.setdefault(finding.name, []).append(finding)
+    for alike in warnings.values():
+        worst = max(alike, key=lambda finding: finding.value or 0.0)
+        others = f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else ""
+        print(f"warning: {worst.sentence}{others}", file=sys.stderr)
 
 
 def _control(timeline: SimulatorTimeline) -> str:
