@@ -55,7 +55,7 @@ class Limit(Task):
         timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
         last = last_minute(timeline)
         kinds, minutes = kinds_of(study), study.limit_minutes(last)
-        resolution, episodes = study.limit_resolution, study.limit_episodes
+        resolution, episodes = self.body.limit_resolution or study.limit_resolution, study.limit_episodes
         if self.over_time and timeline is not None:
             kinds = [kind for kind in kinds if kind.through_neurons][:1]
             minutes, resolution, episodes = timeline.start_min.tolist(), min(ROUGH, resolution), 2

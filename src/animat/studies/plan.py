@@ -75,8 +75,8 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
         ]
         name = f"controls/{body.name}/{kind.mapping}" + ("-held" if kind.percentiles == "first" else "")
         jobs.append(Job(name, Control(body, plain), (*groups, *neurons), 6))
-    finer = study.limit_resolution**4 if body.name == "cartpole" else study.limit_resolution**3
-    cost_s = (40 if body.name == "cartpole" else 12) * finer + 4
+    resolution = body.limit_resolution or study.limit_resolution
+    cost_s = 45 * resolution**4 + 4 if body.name == "cartpole" else 40 * resolution**2
     jobs.append(Job(f"limit/{body.name}", Limit(body), neurons, cost_s))
     if neurons:
         jobs.append(Job(f"limit/{body.name}/over-time", Limit(body, over_time=True), neurons, 12))

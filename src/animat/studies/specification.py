@@ -119,15 +119,19 @@ class Body:
         name: `cartpole` or `navigation`.
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
+        limit_resolution: of its best possible return, in place of the study's.
     """
 
     name: str
     iterations: int | None = None
+    limit_resolution: float | None = None
     parameters: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.iterations is not None and self.iterations < 1:
             raise InvalidArgument(f"robots.iterations: expected at least 1, got {self.iterations}")
+        if self.limit_resolution is not None:
+            _positive("robots.limit_resolution", self.limit_resolution)
         self.robot()
 
     def robot(self) -> Robot[Any]:
