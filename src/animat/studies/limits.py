@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from animat.evaluation.optimum import Case, best_returns
+from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.studies.evaluating import last_minute, setting_of
 from animat.studies.jobs import Report, Task
 from animat.studies.places import TIMELINE, limits_file, write_table
@@ -64,7 +64,16 @@ class Limit(Task):
         for kind, at in asked:
             setting = setting_of(study, self.body, kind, timeline)
             cases.append((setting.environment, setting.simulator(at)))
-        found = best_returns(cases, resolution=resolution, episodes=episodes, seed=study.seed, progress=_Told(report))
+        told = _Told(report)
+        found: dict[int, Optimum] = {}
+        # Cases side by side all have as many actions as the one with the most, and a continuous one has many.
+        for continuous in (False, True):
+            same = [i for i, (environment, _) in enumerate(cases) if (environment.n_actions is None) == continuous]
+            if same:
+                best = best_returns(
+                    [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=told
+                )
+                found |= dict(zip(same, best, strict=True))
         rows = [
             (
                 kind.mapping,
@@ -78,7 +87,8 @@ class Limit(Task):
                 best.without_clock_standard_error,
                 best.nodes,
             )
-            for (kind, at), best in zip(asked, found, strict=True)
+            for i, (kind, at) in enumerate(asked)
+            for best in (found[i],)
         ]
         return [
             write_table(limits_file(folder, self.body.name, "over-time" if self.over_time else "limits"), HEAD, rows)
