@@ -13,8 +13,6 @@ from jaxtyping import install_import_hook
 install_import_hook(
     [
         "animat.neurons.simulator",
-        "animat.robots.cartpole",
-        "animat.robots.navigation",
         "animat.animat",
         "animat.training.sac",
         "animat.evaluation.rollouts",

@@ -103,7 +103,7 @@ def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pyte
 def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
     path = rig_file("maxwell", tmp_path)
     before = path.read_bytes()
-    with pytest.raises(InvalidArgument, match="--out: expected another file"):
+    with pytest.raises(InvalidArgument, match="--out: expected a name that is not taken"):
         convert_recording(path, path)
     assert path.read_bytes() == before
 

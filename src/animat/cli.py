@@ -18,7 +18,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcomman
 from animat.cli_convert import Convert
 from animat.cli_loop import Live, Recover, Run
 from animat.cli_studies import Reproduce, StudyFile
-from animat.errors import AnimatError, InvalidArgument, Mismatch
+from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
 from animat.recordings.findings import Finding
 
 if TYPE_CHECKING:
@@ -234,6 +234,12 @@ class Train(Fitting):
             print(f"warning: {caveat}", file=sys.stderr)
         timeline = None if self.mapping == "none" else self.timeline(self.recordings)
 
+        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.despite:
+            raise UnusableData(
+                "--conditions: expected two or more for an agent to choose from, got one "
+                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                "(to go on in spite of it: --despite one-condition)"
+            )
         from animat.training.specification import Training
         from animat.training.trainer import train
 
@@ -326,6 +332,8 @@ Command = (
     | Annotated[Recover, subcommand("recover")]
 )
 
+COMMANDS = ("record", "inspect", "convert", "train", "evaluate", "reproduce", "study", "run", "live", "recover")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
@@ -340,7 +348,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("animat: interrupted; what was finished is kept, start again to go on", file=sys.stderr)
+        again = "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile) else ""
+        print(f"animat: interrupted; what was finished is kept{again}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # Whoever read the output closed it; Python would complain once more while exiting.
@@ -361,6 +370,10 @@ def _parse(
     arguments: list[str],
 ) -> Record | Inspect | Convert | Train | Evaluate | Reproduce | StudyFile | Run | Live | Recover:
     """Read the command line; usage errors come in one line, not in a box."""
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {arguments[0]!r}")
+    if not arguments:
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; see animat --help")
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

@@ -191,6 +191,8 @@ class _Run:
                 f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got "
                 f"{pace.interval_min:g}"
             )
+        if folder.exists() and not folder.is_dir():
+            raise InvalidArgument(f"--out: expected a folder for the live run, got a file: {folder}")
         if folder.exists() and any(folder.iterdir()):
             raise Mismatch(f"{folder}: expected an empty folder for a live run, got one with files: choose another")
         self.folder, self.account = folder, account

@@ -59,8 +59,8 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     yield Finding(
         "drift",
         "warning" if large else "note",
-        f"responses {'rise' if slope > 0 else 'fall'} by {100 * abs(slope):.0f} % (+- {100 * error:.0f} %) from the "
-        f"start to the end of the recording ({span_s / 60:.1f} min), conditions apart"
+        f"responses {'rise' if slope > 0 else 'fall'} by {100 * abs(slope):.0f} % of their mean "
+        f"(+- {100 * error:.0f} %) from the start to the end of the recording ({span_s / 60:.1f} min), conditions apart"
         + (
             ": one simulator stands for a culture that changes; record for a shorter time, wait until it has settled, "
             "or present conditions mixed, so that drift is not taken for a difference"

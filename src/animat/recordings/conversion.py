@@ -78,11 +78,12 @@ def convert_recording(
 
     Raises:
         InvalidFile: if the file cannot be read, or the new one not be written.
-        InvalidArgument: for a choice that the format does not offer, or an `out` that is the file itself.
+        InvalidArgument: for a choice that the format does not offer, or an `out` that exists.
     """
     path, out = Path(path), Path(out)
-    if out.exists() and path.exists() and out.samefile(path):
-        raise InvalidArgument(f"--out: expected another file than the recording itself, got {out}")
+    if out.exists():
+        # It may be the recording itself, or its stimuli; whatever it is, somebody made it.
+        raise InvalidArgument(f"--out: expected a name that is not taken, got {out}, which exists; choose another")
     if reader is not None:
         from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
         from animat.recordings.spikes_of_traces import with_spikes_of

@@ -49,9 +49,9 @@ def draw_array(recording: Recording) -> Figure:
     unplaced = len(stimulated) - len(rows)
     title = f"{np.count_nonzero(known):,} recording sites at {recording.start_min:g} min"
     if np.any(~known):
-        title += f"; {np.count_nonzero(~known):,} channels of unknown position are not drawn"
+        title += f"\n{np.count_nonzero(~known):,} channels of unknown position are not drawn"
     if unplaced:
-        title += f"; {unplaced} stimulated electrodes that no channel reads are not drawn"
+        title += f"\n{unplaced} stimulated electrodes that no channel reads are not drawn"
     _finish(axes, title)
     return figure
 

@@ -199,6 +199,8 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
         InvalidFile: if there is none, or one cannot be read.
     """
     path = Path(path)
+    if not path.exists():
+        raise InvalidFile(f"{path}: expected a policy file or a folder of them, got no such file; train them first")
     if not path.is_dir():
         return {path.stem: Policy.load(path)}
     # Hidden files are unfinished ones: a process was killed while it wrote them.
