@@ -125,6 +125,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     assert all(name in text for name in rows)
 
 
+@pytest.mark.oracle
 def test_an_interval_of_the_gap_covers_it_as_often_as_it_says(series: list[Responses], tmp_path: Path) -> None:
     from dataclasses import replace
 

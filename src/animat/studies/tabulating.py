@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
-from animat.evaluation.statistics import compare, holm, interquartile_mean, normalised_score
+from animat.evaluation.statistics import compare, holm, interquartile_mean, normalised_score, p_of_u
 from animat.studies.evaluating import last_minute
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
@@ -212,6 +212,8 @@ def _comparisons(study: Study, folder: Path, last: float, references: dict[str, 
         known = references[body.name]
         printed = PRINTED.get((compared.name, body.name)) if study.paper else None
         found = told.p_normal < LEVEL
+        # With four policies a side even U = 0 has p = 0.03: nothing could be found, which is not "no difference".
+        could = p_of_u(0.0, len(a), len(b)) < LEVEL
         better = "second" if told.u_first < len(a) * len(b) / 2 else "first"
         limits = [known.limit(condition, at_min) or {} for condition in (first, second)]
         rows.append(
@@ -237,7 +239,7 @@ def _comparisons(study: Study, folder: Path, last: float, references: dict[str, 
                 told.effect.value,
                 told.effect.low,
                 told.effect.high,
-                f"{better} better" if found else "no difference",
+                f"{better} better" if found else "no difference" if could else "too few policies to tell",
                 None if printed is None else printed.u,
                 None if printed is None else printed.p,
                 None if printed is None else "yes" if found and better == "second" else "no",
