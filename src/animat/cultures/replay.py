@@ -16,8 +16,8 @@ from animat.recordings.recording import UNKNOWN, Channels, Recording
 from animat.recordings.stimulus import Stimulus
 
 NS = 1_000_000_000
-REACH_S = 0.05
-"""How much of what followed a stimulus is kept as its response, unless another stimulus came sooner."""
+REACH_S = 1.0
+"""How much of what followed a stimulus is its answer, unless another one came sooner: beyond any response window."""
 
 
 class ReplayCulture(Culture):
