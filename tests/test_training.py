@@ -114,8 +114,10 @@ def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path: Path)
 
 
 WATCHED = """
-import sys
+import signal, sys
 from pathlib import Path
+# A process that was started in the background ignores the keyboard; this one is to feel it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from animat.training.trainer import train
 from test_training import SHORT, Interrupting, replace, timeline_of
 train(replace(SHORT, policies=7, iterations=10_000_000), timeline_of(), Path(sys.argv[1]), progress=Interrupting())
