@@ -146,6 +146,26 @@ def test_presentations_are_those_of_a_recording(tmp_path: Path) -> None:
     assert {tick.chosen for tick in session.ticks} == set(range(5))
 
 
+def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(tmp_path: Path) -> None:
+    class Ticking:
+        """A clock that ticks each time that it is looked at."""
+
+        time_s = 0.0
+
+        def now_s(self) -> float:
+            self.time_s += 1e-4
+            return self.time_s
+
+        def sleep_until(self, time_s: float) -> None:
+            self.time_s = max(self.time_s, time_s)
+
+    with FakeCulture() as culture:
+        loop = loop_of(real_time=True, pause_s=30.0)
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=2, clock=Ticking())
+    assert len(session.ticks) == 12
+    assert 0 < max(tick.decided_s for tick in session.ticks) < 0.002
+
+
 def test_contenders_take_turns_in_random_order() -> None:
     rng = np.random.default_rng(1)
     turns = interleaved(4, 50, rng)
@@ -257,6 +277,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),
         ({"patience_s": float("nan")}, "patience_s"),
+        ({"patience_s": 0.0}, "patience_s"),
         ({"patterns": 0}, "patterns"),
     ],
 )
@@ -311,6 +332,9 @@ def test_a_budget_is_kept_to_the_pulse() -> None:
     assert account.per_electrode == {1: 2, 2: 4, 3: 2}
     with pytest.raises(BudgetSpent, match="electrode 2 had 4 of 4"):
         account.check(pair)
+    account.take_back(pair)
+    account.check(pair)
+    account.spend(pair)
     account.check([Stimulus(0.0, (1,), PUBLISHED_PULSE)] * 2)
     with pytest.raises(BudgetSpent, match="4 of 10 pulses are spent, and 7 more"):
         account.check([Stimulus(0.0, (i,), PUBLISHED_PULSE) for i in range(10, 17)])

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from animat.cli import main
 from animat.closed_loop.contenders import Contender
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
@@ -80,8 +81,13 @@ def test_a_backend_that_raises_or_loses_its_connection(tmp_path: Path, error: Ex
         assert words in session.ending.sentence
         assert_safe(session, culture, 7)
         assert len(session.ticks) == 7
-    events = [record.words for record in session.log.records if record.words["kind"] == "event"]
-    assert [len(event["asked_for_s"]) for event in events] == [1]
+    # What was asked is in the log and in the account, as nobody knows whether it came.
+    (asked,) = session.unanswered
+    assert len(asked["asked_for_s"]) == len(asked["stimuli"]) == 1
+    assert asked["stimuli"][0][3] in [[100 + i, 100 + (i + 1) % 8] for i in range(8)]
+    assert asked["asked_at_s"] == pytest.approx(session.ticks[-1].read_after_s + 0.0101, abs=1e-3)
+    assert session.to_dict()["unanswered_pulses"] == 1
+    assert session.recording().provenance["closed_loop_unanswered_pulses"] == "1"
     assert read_session(tmp_path).ending == session.ending
 
 
@@ -110,6 +116,7 @@ def spikes(change: Callable[[Any, Any], tuple[Any, Any]]) -> Callable[[Observed]
         (garbled(spikes=lambda o: 7), "cannot be read"),
         (garbled(stimulus_time_s=lambda o: np.empty(0)), "0,) stimulus times for 1"),
         (garbled(stimulus_time_s=lambda o: np.array([np.nan])), "stimulus times"),
+        (garbled(stimulus_time_s=lambda o: o.stimulus_time_s - 0.002), "2 ms before it was asked for"),
         (garbled(duration_s=lambda o: 0.001), "a stretch of 0.001 s"),
         (garbled(duration_s=lambda o: float("nan")), "a stretch of nan s"),
         (garbled(start_s=lambda o: 3.0), "went back"),
@@ -122,6 +129,115 @@ def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str
         assert session.ending.by == "culture"
         assert words in session.ending.sentence
         assert_safe(session, culture, 7)
+    assert session.to_dict()["unanswered_pulses"] == 1
+
+
+class Gone(FakeCulture):
+    """Its clock answers so many times, then does what it is told."""
+
+    def __init__(self, then: Callable[[], Any], left: int = 60) -> None:
+        super().__init__()
+        self.then, self.left = then, left
+
+    @property
+    def now_s(self) -> float:
+        self.left -= 1
+        if self.left == 0:
+            self.then()
+        return self._now_s
+
+
+def test_a_connection_that_is_lost_between_two_stimuli(tmp_path: Path) -> None:
+    def lose() -> None:
+        raise ConnectionResetError("gone")
+
+    # The clock is asked between deliveries, and in them: both are the culture's fault and not the loop's.
+    for left in range(40, 46):
+        with Gone(lose, left) as culture:
+            session = run(tmp_path / str(left), culture)
+            assert session.ending.by == "culture"
+            assert "the connection to the culture is lost" in session.ending.sentence
+            assert_safe(session, culture, 3)
+
+
+@pytest.mark.parametrize("left", range(40, 44))
+def test_a_clock_that_hangs(tmp_path: Path, left: int) -> None:
+    released = threading.Event()
+    with Gone(lambda: released.wait(60), left) as culture:
+        try:
+            session = run(tmp_path, culture, patience_s=0.3)
+            assert session.ending.by == "hang"
+            assert "the culture did not answer 0.3 s after" in session.ending.sentence
+            assert_safe(session, culture, 3)
+        finally:
+            released.set()
+
+
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool) -> None:
+    released, acted = threading.Event(), [0]
+
+    class Pondering:
+        def act(self, observation: Any, rng: np.random.Generator) -> int:
+            acted[0] += 1
+            if acted[0] == 8:
+                if is_interrupted:
+                    os.kill(os.getpid(), signal.SIGINT)
+                released.wait(60)
+            return 0
+
+    with FakeCulture() as culture:
+        try:
+            contender = Contender("it", "", Pondering())
+            session = run_session(culture, loop_of(robot=LONG, patience_s=0.3), [contender], tmp_path, episodes=1)
+            assert session.ending.by == "hang"
+            assert "it did not answer 0.3 s after it should have" in session.ending.sentence
+            assert_safe(session, culture, 7)
+            pulses = culture.pulses
+        finally:
+            released.set()
+        thread = next((t for t in threading.enumerate() if t.name == "closed loop"), None)
+        if thread is not None:
+            thread.join(10)
+        assert culture.pulses == pulses
+
+
+@pytest.mark.parametrize("how", ["raises", "hangs"])
+def test_a_culture_that_cannot_be_stopped_is_told(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    released = threading.Event()
+    monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
+
+    class Unstoppable(FakeCulture):
+        def _halt(self) -> None:
+            if how == "raises":
+                raise ConnectionResetError("gone")
+            released.wait(60)
+
+    with Unstoppable(fault=raising(RuntimeError("smoke")), at=8) as culture:
+        try:
+            session = run(tmp_path, culture)
+        finally:
+            released.set()
+        assert "the culture raised RuntimeError: smoke; BUT the culture" in session.ending.sentence
+        assert "see to it that the device gives no more pulses" in session.ending.sentence
+        # Whatever the device does: nothing passes the guard.
+        with pytest.raises(UnsafeStimulus, match="stop"):
+            culture.stimulate(culture.stimulation_electrodes[:1], session_pulse())
+    assert read_session(tmp_path).ending == session.ending
+
+
+def test_a_later_pulse_of_a_presentation_that_comes_late_is_late(tmp_path: Path) -> None:
+    def third(culture: FakeCulture, observed: Observed) -> Observed:
+        times_s = observed.stimulus_time_s.copy()
+        times_s[2:] += 0.007
+        culture._now_s += 0.007
+        return replace(observed, stimulus_time_s=times_s, duration_s=observed.duration_s + 0.007)
+
+    with FakeCulture(fault=third, at=8) as culture:
+        session = run(tmp_path, culture, pulses=4)
+    late = {tick.number: tick.late_s for tick in session.ticks if tick.late_s > 0}
+    assert late == {7: pytest.approx(0.007, abs=1e-4)}
+    assert session.to_dict()["late_pulses"] == 1
 
 
 def test_a_backend_that_hangs(tmp_path: Path) -> None:
@@ -135,7 +251,8 @@ def test_a_backend_that_hangs(tmp_path: Path) -> None:
         try:
             session = run(tmp_path, culture, patience_s=0.3)
             assert session.ending.by == "hang"
-            assert "did not answer 0.3 s after it should have" in session.ending.sentence
+            assert "the culture did not answer 0.3 s after it should have" in session.ending.sentence
+            assert session.to_dict()["unanswered_pulses"] == 1
             assert_safe(session, culture, 7)
             pulses = culture.pulses
         finally:
@@ -363,6 +480,44 @@ def test_killed_outright_it_loses_at_most_a_second(tmp_path: Path) -> None:
         read_recording(tmp_path / "session.nwb")
     assert recover_session(tmp_path).ticks == session.ticks
     assert_read_alike(tmp_path, loop_of())
+
+
+KILLED_MEANWHILE = """
+import sys, time
+from test_closed_loop_faults import LONG, RANDOM, FakeCulture, loop_of, run_session
+
+def hang(culture, observed):
+    print(culture.pulses, flush=True)
+    time.sleep(600)
+
+with FakeCulture(fault=hang, at=8) as culture:
+    run_session(culture, loop_of(robot=LONG, pulses=4, patience_s=600.0), [RANDOM], sys.argv[1], episodes=1)
+"""
+
+
+def test_killed_during_a_long_presentation_the_log_has_what_was_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED_MEANWHILE, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent,
+    )
+    assert process.stdout is not None
+    pulses = int(process.stdout.readline())
+    time.sleep(1.0)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    session = recover_session(tmp_path)
+    told = session.to_dict()
+    assert told["pulses"] + told["unanswered_pulses"] == pulses == 8 * 4
+    assert told["unanswered_pulses"] == 4
+    assert len(session.unanswered[0]["stimuli"][0][3]) == 2
+    assert main(["recover", str(tmp_path)]) == 0
+    assert "4 pulses were asked for and never answered" in capsys.readouterr().out
+    assert_read_alike(tmp_path, loop_of(pulses=4))
 
 
 def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:

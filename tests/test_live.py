@@ -12,8 +12,18 @@ import pytest
 
 from animat.cli import main
 from animat.cultures.budget import Account, Budget
-from animat.errors import AnimatError, BudgetSpent, InvalidArgument, Mismatch, UnusableData
+from animat.cultures.observed import Observed
+from animat.errors import (
+    AnimatError,
+    BudgetSpent,
+    DeviceFailed,
+    InvalidArgument,
+    Mismatch,
+    UnsafeStimulus,
+    UnusableData,
+)
 from animat.live.exchange import Exchange
+from animat.live.recording import record_within
 from animat.live.shadowing import LOG_FILE, Lived, Pace, live
 from animat.mapping import Thresholds
 from animat.neurons.made_up import made_up_simulator
@@ -119,6 +129,24 @@ def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Pa
     assert found.gap.session.ending.by in ("plan", "budget")
     with FakeCulture() as culture, pytest.raises(BudgetSpent, match="0 of 10 pulses are spent, and 400 more"):
         live(TRAINING, culture, PROTOCOL, tmp_path / "none", account=Account(Budget(pulses=10)))
+
+
+def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path) -> None:
+    account = Account(Budget())
+    blocked = Protocol(pulses=2, patterns=8, presentations=40, setup_s=0.1)
+
+    def fail(culture: FakeCulture, observed: Observed) -> Observed:
+        raise DeviceFailed("gone")
+
+    with FakeCulture(fault=fail, at=2) as culture:
+        with pytest.raises(DeviceFailed):
+            record_within(account, culture, blocked, 1)
+        # Blocks of 80: two were recorded, and the third was handed over.
+        assert account.pulses == culture.delivered == culture.pulses == 3 * 80
+        with pytest.raises(UnsafeStimulus):
+            culture.stop()
+            record_within(account, culture, blocked, 1)
+        assert account.pulses == 3 * 80
 
 
 def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path) -> None:

@@ -320,11 +320,13 @@ class Recover:
 
     def run(self) -> dict[str, Any]:
         """Recover."""
-        from animat.closed_loop.session import recover_session
+        from animat.closed_loop.session import recover_session, told_unanswered
 
         session = recover_session(self.session)
         told = session.to_dict()
         print(f"{session.recording_file}: {told['ticks']} ticks, {told['pulses']} pulses; it ended: {told['ended']}")
+        if told["unanswered_pulses"]:
+            print(told_unanswered(session))
         if told["lost_bytes"]:
             print(f"{told['lost_bytes']} bytes at the end of the log make no whole record and are lost")
         return {"recording": str(session.recording_file), **told}

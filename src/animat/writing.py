@@ -35,7 +35,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(file.fileno())
         beside.chmod(0o666 & ~_umask())
         beside.replace(path)
-        _keep_name(path.parent)
+        keep_name(path.parent)
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise InvalidFile(
@@ -46,7 +46,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def _keep_name(folder: Path) -> None:
+def keep_name(folder: Path) -> None:
     """Put a folder's new name on disk too: without it a file renamed just before a power cut may be the old one."""
     # Some file systems cannot, and then do it in their own time.
     with suppress(OSError):

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.cultures.observed import Observed
 
 
-def wrong_with(observed: Observed, *, n_stimuli: int, duration_s: float, from_s: float, n_channels: int) -> str | None:
+def wrong_with(
+    observed: Observed,
+    *,
+    asked_s: Float64[np.ndarray, " stimuli"],
+    duration_s: float,
+    from_s: float,
+    sample_s: float,
+    n_channels: int,
+) -> str | None:
     """What is wrong with an answer, in a sentence; None for one that can be.
 
     Args:
         observed: the answer.
-        n_stimuli: that were delivered.
+        asked_s: times of the stimuli, counted from when they were asked for: none can begin before.
         duration_s: that was asked for.
         from_s: the soonest time on the culture's clock that it can begin at.
+        sample_s: of the culture; times may be rounded to whole ones.
         n_channels: of the culture.
     """
     try:
@@ -22,11 +32,11 @@ def wrong_with(observed: Observed, *, n_stimuli: int, duration_s: float, from_s:
         pulses_s, start_s, seen_s = observed.stimulus_time_s, observed.start_s, observed.duration_s
         if len(times_s) != len(channel):
             return f"the culture answered {len(times_s)} spike times for {len(channel)} channels"
-        if pulses_s.shape != (n_stimuli,):
-            return f"the culture answered {pulses_s.shape} stimulus times for {n_stimuli} stimuli"
+        if pulses_s.shape != asked_s.shape:
+            return f"the culture answered {pulses_s.shape} stimulus times for {len(asked_s)} stimuli"
         if not (np.isfinite(start_s) and np.isfinite(seen_s) and seen_s >= duration_s - 1e-6):
             return f"the culture answered a stretch of {seen_s} s from {start_s} s where {duration_s} s were asked"
-        if start_s < from_s:
+        if start_s < from_s - 1.5 * sample_s:
             return f"the culture's clock went back to {start_s} s"
         for name, given_s in (("spike", times_s), ("stimulus", pulses_s)):
             # Not (a <= b): a NaN fails it too.
@@ -34,6 +44,9 @@ def wrong_with(observed: Observed, *, n_stimuli: int, duration_s: float, from_s:
                 return f"the culture answered {name} times outside of the {seen_s:g} s that were seen"
             if not bool((given_s[1:] >= given_s[:-1]).all()):
                 return f"the culture answered {name} times that are no rising numbers"
+        if bool((pulses_s < asked_s - 1.5 * sample_s).any()):
+            early_ms = 1000 * float((asked_s - pulses_s).max())
+            return f"the culture answered that a stimulus came {early_ms:.3g} ms before it was asked for"
         if channel.dtype.kind not in "iu":
             return f"the culture answered channels that are no whole numbers ({channel.dtype})"
         if len(channel) and not (channel.min() >= 0 and channel.max() < n_channels):

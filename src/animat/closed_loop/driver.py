@@ -5,11 +5,10 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from animat.closed_loop.answers import in_words, wrong_with
 from animat.closed_loop.body import Body
@@ -17,13 +16,14 @@ from animat.closed_loop.contenders import Contender
 from animat.closed_loop.following import Following
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.stretch import Asked, Stretch, rows_of
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.errors import BudgetSpent, UnsafeStimulus
 from animat.neurons.windows import read_windows
-from animat.recordings.recording import UNKNOWN, Channels
+from animat.recordings.recording import UNKNOWN
 from animat.recordings.schedule import TICK_S, on_ticks
 from animat.recordings.stimulus import Stimulus
 
@@ -34,18 +34,6 @@ class Stop(Exception):
     def __init__(self, ending: Ending) -> None:
         super().__init__(ending.sentence)
         self.ending = ending
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """What was seen in a stretch of time, on the session's clock, its times on the culture's samples."""
-
-    start_s: float
-    duration_s: float
-    spike_times_s: Float64[np.ndarray, " spikes"]
-    spike_channels: Int64[np.ndarray, " spikes"]
-    channels: Channels
-    stimulus_time_s: Float64[np.ndarray, " stimuli"]
 
 
 class Driver:
@@ -74,8 +62,10 @@ class Driver:
         self.records: deque[Record] = deque()
         self.episodes_done = 0
         self.is_stopped = False
-        self.expected_by = float("inf")
-        """When, on `time.monotonic()`, the culture should have answered at the latest; a supervisor watches it."""
+        self.expected = float("inf"), "nobody"
+        """By when, on `time.monotonic()`, who should have answered at the latest; a supervisor watches it."""
+        self.under_way: Asked | None = None
+        """What was asked of the culture and is not answered yet; a supervisor writes it down."""
         self._culture, self._loop, self._contenders, self._turns = culture, loop, contenders, turns
         self._account, self._clock = account, clock
         self._rng = np.random.default_rng([seed, 21])
@@ -86,16 +76,16 @@ class Driver:
         self._percentiles = loop.percentiles
         self._patterns = [tuple(int(e) for e in row if e != UNKNOWN) for row in usable]
         self._deck: list[int] = []
-        self._presented = 0
+        self._presented = self._stretches = 0
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = 0.0
 
     def run(self) -> Ending:
         """Run all episodes; whatever goes wrong is an ending, never an exception."""
-        self._zero_s = self._culture.now_s
-        self._data_at_s = self._wall_zero_s = self._clock.now_s()
         try:
+            self._zero_s = self._now_s()
+            self._data_at_s = self._wall_zero_s = self._clock.now_s()
             for episode, turn in enumerate(self._turns):
                 self._run_episode(episode, self._contenders[turn])
                 self.episodes_done = episode + 1
@@ -116,7 +106,7 @@ class Driver:
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         # The first pulse comes as if one had been given at the end of the pause.
-        self._last_pulse_s = self._culture.now_s
+        self._last_pulse_s = self._now_s()
         for iteration in range(loop.robot.episode_limit):
             chosen = self._choose(contender, observation)
             repeats = 0
@@ -134,6 +124,7 @@ class Driver:
 
     def _choose(self, contender: Contender, observation: Float64[np.ndarray, " observations"]) -> int:
         n = len(self._loop.conditions)
+        self._expect(contender.name)
         try:
             chosen = int(contender.controller.act(observation, self._rng))
         except Exception as error:
@@ -146,7 +137,7 @@ class Driver:
         self, contender: Contender, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
     ) -> tuple[Tick, bool]:
         """Present a condition and move the robot by the answer; returns whether to present it once more instead."""
-        loop, culture = self._loop, self._culture
+        loop = self._loop
         frequency_hz = loop.conditions[delivered].value
         due_s = self._last_pulse_s + 1 / frequency_hz
         times_s = self._times(due_s, frequency_hz)
@@ -158,15 +149,15 @@ class Driver:
             ]
         # Two samples more than the window: no spike at its very end can then be seen only in the next stretch.
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
-        handed_over_s = self._clock.now_s()
-        began_s = culture.now_s
+        decided_s = self._clock.now_s() - self._data_at_s
         stretch = self._see(stimuli, duration_s)
         pulse_time_s = stretch.stimulus_time_s
         if not stimuli:
-            pulse_time_s = self._on_samples(began_s - self._zero_s + times_s)
+            pulse_time_s = self._on_samples(stretch.asked_at_s + times_s)
         after_s = pulse_time_s[-1:]
-        # From when it really came; a grid step is the grid's, and a sample's rounding, and not lateness.
-        late_s = float(pulse_time_s[0]) + self._zero_s - due_s
+        # From when they really came; a grid step is the grid's, and a sample's rounding, and not lateness.
+        due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
+        late_s = float(np.max(pulse_time_s - due_at_s))
         late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
         rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
         self._last_pulse_s = self._zero_s + float(after_s[0])
@@ -194,13 +185,12 @@ class Driver:
             "terminated": False,
             "truncated": False,
             "late_s": late_s,
-            "decided_s": handed_over_s - self._data_at_s,
+            "decided_s": decided_s,
         }
         self._presented += 1
         if self._following is not None and stimuli and contender.calibrates and not is_burst:
             self._following.add(delivered, float(rate_hz[0]))
-        self._data_at_s = self._clock.now_s()
-        tick["wall_s"] = self._data_at_s - self._wall_zero_s
+        tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
@@ -209,13 +199,7 @@ class Driver:
         finally:
             # Whatever happens to the robot, what the culture did is written down.
             finished = Tick(**tick)
-            self.records.append(
-                Record(
-                    {"kind": "seen", **_span(stretch), "stimuli": _rows(stimuli), "tick": vars(finished)},
-                    stretch.spike_times_s,
-                    stretch.spike_channels,
-                )
-            )
+            self._note(stretch, stimuli, vars(finished))
         return finished, again
 
     def _move(self, rate_hz: float, is_burst: bool, iteration: int) -> dict[str, Any]:
@@ -224,6 +208,7 @@ class Driver:
         if handled == "used":
             # In float32, as when it was trained: a response that lies on a percentile is then on it here as well.
             self._last_command = float(loop.mapping.command(np.float32(rate_hz), self._percentiles))
+        self._expect("the robot")
         try:
             moved = self._body.step(self._last_command)
         except Exception as error:
@@ -241,7 +226,7 @@ class Driver:
 
     def _times(self, due_s: float, frequency_hz: float) -> Float64[np.ndarray, " pulses"]:
         """When the pulses of a presentation come, counted from now; its first one is due at a time of the culture's."""
-        now_s = self._culture.now_s
+        now_s = self._now_s()
         first_s = max(due_s - now_s, 0.0)
         if self._loop.real_time:
             # A culture that is held back to real time stands still meanwhile: what is missed has to be made up.
@@ -268,34 +253,38 @@ class Driver:
             account.check(stimuli)
         except BudgetSpent as spent:
             raise Stop(Ending("budget", str(spent))) from spent
-        began = time.monotonic()
-        self.expected_by = began + duration_s + self._loop.patience_s
+        asked = Asked(self._stretches, self._now_s() - self._zero_s, tuple(stimuli))
+        self._stretches += 1
+        # Spent from now on: whether pulses that are never answered came is not known.
+        account.spend(stimuli)
+        before, self.under_way = culture.delivered, asked
+        self._expect("the culture", duration_s)
         try:
             observed = culture.deliver(stimuli, duration_s)
         except Exception as error:
+            is_admitted = culture.delivered > before
+            if not is_admitted:
+                account.take_back(stimuli)
             # Whoever stopped the culture ended the session, not the culture's refusal that follows.
             ending = _ending_of(error, culture, self.is_stopped)
-            asked = [float(stimulus.time_s) for stimulus in stimuli]
-            self.records.append(
-                Record({"kind": "event", "what": "culture", "sentence": ending.sentence, "asked_for_s": asked})
-            )
+            self._note_fault(ending, asked, is_admitted=is_admitted)
             raise Stop(ending) from error
-        finally:
-            self.expected_by = float("inf")
-        account.spend(stimuli)
         wrong = wrong_with(
             observed,
-            n_stimuli=len(stimuli),
+            asked_s=np.array([stimulus.time_s for stimulus in stimuli], np.float64),
             duration_s=duration_s,
-            from_s=self._zero_s + self._seen_until_s - 1.5 / self._rate_hz,
+            from_s=self._zero_s + self._seen_until_s,
+            sample_s=1 / self._rate_hz,
             n_channels=len(self._channels),
         )
         if wrong is not None:
-            words = {"kind": "event", "what": "culture", "sentence": wrong, "got": repr(observed)[:2000]}
-            self.records.append(Record(words))
-            raise Stop(Ending("culture", wrong))
+            ending = Ending("culture", wrong)
+            self._note_fault(ending, asked, is_admitted=bool(stimuli), got=repr(observed)[:2000])
+            raise Stop(ending)
         offset_s = observed.start_s - self._zero_s
         stretch = Stretch(
+            asked.stretch,
+            asked.at_s,
             offset_s,
             observed.duration_s,
             self._on_samples(offset_s + observed.spikes.time_s),
@@ -305,16 +294,36 @@ class Driver:
         )
         self._seen_until_s = offset_s + observed.duration_s
         if pause:
-            self.records.append(
-                Record(
-                    {"kind": "seen", **_span(stretch), "stimuli": [], "tick": None},
-                    stretch.spike_times_s,
-                    stretch.spike_channels,
-                )
-            )
+            self._note(stretch, (), None)
         if self._loop.real_time:
-            self._clock.sleep_until(self._wall_zero_s + (culture.now_s - self._zero_s))
+            until_s = self._wall_zero_s + (self._now_s() - self._zero_s)
+            self._expect("the clock", max(0.0, until_s - self._clock.now_s()))
+            self._clock.sleep_until(until_s)
+        self._data_at_s = self._clock.now_s()
         return stretch
+
+    def _note(self, stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> None:
+        """Have what was seen written down."""
+        span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
+        words = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
+        self.records.append(Record(words, stretch.spike_times_s, stretch.spike_channels))
+
+    def _note_fault(self, ending: Ending, asked: Asked, **more: Any) -> None:
+        """Have it written down that what was asked came to no answer that can be used."""
+        words = {"kind": "event", "what": ending.by, "sentence": ending.sentence, **asked.to_dict(), **more}
+        self.records.append(Record(words))
+
+    def _expect(self, who: str, in_s: float = 0.0) -> None:
+        """Say who is waited for, and how long that may take besides patience."""
+        self.expected = time.monotonic() + in_s + self._loop.patience_s, who
+
+    def _now_s(self) -> float:
+        """The culture's clock, which a connection that is lost takes along."""
+        self._expect("the culture")
+        try:
+            return self._culture.now_s
+        except Exception as error:
+            raise Stop(_ending_of(error, self._culture, self.is_stopped)) from error
 
     def _on_samples(self, times_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
         # The same numbers that a recording of the session holds: only then are windows the same to the last bit.
@@ -330,12 +339,3 @@ def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
         return Ending("culture", f"the culture was stopped: {error}")
     lost = "the connection to the culture is lost: " if isinstance(error, OSError) else "the culture raised "
     return Ending("culture", lost + in_words(error))
-
-
-def _span(stretch: Stretch) -> dict[str, float]:
-    return {"start_s": stretch.start_s, "duration_s": stretch.duration_s}
-
-
-def _rows(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
-    """What was stimulated; when is in the tick."""
-    return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]

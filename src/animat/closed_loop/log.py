@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, InvalidFile
+from animat.writing import keep_name
 
 MAGIC = b"ANIMATL1"
 _RECORD = b"REC1"
@@ -63,6 +64,8 @@ class LogWriter:
         try:
             self._write(MAGIC)
             self.append(Record(dict(header)))
+            self.sync()
+            keep_name(path.parent)
         except OSError as error:
             self.close()
             raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error

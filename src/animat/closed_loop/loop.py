@@ -72,7 +72,8 @@ class Loop:
         most_repeats: of one action; the response after that is used.
         on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: observed without a stimulus before each episode.
-        patience_s: how much longer than it should a culture may take to answer before it counts as hung.
+        patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
+            the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
 
     Raises:
@@ -126,6 +127,8 @@ class Loop:
         for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
+        if self.patience_s == 0:
+            raise InvalidArgument("patience_s: expected above 0 s, got 0: nothing answers at once")
         if self.patterns is not None and self.patterns < 1:
             raise InvalidArgument(f"patterns: expected at least 1, got {self.patterns}")
 

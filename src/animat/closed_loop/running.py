@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from animat.closed_loop.answers import in_words
 from animat.closed_loop.contenders import Contender, interleaved
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.log import LogWriter, Record
@@ -29,7 +30,8 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress, Silent
 
 _POLL_S = 0.1
-_SYNC_S = 1.0
+_SYNC_S = 0.5
+"""Between times that the log is put on the disk itself: with polling and writing, a power cut then costs under 1 s."""
 _GRACE_S = 2.0
 """How long the loop's thread gets to come to its end once it was told to."""
 
@@ -48,8 +50,9 @@ def run_session(
 ) -> Session:
     """Run contenders in closed loop on a culture, their episodes interleaved in random order.
 
-    Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, and once this
-    returns, or `recover_session` did its work, `session.nwb` is a recording like any other. Unless the plan was done
+    Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, with what was asked
+    of the culture and not answered yet; and once this returns, or `recover_session` did its work, `session.nwb` is a
+    recording like any other. Unless the plan was done
     or the budget spent, the culture is then stopped: it delivers nothing until it is closed and opened again.
     `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included.
 
@@ -95,6 +98,8 @@ class _Supervisor:
         self._log, self._progress, self._episodes = log, progress, episodes
         self._synced = time.monotonic()
         self._ending: Ending | None = None
+        self._noted = -1
+        self._not_halted: str | None = None
 
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
@@ -128,9 +133,10 @@ class _Supervisor:
                 self._write()
             except OSError as error:
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
-            if time.monotonic() > driver.expected_by:
+            by_s, who = driver.expected
+            if time.monotonic() > by_s and thread.is_alive():
                 return Ending(
-                    "hang", f"the culture did not answer {self._loop.patience_s:g} s after it should have: left alone"
+                    "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: left alone"
                 )
             self._progress.update(driver.episodes_done, self._episodes)
         return None
@@ -143,12 +149,20 @@ class _Supervisor:
             records.popleft()
             # Let the loop's thread have the interpreter: it may have a deadline.
             time.sleep(0)
+        asked = self._driver.under_way
+        if asked is not None and asked.stretch > self._noted:
+            # If the answer never comes, or the program is killed meanwhile, it is known what was asked for.
+            self._log.append(Record({"kind": "asked", **asked.to_dict()}))
+            self._noted = asked.stretch
         if time.monotonic() - self._synced > _SYNC_S:
             self._log.sync()
             self._synced = time.monotonic()
 
     def _finish(self, ending: Ending) -> Ending:
         """Write what is left, and how it ended."""
+        if self._not_halted is not None:
+            sentence = f"{ending.sentence}; BUT {self._not_halted}: see to it that the device gives no more pulses"
+            ending = replace(ending, sentence=sentence)
         try:
             self._write()
             self._log.append(Record({"kind": "end", "by": ending.by, "sentence": ending.sentence}))
@@ -165,14 +179,19 @@ class _Supervisor:
 
     def _halt(self, ending: Ending) -> None:
         """Stop the culture, from a thread of its own: a backend that hangs must not hang the end as well."""
+        self._not_halted = f"the culture did not say within {_GRACE_S:g} s that it is stopped"
         halting = threading.Thread(target=self._halt_now, args=(ending.sentence,), daemon=True)
         halting.start()
         halting.join(_GRACE_S)
 
     def _halt_now(self, reason: str) -> None:
         # The guard refuses every stimulus from here on, whatever the backend does about those under way.
-        with contextlib.suppress(Exception):
+        try:
             self._culture.stop(reason)
+        except Exception as error:
+            self._not_halted = f"the culture could not be stopped ({in_words(error)})"
+        else:
+            self._not_halted = None
 
 
 @contextlib.contextmanager

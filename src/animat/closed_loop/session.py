@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -81,6 +82,18 @@ class Session:
             by_number.setdefault(tick.episode, []).append(tick)
         return tuple(_episode(number, ticks) for number, ticks in sorted(by_number.items()))
 
+    @cached_property
+    def unanswered(self) -> tuple[dict[str, Any], ...]:
+        """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
+        known, and they are in no recording. The words of its record: when, which stimuli."""
+        answered = {r.words.get("stretch") for r in self.log.records if r.words["kind"] == "seen"}
+        found = {
+            r.words["stretch"]: r.words
+            for r in self.log.records
+            if r.words["kind"] in ("asked", "event") and r.words["stretch"] not in answered
+        }
+        return tuple(words for words in found.values() if words["stimuli"] and words.get("is_admitted", True))
+
     def recording(self) -> Recording:
         """The session as a recording: all that was seen, and every pulse as a stimulus of its presentation.
 
@@ -126,6 +139,7 @@ class Session:
                     "closed_loop": json.dumps(header["loop"]),
                     "closed_loop_ended": f"{self.ending.by}: {self.ending.sentence}",
                     "closed_loop_unwatched_s": f"{max(0.0, duration_s - watched_s):.6f}",
+                    "closed_loop_unanswered_pulses": str(_pulses(self.unanswered)),
                 },
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -143,6 +157,7 @@ class Session:
             "bursts": sum(tick.is_burst for tick in self.ticks),
             "late_pulses": sum(ms > 0 for ms in late_ms),
             "latest_ms": max(late_ms, default=0.0),
+            "unanswered_pulses": _pulses(self.unanswered),
             "lost_bytes": self.log.lost_bytes,
         }
 
@@ -174,6 +189,18 @@ def recover_session(path: str | os.PathLike[str]) -> Session:
     session = read_session(path)
     session.recording().save(session.recording_file)
     return session
+
+
+def told_unanswered(session: Session) -> str:
+    """What is to be known of pulses that were never answered, in a sentence."""
+    return (
+        f"{_pulses(session.unanswered)} pulses were asked for and never answered: whether they came is not known; "
+        f"{LOG_FILE} has their times and electrodes"
+    )
+
+
+def _pulses(asked: Sequence[dict[str, Any]]) -> int:
+    return sum(len(words["stimuli"]) for words in asked)
 
 
 def _episode(number: int, ticks: list[Tick]) -> Episode:

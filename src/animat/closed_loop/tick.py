@@ -34,7 +34,7 @@ class Tick:
         observation: after the step.
         terminated: the task ended by itself.
         truncated: the episode limit ended it.
-        late_s: how much later than it should the first pulse came.
+        late_s: how much later than they should its pulses came, the largest; 0 within a step of the grid.
         decided_s: from the end of the response window before, as data were there, until this presentation was handed
             over.
         wall_s: the machine's clock at the end, from the start of the session.
@@ -79,8 +79,8 @@ class Ending:
 
     Attributes:
         by: `"plan"`, all episodes were run; else what ended it before: the budget, a person (Ctrl-C), a fault of the
-            culture, its silence (`"hang"`), a late pulse where that should stop, the robot, the controller, the disk;
-            `"crash"` where nothing was written about it.
+            culture, the silence of whoever should have answered (`"hang"`), a late pulse where that should stop, the
+            robot, the controller, the disk; `"crash"` where nothing was written about it.
         sentence: what happened.
     """
 

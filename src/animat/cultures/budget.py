@@ -81,6 +81,11 @@ class Account:
         self.pulses += len(stimuli)
         self._on.update(_counted(stimuli))
 
+    def take_back(self, stimuli: Sequence[Stimulus]) -> None:
+        """Write stimuli down as not delivered after all: the culture refused them."""
+        self.pulses -= len(stimuli)
+        self._on -= _counted(stimuli)
+
     def to_dict(self) -> dict[str, Any]:
         """What was spent of what, as plain data."""
         return {

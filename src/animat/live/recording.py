@@ -14,6 +14,8 @@ def record_within(
 ) -> Recording:
     """Record by a protocol if the budget holds all of it.
 
+    Of a recording that fails half way, what was handed to the culture until then is spent.
+
     Raises:
         BudgetSpent: if it does not; nothing is delivered then.
         UnsafeStimulus, InvalidArgument: as `Culture.record` does.
@@ -21,6 +23,8 @@ def record_within(
     schedule = culture.schedule(protocol, seed)
     stimuli = [stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)]
     account.check(stimuli)
-    recording = culture.record(protocol, seed, progress)
-    account.spend(stimuli)
-    return recording
+    before = culture.delivered
+    try:
+        return culture.record(protocol, seed, progress)
+    finally:
+        account.spend(stimuli[: culture.delivered - before])

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import Session
+from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
 from animat.evaluation.statistics import Interval
 from animat.recordings.findings import Finding
@@ -136,6 +136,8 @@ class RealityGap:
             f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
             f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"
         )
+        if outline["unanswered_pulses"]:
+            lines.append(f"  {told_unanswered(self.session)}")
         return "\n".join(lines)
 
 
