@@ -1,6 +1,6 @@
 """How fast the virtual culture's tissue runs against real time, with Brian2 on the same equations in the same run.
 
-    python benchmarks/culture.py [--seconds 20] [--repeats 3]
+    python benchmarks/culture.py [--seconds 20] [--repeats 3] [--pairs 60]
 
 Pin it to one core. Brian2 2.9 needs NumPy below 2.4, so install it with animat in an environment of its own to have the
 comparison; where it is absent, that is said and the rest is measured.
@@ -9,6 +9,8 @@ comparison; where it is absent, that is said and the rest is measured.
 from __future__ import annotations
 
 import argparse
+import copy
+import gc
 import os
 import statistics
 import subprocess
@@ -17,12 +19,17 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
+from animat.cultures.virtual import VirtualCulture
+
+Living = TypeVar("Living", Tissue, VirtualCulture)
 
 PIECE_S = 0.0125
+PAIR_S = 2.0
 COLD = "from animat.cultures.tissue import Tissue; Tissue(1).advance(0.001)"
 
 
@@ -38,6 +45,35 @@ def real_time_factor(run: Callable[[float], None], culture_s: float, repeats: in
         processor.append(culture_s / (time.process_time() - began))
         wall.append(culture_s / (time.perf_counter() - began_wall))
     return statistics.median(processor), statistics.median(wall)
+
+
+def piece_us(living: Living, pairs: int) -> tuple[float, float]:
+    """What a piece of 12.5 ms costs, and what a longer piece costs in the same time, in us of processor time.
+
+    The same two seconds are passed in one piece and in pieces, in turns; each figure is the least of all turns.
+    """
+    pieces = round(PAIR_S / PIECE_S)
+    least = {1: np.inf, pieces: np.inf}
+    for _ in range(pairs):
+        for number in least:
+            fresh = copy.deepcopy(living)
+            gc.collect()
+            gc.disable()
+            began = time.process_time()
+            for _ in range(number):
+                fresh.advance(PAIR_S / number)
+            least[number] = min(least[number], time.process_time() - began)
+            gc.enable()
+    return 1e6 * least[pieces] / pieces, 1e6 * least[1] / pieces
+
+
+def compare_pieces(name: str, living: Living, pairs: int) -> None:
+    """Print what cutting time costs."""
+    piece, whole = piece_us(living, pairs)
+    print(
+        f"{name}: a piece of 12.5 ms takes {piece:.1f} us ({PIECE_S * 1e6 / piece:.0f} times real time), as part of a "
+        f"longer one {whole:.1f} us: {piece - whole:.1f} us more, {100 * (piece / whole - 1):.1f} %"
+    )
 
 
 def cold_start_s() -> tuple[float, float]:
@@ -111,6 +147,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
     arguments.add_argument("--seconds", type=float, default=20.0, help="seconds of culture a run")
     arguments.add_argument("--repeats", type=int, default=3)
+    arguments.add_argument("--pairs", type=int, default=60, help="turns in which one piece and many are compared")
     options = arguments.parse_args()
 
     def in_pieces(culture_s: float) -> None:
@@ -129,6 +166,9 @@ def main() -> None:
     ):
         ours[name], wall = real_time_factor(run, options.seconds, options.repeats)
         print(f"animat, {name}: {ours[name]:.0f} times real time in processor time ({wall:.0f} on the wall)")
+    compare_pieces("the tissue", tissue, options.pairs)
+    with VirtualCulture(1) as culture:
+        compare_pieces(f"the culture with its {len(culture.channels)} channels", culture, options.pairs)
     reference = brian2_runs(options.seconds / 4)
     if reference is None:
         print("Brian2 is not installed here: no ratio")

@@ -16,6 +16,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Protocol
 from animat.recordings.recording import Recording
+from animat.recordings.selection import Selection
 from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
 from cultures import FEW, small_culture
 
@@ -145,6 +146,15 @@ def test_the_same_spikes_however_time_is_cut(piece_s: float) -> None:
     np.testing.assert_allclose(np.concatenate(times), expected.spikes.time_s[known], atol=2e-9)
     assert np.array_equal(np.concatenate(channels), expected.spikes.channel[known])
     assert len(np.concatenate(times)) > 50
+
+
+def test_electrodes_that_see_no_neuron_record_nothing(culture: VirtualCulture) -> None:
+    blind = np.setdiff1d(np.arange(MAXONE.columns * MAXONE.rows), culture.visibility.pairs.electrode)[:3]
+    known = culture.selection
+    with small_culture(selection=Selection(known.array, blind, known.stimulation, known.patterns)) as other:
+        observed = other.deliver([stimulus(other, 0.0)], 0.5)
+        assert len(other.fired[0]) > 50
+        assert len(observed.spikes.time_s) == len(observed.spikes.channel) == 0
 
 
 def test_stimulate_and_present_see_what_a_recording_sees() -> None:

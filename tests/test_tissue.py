@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from itertools import pairwise
 from pathlib import Path
@@ -97,6 +98,14 @@ def test_a_snapshot_is_come_back_to() -> None:
     assert_same_spikes(tissue.advance(0.5), expected)
     with pytest.raises(Mismatch, match="snapshot"):
         Tissue(2, SMALL).restore(snapshot)
+
+
+def test_a_copy_is_a_tissue_of_its_own() -> None:
+    tissue = Tissue(1, SMALL)
+    tissue.advance(0.3, [Pulse(0.2999, np.array([700.0]), np.array([500.0]))])
+    other = copy.deepcopy(tissue)
+    expected = tissue.advance(0.5)
+    assert_same_spikes(other.advance(0.5), expected)
 
 
 def test_spikes_are_in_order_and_on_the_clock() -> None:

@@ -20,9 +20,10 @@ from animat.recordings.array import MAXONE
 from animat.recordings.recording import Channels
 from animat.recordings.scan import ScannedActivity
 from animat.recordings.selection import Selection, SelectionRule, select_electrodes
-from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse, Stimulus
 
 if TYPE_CHECKING:
+    from animat.cultures.tissue import Pulse as TissuePulse
     from animat.cultures.tissue import Tissue, TissueParameters
 
 NS = 1_000_000_000
@@ -239,35 +240,33 @@ class VirtualCulture(Culture):
         self._channels = selection.channels
         pairs = self._visibility.pairs_of(selection.recording)
         order = np.lexsort((pairs.electrode, pairs.neuron))
-        self._seen_by = pairs.electrode[order]
         self._n_seen_by = np.bincount(pairs.neuron, minlength=len(self.tissue.x_um))
-        self._first_seen = np.cumsum(self._n_seen_by) - self._n_seen_by
+        # One row a neuron, filled from the left: a delivery of 12.5 ms has time for few array operations.
+        self._is_seen = np.arange(self._n_seen_by.max(initial=0)) < self._n_seen_by[:, None]
+        self._seen_by = np.zeros(self._is_seen.shape, dtype=np.int64)
+        self._seen_by[self._is_seen] = pairs.electrode[order]
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
-        from animat.cultures import tissue as living
-
         start_ns, tissue = self._now_ns, self.tissue
         end_ns = start_ns + round(duration_s * NS)
         tissue_ns = round(tissue.now_s * NS)
-        pulses, stimulus_ns = [], []
-        for stimulus in admitted.stimuli:
-            stimulus_ns.append(round(stimulus.time_s * NS))
-            x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
-            half_um = MAXONE.pitch_um / 2
-            # The tissue may be up to a step ahead; a pulse in the middle of a step acts at its end anyway.
-            time_ns = max(start_ns + stimulus_ns[-1], tissue_ns)
-            pulses.append(living.Pulse(time_ns / NS, x_um + half_um, y_um + half_um, _strength(stimulus.pulse)))
+        stimulus_ns = [round(stimulus.time_s * NS) for stimulus in admitted.stimuli]
+        # The tissue may be up to a step ahead; a pulse in the middle of a step acts at its end anyway.
+        pulses = [
+            self._pulse(stimulus, max(start_ns + since_ns, tissue_ns))
+            for stimulus, since_ns in zip(admitted.stimuli, stimulus_ns, strict=True)
+        ]
         # To the end of the step that the end lies in, so that every spike before the end is known.
         target_ns = -(-end_ns // self._step_ns) * self._step_ns
         if pulses and target_ns <= tissue_ns:
             target_ns = tissue_ns + self._step_ns
+        time_ns_of, neuron = self._held_ns, self._held_neuron
         if target_ns > tissue_ns:
-            spikes = tissue.advance((target_ns - tissue_ns) / NS, pulses)
-            time_ns_of = np.concatenate([self._held_ns, np.rint(spikes.time_s * NS).astype(np.int64)])
-            neuron = np.concatenate([self._held_neuron, spikes.neuron])
-        else:
-            time_ns_of, neuron = self._held_ns, self._held_neuron
-        known = int(np.searchsorted(time_ns_of, end_ns))
+            time_s, fired = tissue.advance((target_ns - tissue_ns) / NS, pulses)
+            fired_ns = np.rint(time_s * NS).astype(np.int64)
+            time_ns_of = np.concatenate((time_ns_of, fired_ns)) if len(time_ns_of) else fired_ns
+            neuron = np.concatenate((neuron, fired)) if len(neuron) else fired
+        known = int(time_ns_of.searchsorted(end_ns))
         self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
         self._now_ns = end_ns
         self._fired = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
@@ -278,12 +277,18 @@ class VirtualCulture(Culture):
             stimulus_time_s=np.array(stimulus_ns, dtype=np.float64) / NS,
         )
 
+    @staticmethod
+    def _pulse(stimulus: Stimulus, time_ns: int) -> TissuePulse:
+        """A stimulus as the tissue takes it."""
+        from animat.cultures.tissue import Pulse as TissuePulse
+
+        x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
+        half_um = MAXONE.pitch_um / 2
+        return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, _strength(stimulus.pulse))
+
     def _on_channels(self, time_s: Float64[np.ndarray, " spikes"], neuron: Int64[np.ndarray, " spikes"]) -> Spikes:
         """Every spike once on each channel that sees its neuron."""
-        copies = self._n_seen_by[neuron]
-        place = np.arange(copies.sum()) - np.repeat(np.cumsum(copies) - copies, copies)
-        channel = self._seen_by[np.repeat(self._first_seen[neuron], copies) + place]
-        return Spikes(np.repeat(time_s, copies), channel)
+        return Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]])
 
     def _rest(self, duration_s: float) -> None:
         self._now_ns += round(duration_s * NS)

@@ -21,16 +21,23 @@ class Fatigue:
     def __init__(self, seed: int, parameters: TissueParameters) -> None:
         self._parameters = parameters
         self._draws = np.random.default_rng([seed, 2])
-        self._drift = [0.0]
+        self._kept = float(np.exp(-MARK_S / (60 * parameters.drift_min)))
+        self._drift = 0.0
+        self._gains: list[float] = []
 
     def gain(self, mark: int) -> float:
         """The factor on all excitatory weights from `mark` to the next, marks being `MARK_S` apart."""
-        parameters = self._parameters
-        kept = float(np.exp(-MARK_S / (60 * parameters.drift_min)))
-        # Every mark takes one draw, in order: the drift is one function of time, however time is passed.
-        while len(self._drift) <= mark:
-            draw = self._draws.standard_normal() * parameters.drift_share * np.sqrt(1 - kept**2)
-            self._drift.append(self._drift[-1] * kept + float(draw))
+        while len(self._gains) <= mark:
+            self._gains.append(self._next())
+        return self._gains[mark]
+
+    def _next(self) -> float:
+        """The gain after those that are known."""
+        mark, parameters = len(self._gains), self._parameters
+        if mark:
+            # Every mark takes one draw, in order: the drift is one function of time, however time is passed.
+            draw = self._draws.standard_normal() * parameters.drift_share * np.sqrt(1 - self._kept**2)
+            self._drift = self._drift * self._kept + float(draw)
         minutes = mark * MARK_S / 60
         lost = parameters.fatigue_share * (1 - np.exp(-minutes / parameters.fatigue_min))
-        return float(max(0.0, 1 - lost + self._drift[mark]))
+        return float(max(0.0, 1 - lost + self._drift))

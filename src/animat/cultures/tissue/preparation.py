@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from animat.cultures.tissue import kernel
 from animat.cultures.tissue.network import Network
@@ -68,11 +68,11 @@ def nmda_block(v_mv: Float64[np.ndarray, " potentials"]) -> Float64[np.ndarray, 
     return 1 / (1 + np.exp(-0.062 * v_mv) / 3.57)
 
 
-def block_polynomial() -> tuple[np.float32, ...]:
+def block_polynomial() -> Float32[np.ndarray, " coefficients"]:
     """The coefficients of B(V) in y = (V - middle) / half, constant term first, through the Chebyshev nodes."""
     y = np.cos(np.pi * (np.arange(BLOCK_DEGREE + 1) + 0.5) / (BLOCK_DEGREE + 1))
     coefficients = np.polynomial.polynomial.polyfit(y, nmda_block(BLOCK_MIDDLE_MV + BLOCK_HALF_MV * y), BLOCK_DEGREE)
-    return tuple(np.float32(coefficient) for coefficient in coefficients)
+    return coefficients.astype(np.float32)
 
 
 def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> kernel.Wiring:

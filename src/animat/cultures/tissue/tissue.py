@@ -33,6 +33,9 @@ class Spikes(NamedTuple):
     neuron: Int64[np.ndarray, " spikes"]
 
 
+NO_SPIKES = Spikes(np.empty(0), np.empty(0, np.int64))
+
+
 @dataclass(frozen=True, eq=False)
 class Snapshot:
     """The state of a tissue at one time, made by `Tissue.snapshot`, for tissues of the same seed and parameters."""
@@ -68,10 +71,12 @@ class Tissue:
         self._network = grow(seed, self.parameters)
         self._coupling = Coupling(seed, self.parameters, self._network)
         self._fatigue = Fatigue(seed, self.parameters)
-        self._constants = prepare_constants(self.parameters)
+        self._constants = kernel.packed(prepare_constants(self.parameters))
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
         self._state = fresh_state(seed, self.parameters, self._network, self._wiring)
+        self._run = self._constants, tuple(self._wiring), tuple(self._state)
         self._step_ns = round(self.parameters.step_ms * 1e6)
+        self._step_s = self._step_ns / NS
         self._now_ns = 0
         self._step = 0
         self._kicks = NO_KICKS
@@ -113,19 +118,17 @@ class Tissue:
             InvalidArgument: for a negative duration, or a pulse outside this stretch of time; nothing has then passed.
         """
         end_ns = self._now_ns + _nanoseconds("duration_s", duration_s)
-        new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
-        if new:
+        if pulses:
+            new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
             self._kicks = in_order(self._kicks, *new)
         self._now_ns = end_ns
         last_step = end_ns // self._step_ns
-        steps, neurons = [], []
+        parts = []
         while self._step < last_step:
             mark = self._step * self._step_ns // (MARK_S * NS)
             mark_end = -(-(mark + 1) * MARK_S * NS // self._step_ns)
             taken, passed, spikes = kernel.advance(
-                self._constants,
-                self._wiring,
-                self._state,
+                *self._run,
                 self._step,
                 min(last_step, mark_end) - self._step,
                 self._fatigue.gain(mark),
@@ -136,11 +139,9 @@ class Tissue:
             self._step += taken
             if passed:
                 self._kicks = Kicks(*(column[passed:] for column in self._kicks))
-            steps.append(self._spike_step[:spikes].copy())
-            neurons.append(self._spike_neuron[:spikes].copy())
-        if not steps:
-            return Spikes(np.empty(0), np.empty(0, np.int64))
-        return Spikes(np.concatenate(steps) * (self._step_ns / NS), np.concatenate(neurons))
+            parts.append(Spikes(self._spike_step[:spikes] * self._step_s, self._spike_neuron[:spikes].copy()))
+        # Mostly one: joining it with nothing costs 1 % of what 12.5 ms do.
+        return parts[0] if len(parts) == 1 else Spikes(*map(np.concatenate, zip(NO_SPIKES, *parts, strict=True)))
 
     def rest(self, duration_s: float) -> None:
         """Let time pass in closed form: without stepping, without a stimulus, and as if no neuron spiked.
@@ -161,7 +162,7 @@ class Tissue:
         steps = self._now_ns // self._step_ns - self._step
         if steps == 0:
             return
-        parameters, constants, state = self.parameters, self._constants, self._state
+        parameters, state = self.parameters, self._state
         rested_ms = float(steps) * parameters.step_ms
         for values, time_constant_ms in (
             (state.ampa, parameters.ampa_ms),
@@ -176,7 +177,7 @@ class Tissue:
         spread_mv = parameters.noise_mv * np.sqrt(1 - kept**2)
         mean_mv = self._wiring.drive_mv
         state.drive_mv[:] = mean_mv + (state.drive_mv - mean_mv) * kept + spread_mv * rng.standard_normal(len(mean_mv))
-        state.v_mv[:] = np.minimum(constants.leak_mv + state.drive_mv, constants.reset_mv)
+        state.v_mv[:] = np.minimum(np.float32(parameters.leak_mv) + state.drive_mv, np.float32(parameters.reset_mv))
         state.refractory[:] = np.maximum(state.refractory - steps, 0)
         for ring in (state.arriving_ampa, state.arriving_nmda, state.arriving_gaba):
             ring[:] = 0
@@ -201,6 +202,7 @@ class Tissue:
                 "other parameters: make a tissue with those"
             )
         self._state = kernel.State(*(values.copy() for values in snapshot.state))
+        self._run = self._constants, tuple(self._wiring), tuple(self._state)
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
 
     def _kicks_of(self, pulse: Pulse, end_ns: int) -> Kicks:
