@@ -17,9 +17,10 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
-from animat.recordings.detection.settings import Detection
+from animat.recordings.detection.noise import median_noise_uv
+from animat.recordings.detection.settings import Detection, Engine
 from animat.recordings.detection.troughs import find_troughs
-from animat.recordings.raw import ArrayTraces
+from animat.recordings.raw import ArrayTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.recordings.spikes_of_traces import read_traces
 from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
@@ -95,14 +96,17 @@ def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
     assert len(both) >= len(whole.time_s) - 3
 
 
+@pytest.mark.parametrize("band_hz", [(100.0, 3000.0), (40.0, 2000.0), None])
 def test_spikeinterface_and_scipy_find_the_same_spikes(
-    known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]],
+    known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]], band_hz: tuple[float, float] | None
 ) -> None:
     pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
-    ours = find_spikes(known[0], np.arange(0.05, 4, 0.2), SCIPY)
-    theirs = find_spikes(known[0], np.arange(0.05, 4, 0.2), Detection(engine="spikeinterface"))
-    assert theirs.engine == "SpikeInterface"
+    stimuli = np.arange(0.05, 4, 0.2)
+    ours = find_spikes(known[0], stimuli, Detection(engine="scipy", band_hz=band_hz))
+    theirs = find_spikes(known[0], stimuli, Detection(engine="spikeinterface", band_hz=band_hz))
+    assert (ours.engine, theirs.engine) == ("scipy", "SpikeInterface")
     sets = [set(zip(np.rint(f.time_s * RATE_HZ).tolist(), f.channel.tolist(), strict=True)) for f in (ours, theirs)]
+    assert len(sets[0]) > 1000
     assert len(sets[0] ^ sets[1]) <= 0.01 * len(sets[0])
 
 
@@ -141,6 +145,49 @@ def test_troughs_are_those_of_the_definition(steps: list[int], apart: int, depth
     assert set(row.tolist()) <= {0}
 
 
+def test_troughs_by_spikeinterface_are_those_of_the_definition() -> None:
+    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
+    from animat.recordings.detection import with_spikeinterface
+
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        # Whole numbers, so that many are equal; all of the trace, and a part of it.
+        trace = rng.integers(-9, 4, (3, 80)).astype(np.float32)
+        depth, apart = np.array([2, np.inf, 6], np.float32), int(rng.integers(1, 8))
+        for first, last in ((0, 80), (20, 50)):
+            expected = set(
+                zip(*(found.tolist() for found in find_troughs(trace, depth, apart, first, last)), strict=True)
+            )
+            got = with_spikeinterface.find_troughs(trace, depth, apart, first, last)
+            assert set(zip(*(found.tolist() for found in got), strict=True)) == expected
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    samples=st.integers(0, 600),
+    n=st.integers(1, 150),
+    kind=st.sampled_from(["<i2", "<u2", ">i2", "f4", "f8"]),
+    turned=st.booleans(),
+)
+def test_traces_are_the_same_in_any_layout(samples: int, n: int, kind: str, turned: bool) -> None:
+    steps = np.random.default_rng(samples).integers(0, 3000, (samples, n)).astype(kind)
+    given_steps = np.asfortranarray(steps) if turned else steps
+    voltage = in_microvolts(given_steps, 0.195)
+    np.testing.assert_array_equal(voltage, steps.astype(np.float32) * np.float32(0.195))
+    assert voltage.dtype == np.float32
+    assert voltage.T.flags.c_contiguous
+
+
+@pytest.mark.parametrize("samples", [2499, 2500, 7001])
+def test_the_noise_is_told_by_the_median(samples: int) -> None:
+    voltage = np.random.default_rng(2).normal(3, 5, (4, samples)).astype(np.float32)
+    looked_at = voltage[:, :: max(samples // 2500, 1)]
+    middle = np.median(looked_at, axis=1, keepdims=True)
+    expected = np.median(np.abs(looked_at - middle), axis=1) / 0.6745
+    # Of an even number of values, the upper of the two middle ones instead of their mean.
+    np.testing.assert_allclose(median_noise_uv(voltage), expected, rtol=1e-6 if looked_at.shape[1] % 2 else 2e-3)
+
+
 # --- artefacts -------------------------------------------------------------------------------------------------------
 
 
@@ -162,9 +209,14 @@ def in_window(
     return (since_ms >= window_ms[0]) & (since_ms < window_ms[1])
 
 
-def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, ArrayTraces]) -> None:
+@pytest.mark.parametrize("engine", ["scipy", "spikeinterface"])
+def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(
+    stimulated: tuple[Traces, ArrayTraces], engine: Engine
+) -> None:
+    if engine == "spikeinterface":
+        pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
     traces, source = stimulated
-    found = find_spikes(source, traces.stimulus_time_s, SCIPY)
+    found = find_spikes(source, traces.stimulus_time_s, Detection(engine=engine))
     large = (traces.amplitude_uv > 8 * 2.4) & in_window(traces.spikes.time_s, traces.stimulus_time_s, (2, 10))
     kept = in_window(found.time_s, traces.stimulus_time_s, (2, 10))
     true_s, true_channel = traces.spikes.time_s, traces.spikes.channel

@@ -15,6 +15,7 @@ one time after stimuli, and said there (`animat.neurons.timing_quality`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -174,9 +175,8 @@ def _fitted(
     """
     best = np.full(len(trace_uv), np.inf)
     a, b, k = (np.zeros(len(trace_uv)) for _ in range(3))
-    for rate in 1 / np.array(TAUS_MS):
-        basis = np.column_stack([np.exp(-rate * t_ms), np.ones(len(t_ms))])
-        of_rate = np.linalg.pinv(basis) @ trace_uv.T
+    for rate, basis, inverse in _starts(len(t_ms), float(t_ms[:2].max())):
+        of_rate = inverse @ trace_uv.T
         error = np.median(np.abs(trace_uv - (basis @ of_rate).T), axis=1)
         better = error < best
         best[better], a[better], b[better], k[better] = error[better], of_rate[0, better], of_rate[1, better], rate
@@ -186,11 +186,19 @@ def _fitted(
         residual = trace_uv - a[:, None] * shape - b[:, None]
         limit = np.maximum(4 * noise_uv, 3 * np.median(np.abs(residual), axis=1))[:, None]
         residual = np.clip(residual, -limit, limit)
-        jacobian = np.stack([shape, -a[:, None] * t_ms * shape, np.ones_like(shape)], axis=2)
-        normal = np.einsum("rsi,rsj->rij", jacobian, jacobian)
+        jacobian = np.stack([shape, -a[:, None] * t_ms * shape, np.ones_like(shape)], axis=1)
+        normal = jacobian @ jacobian.transpose(0, 2, 1)
         # A little of the diagonal keeps it solvable where a row has no exponential at all.
         normal += 1e-9 * np.einsum("rii->ri", normal)[:, :, None] * np.eye(3) + 1e-12 * np.eye(3)
-        step = np.linalg.solve(normal, np.einsum("rsi,rs->ri", jacobian, residual)[:, :, None])[:, :, 0]
+        step = np.linalg.solve(normal, jacobian @ residual[:, :, None])[:, :, 0]
         a, b = a + step[:, 0], b + step[:, 2]
         k = np.clip(k + np.clip(step[:, 1], -0.5 * k, 0.5 * k), slowest, fastest)
     return np.asarray(a[:, None] * np.exp(-k[:, None] * t_ms))
+
+
+@lru_cache(maxsize=32)
+def _starts(samples: int, step_ms: float) -> list[tuple[float, Float64[np.ndarray, "samples 2"], np.ndarray]]:
+    """Of each k that the fit starts from: k, exp(-k t) and 1 at every sample, and the pseudoinverse of these."""
+    t_ms = np.arange(samples) * step_ms
+    bases = [(1 / tau, np.column_stack([np.exp(-t_ms / tau), np.ones(samples)])) for tau in TAUS_MS]
+    return [(rate, basis, np.linalg.pinv(basis)) for rate, basis in bases]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections import deque
 from collections.abc import Iterator
@@ -12,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
+from animat.recordings.detection.band import MARGIN_S, check_band
+from animat.recordings.detection.engines import SCIPY, Steps, steps_of
 from animat.recordings.detection.noise import median_noise_uv
 from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
 from animat.recordings.detection.settings import Detection
-from animat.recordings.detection.troughs import find_troughs
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
 
@@ -75,25 +73,17 @@ def find_spikes(
     settings, progress = settings or Detection(), progress or Silent()
     if settings.band_hz is not None:
         check_band(settings.band_hz, traces.sampling_rate_hz)
-    installed = importlib.util.find_spec("spikeinterface") is not None
-    if settings.engine == "spikeinterface" and not installed:
-        raise InvalidArgument("engine: expected an installed package, got spikeinterface: pip install 'animat[raw]'")
+    steps = steps_of(settings.engine)
     stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
     workers = workers or len(os.sched_getaffinity(0))
     noise_uv = _noise_uv(traces, stimulus, settings, workers)
-    use_spikeinterface = settings.engine == "spikeinterface" or (settings.engine == "auto" and installed)
-    if use_spikeinterface:
-        from animat.recordings.detection.with_spikeinterface import detect
-
-        sample, channel, saturation = detect(traces, stimulus, noise_uv, settings, workers, progress)
-    else:
-        sample, channel, saturation = _detect(traces, stimulus, noise_uv, settings, workers, progress)
+    sample, channel, saturation = _detect(traces, stimulus, noise_uv, settings, steps, workers, progress)
     order = np.lexsort((channel, sample))
     return FoundSpikes(
         time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
-        engine="SpikeInterface" if use_spikeinterface else "scipy",
+        engine=steps.name,
         findings=tuple(_findings(noise_uv, len(stimulus), saturation, settings)),
     )
 
@@ -129,8 +119,7 @@ def _noise_uv(
         found = np.zeros(channels, np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
-            rows = np.ascontiguousarray(piece.voltage_uv[:, columns].T)
-            first = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin])
+            first = median_noise_uv(_filtered(piece.rows(columns), settings, rate_hz)[:, margin:-margin])
             if len(piece.stimulus):
                 rough = np.zeros(channels, np.float32)
                 rough[columns] = first
@@ -146,11 +135,11 @@ def _noise_uv(
 
 
 def _filtered(
-    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float
+    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float, steps: Steps = SCIPY
 ) -> Float32[np.ndarray, "channels samples"]:
     if settings.band_hz is None:
         return np.asarray(rows - np.median(rows, axis=1, keepdims=True), dtype=np.float32)
-    return band_pass(rows, settings.band_hz, rate_hz)
+    return steps.band_pass(rows, settings.band_hz, rate_hz)
 
 
 def _detect(
@@ -158,6 +147,7 @@ def _detect(
     stimulus: Int64[np.ndarray, " stimuli"],
     noise_uv: Float32[np.ndarray, " channels"],
     settings: Detection,
+    steps: Steps,
     workers: int,
     progress: Progress,
 ) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray]:
@@ -170,7 +160,8 @@ def _detect(
     def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         found = [
-            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings) for columns in blocks(len(noise_uv))
+            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings, steps)
+            for columns in blocks(len(noise_uv))
         ]
         saturation = np.zeros((np.count_nonzero(piece.owned), 2))
         for _, _, of_block in found:
@@ -209,12 +200,13 @@ def _of_block(
     apart: int,
     rate_hz: float,
     settings: Detection,
+    steps: Steps,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cleaned = piece.cleaned(columns, noise_uv, rate_hz, settings)
-    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz, steps)
     if cleaned.is_blank is not None:
         filtered[cleaned.is_blank] = 0.0
-    row, sample = find_troughs(
+    row, sample = steps.find_troughs(
         filtered, depth_uv[columns], apart, piece.margin, piece.margin + piece.stop - piece.start
     )
     saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]

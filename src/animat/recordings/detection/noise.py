@@ -27,5 +27,11 @@ def median_noise_uv(
             voltage_uv = voltage_uv[:, kept]
     # Neighbouring samples of a filtered trace say the same: every few of them tell as much.
     voltage_uv = voltage_uv[:, :: max(voltage_uv.shape[1] // SAMPLES, 1)]
-    middle = np.median(voltage_uv, axis=1, keepdims=True)
-    return np.asarray(np.median(np.abs(voltage_uv - middle), axis=1) / NORMAL, dtype=np.float32)
+    return np.asarray(_median(np.abs(voltage_uv - _median(voltage_uv)[:, None])) / NORMAL, dtype=np.float32)
+
+
+def _median(values: Float32[np.ndarray, "rows values"]) -> Float32[np.ndarray, " rows"]:
+    """Of each row; of the two middle values of an even number, the upper one: one partition, where numpy's takes three,
+    and several times as long."""
+    middle = values.shape[1] // 2
+    return np.asarray(np.partition(values, middle, axis=1)[:, middle], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Raw traces in pieces, each with a margin on both sides and without artefacts: what both engines filter."""
+"""Raw traces in pieces, each with a margin on both sides and without artefacts: what is filtered."""
 
 from __future__ import annotations
 
@@ -39,8 +39,15 @@ class Piece:
         self, columns: slice, noise_uv: Float32[np.ndarray, " channels"], rate_hz: float, settings: Detection
     ) -> Cleaned:
         """Some of its channels without artefacts, one a row; `noise_uv` is of all channels."""
-        rows = np.ascontiguousarray(self.voltage_uv[:, columns].T)
+        rows = self.rows(columns)
+        if len(self.stimulus):
+            # What removes artefacts changes what it is given.
+            rows = rows.copy()
         return without_artefacts(rows, self.stimulus, noise_uv[columns], rate_hz, settings)
+
+    def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
+        """Some of its channels as they were recorded, one a row; not to be changed."""
+        return np.ascontiguousarray(self.voltage_uv[:, columns].T)
 
 
 def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start: int, stop: int, margin: int) -> Piece:

@@ -21,6 +21,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.columns import PlainColumns
 from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
 from animat.recordings.formats.hdf5 import first_line
+from animat.recordings.raw import in_microvolts
 from animat.recordings.recording import Channels, Recording
 
 MISSING = "expected the package SpikeInterface, which is not installed: pip install 'animat[raw]'"
@@ -53,9 +54,8 @@ class SpikeInterfaceTraces:
     def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
         """The voltage of samples `start` to `stop`."""
         has_scale = self.recording.has_scaleable_traces()
-        return np.asarray(
-            self.recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale),
-            dtype=np.float32,
+        return in_microvolts(
+            self.recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale), 1.0
         )
 
 
