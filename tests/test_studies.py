@@ -42,7 +42,7 @@ from animat.studies.plan import plan_study
 from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
 from animat.studies.simulating import Fit, load_timeline
-from animat.studies.specification import Body, Compared, Condition, Culture, Simulators, Study
+from animat.studies.specification import Body, Compared, Simulators, Source, Study, StudyCondition
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import Policy
 
@@ -143,7 +143,7 @@ def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) ->
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     made = tmp_path / "made"
     write_made_up_series(1, made, sessions=2, patterns=5, channels=16)
-    study = Study(culture=Culture("files", files=("made",)), robots=(Body("navigation", iterations=100),))
+    study = Study(culture=Source("files", files=("made",)), robots=(Body("navigation", iterations=100),))
     with pytest.raises(AnimatError, match="halted"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
     make_up_recording(2, start_min=0.0, patterns=5, channels=16).save(sorted(made.glob("*.nwb"))[0])
@@ -373,7 +373,7 @@ def test_jobs_come_after_what_they_need_and_long_chains_first() -> None:
 
 
 def test_every_need_of_a_plan_is_a_job_of_it() -> None:
-    for study in (paper_study(), read_study(TINY), Study(conditions=(Condition("direct", mapping="none"),))):
+    for study in (paper_study(), read_study(TINY), Study(conditions=(StudyCondition("direct", mapping="none"),))):
         jobs = in_order(plan_study(study, Path()))
         names = [job.name for job in jobs]
         assert len(set(names)) == len(names)
@@ -405,7 +405,7 @@ class HereAndNow(Executor):
 
 def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
     write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
-    study = Study(culture=Culture("files", files=("made",)), simulators=Simulators(kind="empirical"))
+    study = Study(culture=Source("files", files=("made",)), simulators=Simulators(kind="empirical"))
     folder = tmp_path / "study"
     copies = Record(tmp_path).run(study, folder, lambda share, words: None)
     assert [path.name for path in copies] == ["recording_0000_min.nwb", "recording_0030_min.nwb"]
@@ -426,8 +426,8 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
     write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     study = replace(
         read_study(TINY),
-        culture=Culture("files", files=("made",)),
-        conditions=(Condition("held", percentiles="first"),),
+        culture=Source("files", files=("made",)),
+        conditions=(StudyCondition("held", percentiles="first"),),
         comparisons=(),
         policies=1,
         paper=False,

@@ -18,7 +18,7 @@ from animat.studies.jobs import Report, Task
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, episodes_file, policies_folder, write_table
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Condition, Study
+from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.training import training_of
 from animat.training.policy import Policy
 
@@ -31,7 +31,7 @@ class Evaluate(Task):
     """Run a condition's policies at the minutes of its comparisons, at every recording, and once for their paths."""
 
     body: Body
-    condition: Condition
+    condition: StudyCondition
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
@@ -76,7 +76,7 @@ class Control(Task):
     """
 
     body: Body
-    plain: Condition
+    plain: StudyCondition
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
@@ -145,7 +145,7 @@ class Setting:
         return roll_out(self.environment, self.simulator(at_min), actor, n, episodes=episodes, seed=seed)
 
 
-def setting_of(study: Study, body: Body, condition: Condition, timeline: SimulatorTimeline | None) -> Setting:
+def setting_of(study: Study, body: Body, condition: StudyCondition, timeline: SimulatorTimeline | None) -> Setting:
     """What a condition's policies are evaluated in."""
     training = training_of(study, body, condition)
     if not condition.through_neurons or timeline is None:
@@ -157,7 +157,7 @@ def setting_of(study: Study, body: Body, condition: Condition, timeline: Simulat
     return Setting(training.environment(len(timeline.conditions)), timeline, labels)
 
 
-def is_usual(condition: Condition) -> bool:
+def is_usual(condition: StudyCondition) -> bool:
     """Whether its policies are trained, and get what they choose."""
     return condition.trained and condition.delivery == "chosen" and condition.through_neurons
 
@@ -172,7 +172,7 @@ def draw_seed(*names: object) -> int:
     return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
 
 
-def _networks(study: Study, folder: Path, body: Body, condition: Condition) -> Networks:
+def _networks(study: Study, folder: Path, body: Body, condition: StudyCondition) -> Networks:
     out = policies_folder(folder, body, condition)
     policies = [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
     return networks_of(policies, greedy=study.actions == "most probable")

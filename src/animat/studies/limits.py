@@ -11,7 +11,7 @@ from animat.studies.evaluating import last_minute, setting_of
 from animat.studies.jobs import Report, Task
 from animat.studies.places import TIMELINE, limits_file, write_table
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Condition, Study
+from animat.studies.specification import Body, Study, StudyCondition
 
 HEAD = (
     "mapping",
@@ -29,11 +29,11 @@ ROUGH = 0.5
 """Steps of the grid along each axis where every recording has its limit, as a part of those elsewhere."""
 
 
-def kinds_of(study: Study) -> list[Condition]:
+def kinds_of(study: Study) -> list[StudyCondition]:
     """One condition for each mapping and way to hold percentiles, delivered as chosen: each has a limit of its own."""
-    kinds: dict[tuple[str, str], Condition] = {}
+    kinds: dict[tuple[str, str], StudyCondition] = {}
     for condition in study.conditions:
-        limit = Condition("limit", mapping=condition.mapping, percentiles=condition.percentiles)
+        limit = StudyCondition("limit", mapping=condition.mapping, percentiles=condition.percentiles)
         kinds.setdefault((condition.mapping, condition.percentiles), limit)
     return list(kinds.values())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from animat.studies.specification import Body, Compared, Condition, Culture, Study
+from animat.studies.specification import Body, Compared, Source, Study, StudyCondition
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ PRINTED: dict[tuple[str, str], Printed] = {
 """By the comparison's and the robot's name. Source: Sawada et al. 2022, its table of comparisons."""
 
 CONDITIONS = (
-    Condition("before training", trained=False),
-    Condition("1 threshold"),
-    Condition("9 thresholds", mapping="9-thresholds"),
-    Condition("control", delivery="shuffled"),
-    Condition("without shadowing", shadowing=False),
-    Condition("linear", mapping="linear"),
-    Condition("without neurons", mapping="none"),
+    StudyCondition("before training", trained=False),
+    StudyCondition("1 threshold"),
+    StudyCondition("9 thresholds", mapping="9-thresholds"),
+    StudyCondition("control", delivery="shuffled"),
+    StudyCondition("without shadowing", shadowing=False),
+    StudyCondition("linear", mapping="linear"),
+    StudyCondition("without neurons", mapping="none"),
 )
 
 COMPARISONS = (
@@ -56,7 +56,7 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
     if not quick:
         return Study(
             title="The paper's study on a virtual culture",
-            culture=Culture(seed=culture_seed),
+            culture=Source(seed=culture_seed),
             # On navigation's grid 0.6 of the steps leave an error of a hundredth.
             robots=(Body("cartpole"), Body("navigation", limit_resolution=0.6)),
             conditions=CONDITIONS,
@@ -66,7 +66,7 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
         )
     return Study(
         title="The paper's study on a virtual culture, in short",
-        culture=Culture(seed=culture_seed, sessions=8, interval_min=20.0),
+        culture=Source(seed=culture_seed, sessions=8, interval_min=20.0),
         robots=(Body("cartpole", iterations=60_000), Body("navigation", iterations=60_000)),
         conditions=CONDITIONS,
         comparisons=COMPARISONS,

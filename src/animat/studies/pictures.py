@@ -31,7 +31,7 @@ from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
 from animat.studies.places import RECORDINGS, TIMELINE, episodes_file, limits_file, read_table, table_file
 from animat.studies.simulating import load_timeline, read_series
-from animat.studies.specification import Body, Condition, Study
+from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.tabulating import References, controls_file, performances
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def _controls(study: Study, folder: Path, body: Body, known: References, last: f
     return panels
 
 
-def _paths(folder: Path, body: Body, condition: Condition) -> list[tuple[np.ndarray, list[float]]]:
+def _paths(folder: Path, body: Body, condition: StudyCondition) -> list[tuple[np.ndarray, list[float]]]:
     """Observations and commands of each policy's episode."""
     of_actor: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in read_table(episodes_file(folder, body.name, f"{condition.slug}-paths")):

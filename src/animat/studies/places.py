@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.studies.specification import Body, Condition
+from animat.studies.specification import Body, StudyCondition
 from animat.writing import written_whole
 
 RECORDINGS = "recordings"
@@ -19,7 +19,7 @@ UNFINISHED = ".unfinished"
 """For checkpoints; gone when the study is finished."""
 
 
-def policies_folder(folder: Path, body: Body, condition: Condition) -> Path:
+def policies_folder(folder: Path, body: Body, condition: StudyCondition) -> Path:
     """Of the policies of a condition on a robot."""
     return folder / "policies" / body.name / condition.slug
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from animat.studies.jobs import Job
-from animat.studies.specification import Body, Condition, Study
+from animat.studies.specification import Body, Study, StudyCondition
 
 ITERATIONS_PER_S = 110_000
 """Of training on one core, all policies of a group together; only the order of jobs and the time left rest on it."""
@@ -83,7 +83,7 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
     return jobs
 
 
-def plain_condition(study: Study, kind: Condition) -> Condition:
+def plain_condition(study: Study, kind: StudyCondition) -> StudyCondition:
     """Of the conditions with a mapping, the one trained most plainly: its policies stand for the mapping."""
     same = [c for c in study.conditions if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
     return max(same, key=lambda c: (c.trained, c.delivery == "chosen", c.shadowing))

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from animat.errors import AnimatError, InvalidFile
-from animat.neurons.conditions import Condition as Stimulus
-from animat.neurons.conditions import conditions_named
+from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.responses import Responses
 from animat.neurons.series import extract_series
@@ -105,7 +104,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
     try:
         data = path.read_bytes()
         told: dict[str, Any] = json.loads(_metadata(data)["animat"])
-        conditions = tuple(Stimulus(**each) for each in told["conditions"])
+        conditions = tuple(Condition(**each) for each in told["conditions"])
         labels = tuple(condition.label for condition in conditions)
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)

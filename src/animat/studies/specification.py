@@ -59,7 +59,7 @@ def _positive(name: str, value: float) -> None:
 
 
 @dataclass(frozen=True)
-class Culture:
+class Source:
     """Where the recordings come from: files, or a culture that is recorded for the study.
 
     Attributes:
@@ -145,7 +145,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Condition:
+class StudyCondition:
     """One way to train policies, on each robot.
 
     Attributes:
@@ -228,10 +228,10 @@ class Study:
     """
 
     title: str = "Study"
-    culture: Culture = field(default_factory=Culture)
+    culture: Source = field(default_factory=Source)
     simulators: Simulators = field(default_factory=Simulators)
     robots: tuple[Body, ...] = (Body("cartpole"), Body("navigation"))
-    conditions: tuple[Condition, ...] = (Condition("1 threshold"),)
+    conditions: tuple[StudyCondition, ...] = (StudyCondition("1 threshold"),)
     comparisons: tuple[Compared, ...] = ()
     policies: int = 10
     seed: int = 1
@@ -266,11 +266,11 @@ class Study:
         if self.algorithm:
             _check_algorithm(self.algorithm)
 
-    def condition(self, name: str) -> Condition:
+    def condition(self, name: str) -> StudyCondition:
         """The condition of this name."""
         return next(condition for condition in self.conditions if condition.name == name)
 
-    def minutes_of(self, condition: Condition, last_min: float) -> dict[float, int]:
+    def minutes_of(self, condition: StudyCondition, last_min: float) -> dict[float, int]:
         """Minutes that a condition is evaluated at for comparisons, and in how many episodes; the last at least."""
         minutes: dict[float, int] = {}
         for compared in self.comparisons:

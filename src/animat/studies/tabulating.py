@@ -20,7 +20,7 @@ from animat.studies.paper import PRINTED
 from animat.studies.places import TIMELINE, episodes_file, limits_file, policies_folder, read_table, table_file
 from animat.studies.places import write_table as write
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Condition, Study
+from animat.studies.specification import Body, Study, StudyCondition
 from animat.training.policy import Policy
 
 LEVEL = 0.01
@@ -128,15 +128,15 @@ class References:
             for at_min, returns in of_minute.items():
                 self._random[kind.mapping, kind.percentiles, at_min] = float(np.mean(returns))
 
-    def random(self, condition: Condition, at_min: float) -> float | None:
+    def random(self, condition: StudyCondition, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
         return self._of(self._random, condition, at_min)  # type: ignore[no-any-return]
 
-    def limit(self, condition: Condition, at_min: float) -> dict[str, Any] | None:
+    def limit(self, condition: StudyCondition, at_min: float) -> dict[str, Any] | None:
         """The best possible return and how well it is known, of what is delivered as chosen."""
         return self._of(self._limits, condition, at_min)  # type: ignore[no-any-return]
 
-    def score(self, condition: Condition, at_min: float, mean: float) -> float | None:
+    def score(self, condition: StudyCondition, at_min: float, mean: float) -> float | None:
         """The normalised score; None where nothing can be learned."""
         random, limit = self.random(condition, at_min), self.limit(condition, at_min)
         if random is None or limit is None:
@@ -147,7 +147,7 @@ class References:
             return None
 
     @staticmethod
-    def _of(known: dict[tuple[str, str, float], Any], condition: Condition, at_min: float) -> Any:
+    def _of(known: dict[tuple[str, str, float], Any], condition: StudyCondition, at_min: float) -> Any:
         if condition.through_neurons:
             return known.get((condition.mapping, condition.percentiles, at_min))
         # Without neurons every minute is the same.
@@ -155,13 +155,15 @@ class References:
         return same[0] if same else None
 
 
-def controls_file(folder: Path, body: Body, condition: Condition, what: str = "") -> Path:
+def controls_file(folder: Path, body: Body, condition: StudyCondition, what: str = "") -> Path:
     """The table of controls of a condition's mapping."""
     held = "-held" if condition.percentiles == "first" else ""
     return episodes_file(folder, body.name, f"controls-{condition.mapping}{held}{what}")
 
 
-def performances(folder: Path, body: Body, condition: Condition, at_min: float) -> Float64[np.ndarray, " policies"]:
+def performances(
+    folder: Path, body: Body, condition: StudyCondition, at_min: float
+) -> Float64[np.ndarray, " policies"]:
     """Each policy's mean return over its episodes at a minute: the paper's measure of a policy."""
     returns: dict[str, list[float]] = defaultdict(list)
     for row in read_table(episodes_file(folder, body.name, condition.slug)):

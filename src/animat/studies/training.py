@@ -13,7 +13,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.studies.jobs import Report, Task
 from animat.studies.places import TIMELINE, UNFINISHED, policies_folder
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Condition, Study
+from animat.studies.specification import Body, Study, StudyCondition
 from animat.training.group import Group, train_group, untrained_policies
 from animat.training.sac import SAC
 from animat.training.specification import CHUNKS, Training
@@ -27,7 +27,7 @@ class TrainGroup(Task):
     """Train some policies of a condition on a robot, going on from where a killed run stopped."""
 
     body: Body
-    condition: Condition
+    condition: StudyCondition
     members: tuple[int, ...]
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
@@ -52,7 +52,7 @@ class TrainGroup(Task):
         return [*files, out / MANIFEST]
 
 
-def training_of(study: Study, body: Body, condition: Condition) -> Training:
+def training_of(study: Study, body: Body, condition: StudyCondition) -> Training:
     """What a condition means for the trainer."""
     through_neurons = condition.through_neurons
     return Training(
@@ -71,6 +71,6 @@ def training_of(study: Study, body: Body, condition: Condition) -> Training:
     )
 
 
-def timeline_for(condition: Condition, folder: Path) -> SimulatorTimeline | None:
+def timeline_for(condition: StudyCondition, folder: Path) -> SimulatorTimeline | None:
     """The study's simulators, for a condition that has neurons."""
     return load_timeline(folder / TIMELINE) if condition.through_neurons else None
