@@ -182,6 +182,41 @@ def test_a_stop_from_another_thread_lets_nothing_through_after_it(neurons: Neuro
             assert len(neurons.pulses) == delivered
 
 
+def test_a_hand_over_that_hangs_does_not_keep_a_stop_from_taking_back_what_is_queued(
+    neurons: Neurons, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.cultures.cl1.HAND_OVER_S", 0.1)
+    hanging, released, made = threading.Event(), threading.Event(), neurons.create_stim_plan
+
+    def plan() -> object:
+        if neurons.queue:
+            hanging.set()
+            released.wait(30)
+        return made()
+
+    neurons.create_stim_plan = plan  # type: ignore[method-assign]
+    failed: list[Exception] = []
+    with CL1Culture() as culture:
+
+        def deliver() -> None:
+            try:
+                culture.deliver([Stimulus(0.0125 * i, (1,), CL1_PULSE) for i in range(8)], 0.2)
+            except DeviceFailed as error:
+                failed.append(error)
+
+        thread = threading.Thread(target=deliver)
+        thread.start()
+        assert hanging.wait(30)
+        assert neurons.queue
+        culture.stop("it hangs")
+        assert neurons.queue == []
+        released.set()
+        thread.join(30)
+        # What hung was handed over after all: it is taken back as well.
+        assert len(failed) == 1
+        assert neurons.queue == []
+
+
 def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]
     with CL1Culture(record_to=tmp_path) as culture:
         culture.present([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)])

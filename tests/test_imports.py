@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "cultures": {"recordings"},
     "closed_loop": {"cultures", "neurons", "mapping", "robots", "recordings"},
     "reality_gap": {"closed_loop", "cultures", "evaluation", "training", "animat", "neurons", "recordings"},
-    "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "recordings"},
+    "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
     "studies": {
         "recordings",

@@ -23,8 +23,9 @@ from animat.errors import (
     UnusableData,
 )
 from animat.live.exchange import Exchange
+from animat.live.plan import LOG_FILE, Pace, check_plan
 from animat.live.recording import record_within
-from animat.live.shadowing import LOG_FILE, Lived, Pace, live
+from animat.live.shadowing import Lived, live
 from animat.mapping import Thresholds
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.responses import extract_responses
@@ -94,7 +95,7 @@ def test_what_happened_is_in_the_log_in_order(lived: tuple[Lived, Path, int]) ->
     told = lines(folder)
     whats = [line["what"] for line in told]
     assert whats == [
-        "recording", "training", "training began", "recording", "swap", "recording", "swap",
+        "begun", "recording", "training", "training began", "recording", "swap", "recording", "swap",
         "trained", "closed loop", "end",
     ]  # fmt: skip
     for name in ("at", "wall_s", "culture_min"):
@@ -189,7 +190,74 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
         assert culture.after_halt == 0
     assert list(load_policies(tmp_path / "live" / "policies")) == ["p0", "p1"]
     assert len(read_recordings([tmp_path / "live" / "recordings"])) >= 2
-    assert lines(tmp_path / "live")[-1]["what"] == "interrupted"
+    told = lines(tmp_path / "live")
+    assert [line["what"] for line in told[-2:]] == ["interrupted", "end"]
+    assert told[-1]["budget"]["pulses"] == culture.pulses
+    with pytest.raises(Mismatch, match=r"ended before its time \(stopped by a person\), with .* 2 policies"):
+        live(TRAINING, culture, PROTOCOL, tmp_path / "live")
+
+
+def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(tmp_path: Path) -> None:
+    def fail(culture: FakeCulture, observed: Observed) -> Observed:
+        raise DeviceFailed("gone")
+
+    with FakeCulture(fault=fail, at=1) as culture:
+        with pytest.raises(DeviceFailed, match="gone"):
+            live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK)
+        assert culture.is_stopped
+        assert culture.after_halt == 0
+        # The second recording was handed over: nobody knows what came of it.
+        assert lines(tmp_path / "live")[-1]["budget"]["pulses"] == culture.pulses == 2 * PULSES
+    told = lines(tmp_path / "live")
+    assert [line["what"] for line in told[-2:]] == ["fault", "end"]
+    assert told[-2]["sentence"] == "DeviceFailed: gone"
+    policies = load_policies(tmp_path / "live" / "policies")
+    assert list(policies) == ["p0", "p1"]
+    assert all(len(policy.learning_curve) for policy in policies.values())
+
+
+def test_policies_are_kept_while_they_are_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.live.trainers.KEEP_S", 0.0)
+
+    class Looking:
+        """A progress at which the program is ended once there are policies: until then nobody asked for them."""
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if (tmp_path / "live" / "policies" / "p1.safetensors").exists():
+                assert not (tmp_path / "live" / ".exchange" / "finish").exists()
+                raise KeyboardInterrupt
+
+    with FakeCulture() as culture, pytest.raises(KeyboardInterrupt):
+        pace = Pace(interval_min=10, duration_min=100_000, speed=1e4)
+        live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=pace, progress=Looking())
+
+
+def test_a_killed_run_says_what_stands_there_and_what_can_be_done_with_it(tmp_path: Path) -> None:
+    folder = tmp_path / "live"
+    (folder / "recordings").mkdir(parents=True)
+    (folder / "live.log").write_text('{"what": "begun"}\n{"what": "reco')
+
+    def said() -> str:
+        with pytest.raises(Mismatch) as refused:
+            check_plan(TRAINING, PROTOCOL, folder, QUICK, 1, {})
+        assert "\n" not in str(refused.value)
+        return str(refused.value)
+
+    assert "was killed, or still goes on, with 0 recordings (nothing of it can be used)" in said()
+    (folder / "recordings" / "recording_00.0_min.nwb").touch()
+    assert f"`animat train --recordings {folder / 'recordings'}`" in said()
+    (folder / "policies").mkdir()
+    (folder / "policies" / "p0.safetensors").touch()
+    (folder / "policies" / ".p1.safetensors.abc.partial.safetensors").touch()
+    assert "with 1 recordings, 1 policies" in said()
+    assert f"`animat run {folder / 'policies'} --recordings {folder / 'recordings'}`" in said()
+    (folder / "session").mkdir()
+    (folder / "session" / "session.log").touch()
+    assert f"`animat recover {folder / 'session'}`" in said()
+    (folder / "live.log").write_text('{"what": "begun"}\n{"what": "end"}\n')
+    assert "a live run that is done" in said()
+    (folder / "live.log").unlink()
+    assert "got one with files" in said()
 
 
 def test_a_training_that_fails_ends_the_run_with_its_recordings_kept(tmp_path: Path) -> None:
@@ -205,18 +273,59 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
     with FakeCulture() as culture:
         with pytest.raises(InvalidArgument, match="through neurons"):
             live(Training(Navigation(), None), culture, PROTOCOL, tmp_path / "live")
+        for wrong, words in (
+            ({"episodes": 0}, "episodes: expected at least 1"),
+            ({"patience_s": float("nan")}, "patience_s"),
+            ({"pause_s": -1.0}, "pause_s"),
+            ({"on_burst": "panic"}, "on_burst"),
+        ):
+            with pytest.raises(InvalidArgument, match=words):
+                live(TRAINING, culture, PROTOCOL, tmp_path / "live", **wrong)
         with pytest.raises(InvalidArgument, match="interval_min: expected at least"):
             live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=Pace(interval_min=0.1))
         (tmp_path / "full").mkdir()
         (tmp_path / "full" / "something").touch()
         with pytest.raises(Mismatch, match="an empty folder"):
             live(TRAINING, culture, PROTOCOL, tmp_path / "full")
-        for wrong in ({"speed": 0.0}, {"interval_min": -1.0}, {"duration_min": float("nan")}):
-            with pytest.raises(InvalidArgument, match=next(iter(wrong))):
-                Pace(**wrong)
+        for pace in ({"speed": 0.0}, {"interval_min": -1.0}, {"duration_min": float("nan")}):
+            with pytest.raises(InvalidArgument, match=next(iter(pace))):
+                Pace(**pace)
         assert culture.delivered == 0
-    assert main(["live", "cartpole", "--culture", "cl1", "--speed", "2"]) == 1
-    assert main(["live", "cartpole", "--duration-min", "-1"]) == 1
+        assert not (tmp_path / "live").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--culture", "cl1", "--speed", "2"], "--speed: expected 1"),
+        (["--speed", "0"], "speed: expected a number above 0, got 0"),
+        (["--duration-min", "-1"], "duration_min"),
+        (["--interval-min", "0.1"], "interval_min: expected at least"),
+        (["--presentations", "0"], "presentations: expected 1 to"),
+        (["--pulses", "0"], "at least 1 pulse"),
+        (["--episodes", "0"], "episodes: expected at least 1"),
+        (["--policies", "0"], "policies: expected at least 1"),
+        (["--seed", "-1"], "seed"),
+        (["--patience-s", "nan"], "patience_s"),
+        (["--pause-s", "-1"], "pause_s"),
+        (["--budget-pulses", "-1"], "budget.pulses"),
+        (["--culture", "replay"], "--recordings: expected some for a replay"),
+        (["--out", "{full}"], "expected an empty folder"),
+        (["--out", "{full}/something"], "expected a folder for the live run, got a file"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_a_culture_is_opened(
+    more: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def opened(*_: Any, **__: Any) -> Any:
+        raise AssertionError("a culture was made")
+
+    monkeypatch.setattr("animat.cultures.kinds.culture_of", opened)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "something").touch()
+    assert main(["live", "cartpole", *(word.replace("{full}", "full") for word in more)]) == 1
+    assert words in capsys.readouterr().err
 
 
 def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,9 @@ from animat.cli import main
 from animat.closed_loop.contenders import lean
 from animat.closed_loop.session import read_session
 from animat.cultures.budget import Account, Budget
-from animat.cultures.kinds import culture_of, pulse_for
+from animat.cultures.cl1 import CL1Culture
+from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
+from animat.cultures.observed import Observed
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import networks_of, roll_out
@@ -218,6 +223,13 @@ class TestCommand:
             policy_of(i, series).save(tmp_path / "policies" / f"p{i}.safetensors")
         return tmp_path
 
+    @pytest.fixture
+    def never_opened(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def opened(*_: Any, **__: Any) -> Any:
+            raise AssertionError("a culture was made")
+
+        monkeypatch.setattr("animat.cultures.kinds.culture_of", opened)
+
     def command(self, folder: Path, *more: str) -> int:
         given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--out", str(folder / "session")]
         return main(["run", *given, "--culture", "replay", "--episodes", "2", *more])
@@ -241,6 +253,63 @@ class TestCommand:
         assert "a session is there already; choose another folder" in capsys.readouterr().err
         assert (folder / "session" / "session.log").read_bytes() == before
 
+    def test_of_a_session_that_was_killed_it_says_how_to_recover_it_and_touches_nothing(
+        self, folder: Path, capsys: pytest.CaptureFixture[str], never_opened: None
+    ) -> None:
+        session = folder / "session"
+        session.mkdir()
+        (session / "session.log").write_bytes(b"what a killed program left")
+        (session / "calibration.nwb").write_bytes(b"its recording")
+        for given in ([], ["--recordings", str(folder / "recordings")]):
+            assert main(["run", str(folder / "policies"), "--out", str(session), *given]) == 1
+            assert f"`animat recover {session}` does it; choose another folder" in capsys.readouterr().err
+        assert (session / "calibration.nwb").read_bytes() == b"its recording"
+
+    def test_a_recording_that_could_not_be_written_is_an_error(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (folder / "session" / "session.nwb").mkdir(parents=True)
+        (folder / "session" / "session.nwb" / "in the way").touch()
+        assert self.command(folder, "--controls", "random") == 1
+        printed = capsys.readouterr()
+        assert "session.nwb: cannot be written" in printed.err
+        assert "animat recover" in printed.err
+        assert "is its recording" not in printed.out
+
+    @pytest.mark.parametrize("is_recorded", [True, False])
+    def test_a_polite_kill_closes_the_culture_whenever_it_comes(
+        self, folder: Path, is_recorded: bool, monkeypatch: pytest.MonkeyPatch, recordings: list[Recording]
+    ) -> None:
+        def kill(culture: FakeCulture, observed: Observed) -> Observed:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.2)
+            return observed
+
+        culture = FakeCulture(fault=kill, at=0)
+        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
+        before = signal.getsignal(signal.SIGTERM)
+        given = ["--recordings", str(folder / "recordings")] if is_recorded else []
+        assert main(["run", str(folder / "policies"), *given, "--out", str(folder / "new")]) == 130
+        assert not culture.is_open
+        assert culture.deliveries <= 2
+        assert signal.getsignal(signal.SIGTERM) is before
+
+    def test_other_electrodes_than_in_the_recordings_are_told(
+        self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        class Rewired(FakeCulture):
+            @property
+            def patterns(self) -> np.ndarray:
+                return np.array([[100 + i, 100 + (i + 1 + (i < 3)) % 8, -1] for i in range(8)])
+
+        for made, words in ((FakeCulture(), None), (Rewired(), "3 of the 8 sets of electrodes")):
+            monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, made=made, **__: made)
+            given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--episodes", "1"]
+            assert main(["run", *given, "--controls", "random", "--out", str(folder / type(made).__name__)]) == 0
+            said = capsys.readouterr().err
+            assert "no pattern of this culture" in said if words else "pattern" not in said
+            assert (words or "") in said
+
     def test_a_spent_budget_is_told_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--budget-pulses", "50") == 1
         printed = capsys.readouterr()
@@ -263,19 +332,50 @@ class TestCommand:
         ("more", "words"),
         [
             (["--episodes", "0"], "--episodes: expected at least 1"),
+            (["--seed", "-1"], "--seed: expected 0 or more"),
             (["--pulses", "0"], "pulses: expected at least 1"),
             (["--pause-s", "-1"], "pause_s: expected a finite number from 0"),
-            (["--state", "nowhere.state"], "state: expected none for a culture of kind 'replay'"),
+            (["--patience-s", "nan"], "patience_s: expected a finite number from 0"),
+            (["--patience-s", "0"], "patience_s: expected above 0 s"),
             (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),
+            (["--at-min", "nan"], "at_min"),
+            (["--bins", "0"], "bins"),
+            (["--out", "/dev/null"], "expected a folder for the session, got a file"),
         ],
     )
-    def test_bad_settings_are_one_line(
-        self, folder: Path, more: list[str], words: str, capsys: pytest.CaptureFixture[str]
+    def test_bad_settings_are_one_line_before_a_culture_is_opened(
+        self, folder: Path, more: list[str], words: str, capsys: pytest.CaptureFixture[str], never_opened: None
     ) -> None:
         assert self.command(folder, *more) == 1
         said = capsys.readouterr().err.splitlines()[-1]
         assert words in said
+
+    def test_what_does_not_belong_together_is_told_before_a_culture_is_opened(
+        self, folder: Path, series: list[Responses], capsys: pytest.CaptureFixture[str], never_opened: None
+    ) -> None:
+        other = policy_of(3, series, conditions=tuple(reversed(series[0].conditions)))
+        other.save(folder / "other" / "q0.safetensors")
+        given = ["--recordings", str(folder / "recordings"), "--out", str(folder / "new")]
+        assert main(["run", str(folder / "other"), *given]) == 1
+        assert "conditions: expected 80 Hz" in capsys.readouterr().err
+        other.save(folder / "policies" / "q0.safetensors")
+        assert main(["run", str(folder / "policies"), *given]) == 1
+        assert "q0: expected the same conditions as p0" in capsys.readouterr().err
+
+    def test_other_mistakes_are_one_line_too(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert self.command(folder, "--state", "nowhere.state") == 1
+        assert "state: expected none for a culture of kind 'replay'" in capsys.readouterr().err
         assert main(["recover", str(folder / "nowhere")]) == 1
+
+
+def test_a_cl1_is_stimulated_through_the_patterns_that_it_was_recorded_with(recordings: list[Recording]) -> None:
+    from dataclasses import replace
+
+    drawn = replace(recordings[0], provenance={"source": "CL1 (device) by animat.cultures.cl1", "pattern_seed": "7"})
+    known = recorded_culture("cl1", [drawn], [])
+    np.testing.assert_array_equal(culture_of("cl1", **known).patterns, CL1Culture(seed=7).patterns)
+    given = replace(drawn, provenance={**drawn.provenance, "pattern_seed": "none: they were given"})
+    assert recorded_culture("cl1", [given], []) == recorded_culture("virtual", [drawn], []) == {}
 
 
 def test_another_kind_of_culture_is_another_word(tmp_path: Path, recordings: list[Recording]) -> None:

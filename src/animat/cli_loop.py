@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.errors import InvalidArgument, LoopEnded
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 
 if TYPE_CHECKING:
-    from animat.closed_loop.tick import Ending
+    from animat.closed_loop.session import Session
     from animat.cultures.base import Culture
+    from animat.cultures.budget import Account
     from animat.progress import Progress
     from animat.reality_gap import Calibration
     from animat.recordings.findings import Finding
@@ -32,7 +33,7 @@ class Stimulating:
     selection: Path | None = None
     """For a maxone: the file of its electrodes"""
     culture_seed: int | None = None
-    """Which virtual culture; default: the one of the recordings, else 1"""
+    """Which virtual culture, or which patterns of a CL1; default: those of the recordings, else 1"""
     budget_pulses: int | None = None
     """Most pulses in all, recordings included; default: no end, but the culture's limits"""
     budget_per_electrode: int | None = None
@@ -47,6 +48,15 @@ class Stimulating:
     """Without stimulation before each episode"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
+
+    def _of_the_loop(self) -> dict[str, Any]:
+        """Settings of the closed loop."""
+        return {
+            "on_burst": self.on_burst,
+            "on_late": self.on_late,
+            "pause_s": self.pause_s,
+            "patience_s": self.patience_s,
+        }
 
 
 @dataclass(frozen=True)
@@ -72,7 +82,7 @@ class Run(Stimulating):
     bins: int = 20
     """Bins of a histogram"""
     range_hz: float | None = None
-    """Upper end of a histogram's range, in Hz; default: from the first recording"""
+    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
     burst_threshold: float | None = None
     """Share of active channels above which a response is a burst; 1: none is; default: as in the recording"""
     despite: tuple[str, ...] = ()
@@ -90,21 +100,45 @@ class Run(Stimulating):
 
     def run(self) -> dict[str, Any]:
         """Run."""
+        import numpy as np
+
+        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
+        from animat.closed_loop.loop import Loop
+        from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
+        from animat.mapping import N_PERCENTILES
         from animat.progress import Bar
-        from animat.reality_gap import run_policies
+        from animat.reality_gap import check_conditions, check_policies, run_policies
         from animat.recordings.reading import read_recordings
         from animat.training.policy import load_policies
 
+        # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
         if self.episodes < 1:
             raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
-        keep_compilations()
+        if self.seed < 0:
+            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         policies = load_policies(self.policies)
-        recordings = read_recordings(self.recordings) if self.recordings else []
+        first = check_policies(policies)
+        settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
+        Loop.of_policy(first, np.zeros(N_PERCENTILES), **settings)
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
-        with Bar("closed loop") as progress, self._culture(recordings, progress) as culture:
-            calibration, pulse, patterns = self._calibrate(culture, recordings, policies, account, progress)
+        expect_no_session(self.out)
+        keep_compilations()
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        calibration = None
+        if recordings:
+            calibration = self._calibration(recordings, first, self.at_min)
+            check_conditions(first, calibration)
+        with (
+            polite_kill_as_ctrl_c(),
+            Bar("closed loop") as progress,
+            self._culture(recordings, progress) as culture,
+        ):
+            pulse, patterns, noticed = self._presenting(culture, recordings)
+            if calibration is None:
+                recording = self._record(culture, first, account, progress)
+                calibration = self._calibration([recording], first, recording.start_min)
             gap = run_policies(
                 policies,
                 culture,
@@ -115,21 +149,18 @@ class Run(Stimulating):
                 greedy=not self.drawn,
                 follow=self.thresholds == "follow",
                 seed=self.seed,
-                pulses=self.pulses,
                 account=account,
                 progress=progress,
+                noticed=noticed,
                 pulse=pulse,
                 patterns=patterns,
-                on_burst=self.on_burst,
-                on_late=self.on_late,
-                pause_s=self.pause_s,
-                patience_s=self.patience_s,
-                real_time=self.real_time,
+                **settings,
             )
         _say(gap.findings)
         print(gap.to_text())
-        print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
-        _expect_no_fault(gap.session.ending, self.out)
+        if gap.session.recording_file.is_file():
+            print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
+        _expect_no_fault(gap.session, self.out)
         return gap.to_dict()
 
     def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
@@ -137,7 +168,7 @@ class Run(Stimulating):
 
         if self.culture == "replay" and not recordings:
             raise InvalidArgument("--recordings: expected some for a replay to answer from, got none")
-        known = recorded_culture(recordings, self.recordings) if self.culture == "virtual" else {}
+        known = recorded_culture(self.culture, recordings, self.recordings)
         state = self.state or (known.get("state") if self.culture_seed is None else None)
         seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
         if state is not None:
@@ -146,53 +177,56 @@ class Run(Stimulating):
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
 
-    def _calibrate(
-        self,
-        culture: Culture,
-        recordings: Sequence[Recording],
-        policies: dict[str, Policy],
-        account: Any,
-        progress: Progress,
-    ) -> tuple[Calibration, Pulse, int | None]:
-        """From the recordings; without any, the culture is recorded as the policies' recordings were presented."""
+    def _presenting(
+        self, culture: Culture, recordings: Sequence[Recording]
+    ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
+        """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
+        from animat.cultures.kinds import pulse_for
+        from animat.cultures.same_patterns import other_patterns
+        from animat.recordings.protocol import Protocol
+
+        if not recordings:
+            return pulse_for(self.culture), None, ()
+        found = other_patterns(recordings[0], culture)
+        noticed = () if found is None else (found,)
+        told = recordings[0].provenance.get("protocol")
+        if told is None:
+            return pulse_for(self.culture), None, noticed
+        protocol = Protocol.from_json(told)
+        return protocol.pulse, min(protocol.patterns, len(culture.patterns)), noticed
+
+    def _record(self, culture: Culture, first: Policy, account: Account, progress: Progress) -> Recording:
+        """The culture as it is now, presented as the policies' recordings were."""
         from animat.cultures.kinds import pulse_for
         from animat.live.recording import record_within
-        from animat.neurons.series import extract_series
-        from animat.reality_gap import Calibration
         from animat.recordings.protocol import Presentation, Protocol
 
-        first = next(iter(policies.values()))
-        pulse, patterns = pulse_for(self.culture), None
-        if recordings:
-            told = recordings[0].provenance.get("protocol")
-            if told is not None:
-                protocol = Protocol.from_json(told)
-                pulse, patterns = protocol.pulse, protocol.patterns
-            at_min = self.at_min
-        else:
-            presentation = first.presentation or Presentation("mixed")
-            protocol = Protocol(
-                tuple(condition.value for condition in first.conditions),
-                order=presentation.order,
-                pulses=presentation.pulses,
-                patterns=min(100, len(culture.patterns)),
-                pulse=pulse,
-            )
-            print("no recordings were given: the culture is recorded first", file=sys.stderr)
-            recording = record_within(account, culture, protocol, self.seed, progress)
-            recording.save(self.out / "calibration.nwb")
-            recordings, at_min = [recording], recording.start_min
+        presentation = first.presentation or Presentation("mixed")
+        protocol = Protocol(
+            tuple(condition.value for condition in first.conditions),
+            order=presentation.order,
+            pulses=presentation.pulses,
+            patterns=min(100, len(culture.patterns)),
+            pulse=pulse_for(self.culture),
+        )
+        print("no recordings were given: the culture is recorded first", file=sys.stderr)
+        recording = record_within(account, culture, protocol, self.seed, progress)
+        recording.save(self.out / "calibration.nwb")
+        return recording
+
+    def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:
+        from animat.neurons.series import extract_series
+        from animat.reality_gap import Calibration
+
         series = extract_series(
             recordings,
             window_ms=first.window_ms or (2.0, 10.0),
             burst_threshold=self.burst_threshold,
             despite=self.despite,
         )
-        usable = None if patterns is None else min(patterns, len(culture.patterns))
-        calibration = Calibration.of_series(
+        return Calibration.of_series(
             series, first, at_min=at_min, kind=self.simulator, bins=self.bins, range_hz=self.range_hz
         )
-        return calibration, pulse, usable
 
 
 @dataclass(frozen=True)
@@ -236,10 +270,12 @@ class Live(Stimulating):
 
     def run(self) -> dict[str, Any]:
         """Live."""
+        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.cultures.kinds import culture_of, pulse_for
-        from animat.live.shadowing import Pace, live
+        from animat.live.plan import Pace, check_plan
+        from animat.live.shadowing import live
         from animat.mapping import mapping_named
         from animat.progress import Bar
         from animat.recordings.protocol import Protocol
@@ -250,7 +286,10 @@ class Live(Stimulating):
         simulated = self.culture in ("virtual", "replay")
         if self.speed is not None and self.speed != 1 and not simulated:
             raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
-        pace = Pace(self.interval_min, self.duration_min, self.speed or (30.0 if simulated else 1.0))
+        if self.culture == "replay" and not self.recordings:
+            raise InvalidArgument("--recordings: expected some for a replay to answer from, got none")
+        default_speed = 30.0 if simulated else 1.0
+        pace = Pace(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
         robot = robot_named(self.robot)
         training = Training(
             robot,
@@ -261,10 +300,16 @@ class Live(Stimulating):
             percentiles=self.percentiles,
         )
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        protocol = Protocol(
+            order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
+        )
+        settings = {**self._of_the_loop(), "follow": self.thresholds == "follow"}
+        check_plan(training, protocol, self.out, pace, self.episodes, settings)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
+            polite_kill_as_ctrl_c(),
             Bar("live") as progress,
             culture_of(
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
@@ -273,13 +318,7 @@ class Live(Stimulating):
             lived = live(
                 training,
                 culture,
-                Protocol(
-                    order=self.order,
-                    pulses=self.pulses,
-                    patterns=min(100, len(culture.patterns)),
-                    presentations=self.presentations,
-                    pulse=pulse_for(self.culture),
-                ),
+                replace(protocol, patterns=min(100, len(culture.patterns))),
                 self.out,
                 pace=pace,
                 episodes=self.episodes,
@@ -287,11 +326,7 @@ class Live(Stimulating):
                 kind=self.simulator,
                 account=account,
                 progress=progress,
-                follow=self.thresholds == "follow",
-                on_burst=self.on_burst,
-                on_late=self.on_late,
-                pause_s=self.pause_s,
-                patience_s=self.patience_s,
+                **settings,
             )
         print(
             f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
@@ -305,7 +340,7 @@ class Live(Stimulating):
             )
         _say(lived.gap.findings)
         print(lived.gap.to_text())
-        _expect_no_fault(lived.gap.session.ending, self.out)
+        _expect_no_fault(lived.gap.session, self.out)
         return lived.to_dict()
 
 
@@ -332,12 +367,15 @@ class Recover:
         return {"recording": str(session.recording_file), **told}
 
 
-def _expect_no_fault(ending: Ending, folder: Path) -> None:
+def _expect_no_fault(session: Session, folder: Path) -> None:
     """Turn an ending before its time into an error, now that all is told and written."""
+    ending = session.ending
     if ending.by == "person":
         raise KeyboardInterrupt
     if ending.by != "plan":
         raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
+    if not session.recording_file.is_file():
+        raise InvalidFile(ending.sentence)
 
 
 def _range(members: Sequence[int]) -> str:

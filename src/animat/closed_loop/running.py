@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -19,9 +18,10 @@ import numpy as np
 from animat.closed_loop.answers import in_words
 from animat.closed_loop.contenders import Contender, interleaved
 from animat.closed_loop.driver import Driver
+from animat.closed_loop.interrupts import told_instead
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import FORMAT, LOG_FILE, Session, read_session
+from animat.closed_loop.session import FORMAT, LOG_FILE, Session, expect_no_session, read_session
 from animat.closed_loop.tick import Ending
 from animat.closed_loop.timing import Clock, WallClock
 from animat.cultures.base import Culture
@@ -72,6 +72,7 @@ def run_session(
         InvalidFile: if the log cannot be begun.
     """
     _check(culture, loop, contenders, episodes, seed)
+    expect_no_session(folder)
     account, progress = account or Account(), progress or Silent()
     turns = interleaved(len(contenders), episodes, np.random.default_rng([seed, 20]))
     driver = Driver(culture, loop, contenders, turns, account, clock or WallClock(), seed)
@@ -105,7 +106,7 @@ class _Supervisor:
         """Start the loop and stay with it to its end."""
         driver = self._driver
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
-        with _interrupts(self._stop_for_a_person), _without_collector():
+        with told_instead(self._stop_for_a_person), _without_collector():
             thread.start()
             ending = self._watch(thread)
             if ending is not None:
@@ -192,21 +193,6 @@ class _Supervisor:
             self._not_halted = f"the culture could not be stopped ({in_words(error)})"
         else:
             self._not_halted = None
-
-
-@contextlib.contextmanager
-def _interrupts(stop: Any) -> Iterator[None]:
-    """Let Ctrl-C and a polite kill end the session in place of raising somewhere; only the main thread can."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    asking = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop()) for number in asking]
-    try:
-        yield
-    finally:
-        for number, handler in zip(asking, before, strict=True):
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

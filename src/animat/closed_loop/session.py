@@ -14,7 +14,7 @@ import numpy as np
 
 from animat.closed_loop.log import Log, read_log
 from animat.closed_loop.tick import Ending, Tick
-from animat.errors import InvalidFile
+from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
 
@@ -178,6 +178,31 @@ def read_session(path: str | os.PathLike[str]) -> Session:
         if record.words["kind"] == "end":
             ending = Ending(record.words["by"], record.words["sentence"])
     return Session(file.parent, log, ending)
+
+
+def expect_no_session(folder: str | os.PathLike[str]) -> None:
+    """Raise unless a folder can take a new session; says what can be done with one that is there. Makes the folder.
+
+    Raises:
+        InvalidArgument: if a session is there, or a file in the folder's place.
+        InvalidFile: if the folder cannot be made or written to.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InvalidArgument(f"{folder}: expected a folder for the session, got a file")
+    if (folder / LOG_FILE).exists():
+        told = (
+            ""
+            if (folder / RECORDING_FILE).exists()
+            else (f" that was killed or still runs: its recording was not written, `animat recover {folder}` does it")
+        )
+        raise InvalidArgument(f"{folder / LOG_FILE}: a session is there already{told}; choose another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidFile(f"{folder}: cannot be made: {error.strerror or error}") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InvalidFile(f"{folder}: cannot be written to: permission denied")
 
 
 def recover_session(path: str | os.PathLike[str]) -> Session:

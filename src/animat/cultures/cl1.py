@@ -33,6 +33,8 @@ SITES = tuple(channel for channel in range(CHANNELS) if channel not in NO_STIMUL
 FRAMES_PER_S = 25_000
 LEAD_US = 80
 """The shortest time from a command to its pulse."""
+HAND_OVER_S = 0.5
+"""How long a stop waits for a pulse that is being handed over."""
 STIMULUS_STREAM = "animat_stimuli"
 """The data stream beside the SDK's own recording, which keeps no parameters of stimuli."""
 
@@ -109,7 +111,7 @@ class CL1Culture(Culture):
         if jitter_tolerance_ms is not None and not jitter_tolerance_ms >= 0:
             raise InvalidArgument(f"jitter_tolerance_ms: expected 0 ms or more, or None, got {jitter_tolerance_ms}")
         self._patterns = _drawn(seed) if patterns is None else _checked(patterns)
-        self._seed = seed
+        self._pattern_seed = str(seed) if patterns is None else "none: they were given"
         self._ticks_per_s = ticks_per_s
         self._margin_frames = round(margin_ms * 1e-3 * FRAMES_PER_S)
         self._jitter: dict[str, Any] = {"ignore_jitter": True}
@@ -170,7 +172,7 @@ class CL1Culture(Culture):
         return {
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
-            "pattern_seed": str(self._seed),
+            "pattern_seed": self._pattern_seed,
             **named,
         }
 
@@ -249,9 +251,15 @@ class CL1Culture(Culture):
             raise DeviceFailed(f"CL1: expected {duration_s:g} s to pass, got {_line(error)}") from error
 
     def _halt(self) -> None:
-        with self._lock:
-            self._is_halted = True
+        # First of all: whoever is about to hand over a pulse looks at it with the lock held.
+        self._is_halted = True
+        # A hand-over that is under way comes before; one that hangs must not keep what is queued from being taken back.
+        is_held = self._lock.acquire(timeout=HAND_OVER_S)
+        try:
             self._interrupt()
+        finally:
+            if is_held:
+                self._lock.release()
 
     def _close(self) -> None:
         try:

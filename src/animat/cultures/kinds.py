@@ -79,11 +79,25 @@ def pulse_for(kind: CultureKind) -> Pulse:
     return BALANCED_PULSE if kind == "maxone" else PUBLISHED_PULSE
 
 
-def recorded_culture(recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
-    """The seed of the virtual culture that recordings are of, and the state that was written after them, as known."""
+def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
+    """What is known of the culture that recordings are of, as arguments of `culture_of`.
+
+    Of a virtual culture its seed, and the state that was written after them; of a CL1 the seed of its patterns, so that
+    it is stimulated through the electrodes that it was recorded with.
+    """
     found: dict[str, Any] = {}
     provenance = recordings[0].provenance if recordings else {}
-    if provenance.get("source", "").startswith("virtual culture") and provenance.get("seed", "").isdigit():
+    if (
+        kind == "cl1"
+        and provenance.get("source", "").startswith("CL1")
+        and provenance.get("pattern_seed", "").isdigit()
+    ):
+        found["seed"] = int(provenance["pattern_seed"])
+    if (
+        kind == "virtual"
+        and provenance.get("source", "").startswith("virtual culture")
+        and provenance.get("seed", "").isdigit()
+    ):
         found["seed"] = int(provenance["seed"])
         from animat.cultures.series import STATE_FILE
 

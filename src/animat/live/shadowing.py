@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,8 +19,9 @@ import jax
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.series import recording_name
-from animat.errors import BudgetSpent, InvalidArgument, Mismatch, UnusableData
+from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.exchange import Exchange
+from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Pace, check_plan
 from animat.live.recording import record_within
 from animat.live.trainers import Trainers
 from animat.neurons.responses import Responses
@@ -34,37 +36,7 @@ from animat.training.policy import Policy
 from animat.training.specification import Training
 from animat.training.trainer import describe
 
-LOG_FILE = "live.log"
-RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 _POLL_S = 0.1
-
-
-@dataclass(frozen=True)
-class Pace:
-    """When the culture is recorded.
-
-    Attributes:
-        interval_min: of the culture's clock, between the starts of two recordings.
-        duration_min: of the culture's clock, from the first recording to the end of training.
-        speed: minutes of the culture's clock in one of ours: 1 for a living one.
-
-    Raises:
-        InvalidArgument: for a number that is not above 0.
-    """
-
-    interval_min: float = 10.0
-    duration_min: float = 60.0
-    speed: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("interval_min", "duration_min", "speed"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")
-
-    @property
-    def recordings(self) -> int:
-        """How many are made: the end of training needs none."""
-        return math.ceil(self.duration_min / self.interval_min - 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +110,16 @@ def live(
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
-        InvalidArgument: for a training without neurons, or recordings that take longer than an interval.
-        Mismatch: if something is in the folder already.
+        InvalidArgument, Mismatch: before anything is delivered, as `animat.live.plan.check_plan` does.
         BudgetSpent: if the budget does not hold the first recording.
-        AnimatError: if a process that trains fails.
+        AnimatError: if a process that trains fails, or the culture does: the culture is then stopped, and recordings
+            and policies are kept as they are.
     """
-    run = _Run(training, culture, protocol, Path(folder), pace or Pace(), kind, account or Account(), progress)
-    policies = run.shadow()
+    pace = pace or Pace()
+    check_plan(training, protocol, Path(folder), pace, episodes, settings)
+    run = _Run(training, culture, protocol, Path(folder), pace, kind, account or Account(), progress)
     try:
+        policies = run.shadow()
         calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
         if training.percentiles == "first":
             first = Calibration.of_series(run.used[:1], kind=kind).simulator.percentiles
@@ -166,8 +140,11 @@ def live(
             **settings,
         )
         run.write("closed loop", **gap.session.to_dict())
-    finally:
-        run.write("end", budget=run.account.to_dict())
+    except BaseException:
+        with suppress(InvalidFile):
+            run.write("end", budget=run.account.to_dict())
+        raise
+    run.write("end", budget=run.account.to_dict())
     return Lived(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 
@@ -183,18 +160,6 @@ class _Run:
         account: Account,
         progress: Progress | None,
     ) -> None:
-        if training.mapping is None:
-            raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
-        takes_min = culture.schedule(protocol).duration_s / 60
-        if takes_min > pace.interval_min:
-            raise InvalidArgument(
-                f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got "
-                f"{pace.interval_min:g}"
-            )
-        if folder.exists() and not folder.is_dir():
-            raise InvalidArgument(f"--out: expected a folder for the live run, got a file: {folder}")
-        if folder.exists() and any(folder.iterdir()):
-            raise Mismatch(f"{folder}: expected an empty folder for a live run, got one with files: choose another")
         self.folder, self.account = folder, account
         self.files: list[Path] = []
         self.used: list[Responses] = []
@@ -204,10 +169,34 @@ class _Run:
         self._culture, self._protocol, self._pace, self._kind = culture, protocol, pace, kind
         self._progress = progress or Silent()
         self._zero_s, self._wall_zero_s = culture.now_s, time.monotonic()
-        folder.mkdir(parents=True, exist_ok=True)
+        self._known_s, self._ended_early = self._zero_s, False
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InvalidFile(f"{folder}: cannot be made: {error.strerror or error}") from error
+        self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed)
 
     def shadow(self) -> dict[str, Policy]:
-        """Record and train to the end; returns the policies."""
+        """Record and train to the end; returns the policies. Whatever ends it before, the culture is stopped."""
+        try:
+            return self._record_and_train()
+        except BaseException as error:
+            self._end_early(error)
+            raise
+
+    def _end_early(self, error: BaseException) -> None:
+        """Stimulate no more, and write down why, once."""
+        if self._ended_early:
+            return
+        self._ended_early = True
+        is_person = isinstance(error, KeyboardInterrupt)
+        told = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
+        with suppress(Exception):
+            self._culture.stop(told)
+        with suppress(InvalidFile):
+            self.write("interrupted" if is_person else "fault", sentence=told)
+
+    def _record_and_train(self) -> dict[str, Policy]:
         exchange = Exchange(self.folder / ".exchange")
         timeline = self._record(0)
         if timeline is None:
@@ -218,11 +207,11 @@ class _Run:
             self.write("training", policies=self._training.policies, processes=len(groups))
             try:
                 self._shadow(exchange, trainers)
-            except KeyboardInterrupt:
-                # Whoever ends it early keeps the policies as they are.
-                self._culture.stop("stopped by a person (Ctrl-C)")
-                self.write("interrupted")
-                trainers.finish()
+            except BaseException as error:
+                self._end_early(error)
+                # The policies as they are are better than none.
+                with suppress(AnimatError):
+                    trainers.finish()
                 raise
             self._note(trainers.finish())
             self.iterations = trainers.iterations
@@ -312,13 +301,22 @@ class _Run:
         line = {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
-            "culture_min": round((self._culture.now_s - self._zero_s) / 60, 4),
+            "culture_min": round((self._now_s() - self._zero_s) / 60, 4),
             "what": what,
             **words,
         }
-        with (self.folder / LOG_FILE).open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        try:
+            with (self.folder / LOG_FILE).open("a") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise InvalidFile(f"{self.folder / LOG_FILE}: cannot be written: {error.strerror or error}") from error
         return line
+
+    def _now_s(self) -> float:
+        """The culture's clock; where a connection is lost, what it showed last."""
+        with suppress(Exception):
+            self._known_s = self._culture.now_s
+        return self._known_s
 
 
 def _newest(timeline: SimulatorTimeline) -> Any:

@@ -19,6 +19,9 @@ from animat.errors import AnimatError
 from animat.live.exchange import Exchange
 from animat.training.group import Group
 
+KEEP_S = 10.0
+"""Seconds between times that the policies are written as they are: what a killed run costs of training."""
+
 
 class Trainers:
     """One process a group of policies; use it as a context manager, which ends them whatever happens.
@@ -45,7 +48,7 @@ class Trainers:
         cores = sorted(os.sched_getaffinity(0), reverse=True)
         for i, group in enumerate(self._groups):
             with tempfile.TemporaryFile() as job:
-                pickle.dump((group, self._exchange, self._folder), job)
+                pickle.dump((group, self._exchange, self._folder, KEEP_S), job)
                 job.seek(0)
                 command = [sys.executable, "-m", "animat.live.worker", str(cores[i % len(cores)])]
                 process = subprocess.Popen(command, stdin=job, stdout=subprocess.PIPE)

@@ -11,6 +11,7 @@ import os
 import pickle
 import signal
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,8 @@ def main() -> int:
     group: Group
     exchange: Exchange
     folder: Path
-    group, exchange, folder = pickle.load(sys.stdin.buffer)
+    keep_s: float
+    group, exchange, folder, keep_s = pickle.load(sys.stdin.buffer)
 
     def tell(**words: Any) -> None:
         print(json.dumps({"members": group.members, **words}), flush=True)
@@ -45,7 +47,12 @@ def main() -> int:
         # The policies tell what they were trained on, the last of it known only in the end.
         group = replace(group, provenance={**group.provenance, "swaps": swaps})
         together = SideBySide(group)
-        number, simulator, index = -1, None, 0
+        number, simulator, index, kept_s = -1, None, 0, time.monotonic()
+
+        def keep() -> None:
+            for member, policy in zip(group.members, together.policies(), strict=True):
+                policy.save(folder / f"p{member}.safetensors")
+
         while not (exchange.is_finished and index):
             newer = exchange.newest(number)
             if newer is not None:
@@ -56,11 +63,13 @@ def main() -> int:
             if simulator is None:
                 raise AnimatError("live: expected a simulator in the exchange before training began, got none")
             mean_return = together.train(index, simulator)
+            if time.monotonic() - kept_s > keep_s:
+                keep()
+                kept_s = time.monotonic()
             index += 1
             iterations = group.training.chunk(index)[0] * group.training.algorithm.environments
             tell(done=index, using=number, iterations=iterations, mean_return=mean_return)
-        for member, policy in zip(group.members, together.policies(), strict=True):
-            policy.save(folder / f"p{member}.safetensors")
+        keep()
     except AnimatError as error:
         tell(error=str(error))
         return 1

@@ -1,7 +1,15 @@
 """Predicted return against lived return: policies and controls on a simulator, then in closed loop on the culture."""
 
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.running import PREDICTED_EPISODES, run_policies
+from animat.reality_gap.running import PREDICTED_EPISODES, check_conditions, check_policies, run_policies
 from animat.reality_gap.table import RealityGap, Row
 
-__all__ = ["PREDICTED_EPISODES", "Calibration", "RealityGap", "Row", "run_policies"]
+__all__ = [
+    "PREDICTED_EPISODES",
+    "Calibration",
+    "RealityGap",
+    "Row",
+    "check_conditions",
+    "check_policies",
+    "run_policies",
+]

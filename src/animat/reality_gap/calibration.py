@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float64
 
+from animat.errors import InvalidArgument
 from animat.neurons.conditions import Condition
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import Kind, NeuronSimulator
@@ -75,6 +76,8 @@ class Calibration:
             at_min = float(timeline.start_min[-1] if policy is None else timeline.start_min[0])
             if trained.get("shadowing"):
                 at_min += trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"]
+        if np.isnan(at_min):
+            raise InvalidArgument("at_min: expected a minute on the culture's clock, got nan")
         row = timeline.row_at(at_min)
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)

@@ -47,6 +47,7 @@ def run_policies(
     pulses: int | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
+    noticed: Sequence[Finding] = (),
     **settings: Any,
 ) -> RealityGap:
     """Run policies, and the controls of the study between them, in closed loop, and compare with the prediction.
@@ -68,6 +69,7 @@ def run_policies(
         pulses: of a presentation; None: as in the policies' recordings.
         account: of a stimulation budget.
         progress: told after each episode.
+        noticed: findings to be told beside those made here.
         settings: other attributes of `Loop`.
 
     Raises:
@@ -75,7 +77,8 @@ def run_policies(
         Mismatch: if they differ from each other, or from the calibration's conditions.
         UnusableData: for policies without neurons.
     """
-    first = _check(policies, calibration)
+    first = check_policies(policies)
+    check_conditions(first, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if follow:
         settings["following"] = calibration.responses_hz
@@ -137,11 +140,17 @@ def run_policies(
         rows,
         session,
         account,
-        (*findings, *calibration.findings),
+        (*noticed, *findings, *calibration.findings),
     )
 
 
-def _check(policies: Mapping[str, Policy], calibration: Calibration) -> Policy:
+def check_policies(policies: Mapping[str, Policy]) -> Policy:
+    """Raise unless policies can take turns in one closed loop; returns the first, which stands for all.
+
+    Raises:
+        InvalidArgument: for none.
+        Mismatch: if they differ in robot, mapping, conditions, presentation or response window.
+    """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))
@@ -149,12 +158,20 @@ def _check(policies: Mapping[str, Policy], calibration: Calibration) -> Policy:
         for attribute in ("robot", "mapping", "conditions", "presentation", "window_ms"):
             if getattr(policy, attribute) != getattr(first, attribute):
                 raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; run it alone")
+    return first
+
+
+def check_conditions(first: Policy, calibration: Calibration) -> None:
+    """Raise unless a calibration is for the conditions that policies pick from.
+
+    Raises:
+        Mismatch: if it is not.
+    """
     if first.mapping is not None and first.conditions != calibration.conditions:
         raise Mismatch(
             f"conditions: expected {', '.join(c.label for c in first.conditions)}, which the policies pick from, got "
             f"recordings with {', '.join(c.label for c in calibration.conditions)}"
         )
-    return first
 
 
 def _rows(

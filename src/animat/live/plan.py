@@ -1,0 +1,134 @@
+"""What a live run is to do, and everything about it that can be checked before a culture is opened."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.session import LOG_FILE as SESSION_LOG
+from animat.errors import InvalidArgument, Mismatch
+from animat.mapping import N_PERCENTILES
+from animat.neurons.conditions import Condition
+from animat.recordings.protocol import Protocol
+from animat.recordings.schedule import make_schedule
+from animat.training.specification import Training
+
+LOG_FILE = "live.log"
+RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
+_NOT_OF_THE_LOOP = ("follow", "greedy")
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When the culture is recorded.
+
+    Attributes:
+        interval_min: of the culture's clock, between the starts of two recordings.
+        duration_min: of the culture's clock, from the first recording to the end of training.
+        speed: minutes of the culture's clock in one of ours: 1 for a living one.
+
+    Raises:
+        InvalidArgument: for a number that is not above 0.
+    """
+
+    interval_min: float = 10.0
+    duration_min: float = 60.0
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("interval_min", "duration_min", "speed"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")
+
+    @property
+    def recordings(self) -> int:
+        """How many are made: the end of training needs none."""
+        return math.ceil(self.duration_min / self.interval_min - 1e-9)
+
+
+def check_plan(
+    training: Training, protocol: Protocol, folder: Path, pace: Pace, episodes: int, settings: Mapping[str, Any]
+) -> None:
+    """Raise for what would only come out when the culture is open, or after an hour of training.
+
+    Args:
+        training: what is trained.
+        protocol: of every recording.
+        folder: for all that comes of it.
+        pace: when the culture is recorded.
+        episodes: of each policy in closed loop.
+        settings: of the closed loop (`animat.closed_loop.loop.Loop`).
+
+    Raises:
+        InvalidArgument: for a training without neurons, recordings that take longer than an interval, no episodes, a
+            setting of the closed loop that cannot be, or a file in the folder's place.
+        Mismatch: if something is in the folder already; for an earlier live run, what, and what can be done with it.
+    """
+    if training.mapping is None:
+        raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
+    # How long it takes does not depend on which electrodes are pulsed.
+    takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), 0).duration_s / 60
+    if takes_min > pace.interval_min:
+        raise InvalidArgument(
+            f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {pace.interval_min:g}"
+        )
+    if episodes < 1:
+        raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    of_the_loop = {name: value for name, value in settings.items() if name not in _NOT_OF_THE_LOOP}
+    conditions = tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in protocol.frequencies_hz)
+    given: dict[str, Any] = {
+        "pulses": protocol.pulses,
+        "pulse": protocol.pulse,
+        "patterns": protocol.patterns,
+    } | of_the_loop
+    Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **given)
+    if folder.exists() and not folder.is_dir():
+        raise InvalidArgument(f"--out: expected a folder for the live run, got a file: {folder}")
+    if folder.exists() and any(folder.iterdir()):
+        stands = what_stands(folder) or "one with files"
+        raise Mismatch(f"{folder}: expected an empty folder for a live run, got {stands}: choose another")
+
+
+def what_stands(folder: Path) -> str | None:
+    """What an earlier live run left in a folder, and what can be done with it; None if there was none.
+
+    A live run is not gone on with: its culture has lived on meanwhile. What it recorded and trained is there.
+    """
+    log = folder / LOG_FILE
+    if not log.is_file():
+        return None
+    recordings = sorted(file.name for file in (folder / RECORDINGS).glob("[!.]*.nwb"))
+    policies = sorted(file.name for file in (folder / POLICIES).glob("[!.]*.safetensors"))
+    kept, can = [f"{len(recordings)} recordings"], []
+    if policies:
+        kept.append(f"{len(policies)} policies")
+        can.append(f"`animat run {folder / POLICIES} --recordings {folder / RECORDINGS}` runs them")
+    elif recordings:
+        can.append(f"`animat train --recordings {folder / RECORDINGS}` trains on what was recorded")
+    if (folder / SESSION / SESSION_LOG).is_file():
+        kept.append("a session")
+        can.append(f"`animat recover {folder / SESSION}` writes its recording")
+    return f"a live run that {_ended(log)}, with {', '.join(kept)} ({'; '.join(can) or 'nothing of it can be used'})"
+
+
+def _ended(log: Path) -> str:
+    """How the log of a live run says that it ended."""
+    told: list[dict[str, Any]] = []
+    for line in log.read_text(errors="replace").splitlines():
+        try:
+            told.append(json.loads(line))
+        except ValueError:
+            break
+    if not told or told[-1]["what"] != "end":
+        return "was killed, or still goes on"
+    before = next((line for line in reversed(told[:-1]) if line["what"] in ("interrupted", "fault")), None)
+    if before is not None:
+        return f"ended before its time ({before.get('sentence', before['what'])})"
+    return "is done"
