@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import fidelity
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import fit_empirical, fit_histogram, histogram_range_hz, silenced
+from animat.neurons.simulator import fit_empirical, fit_histogram, silenced
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.protocol import Presentation
 
@@ -66,10 +66,31 @@ def test_a_histogram_draws_a_bin_then_uniformly_inside_it() -> None:
         assert stats.kstest(draw(simulator, i), known.cdf).pvalue > 1e-4
 
 
-def test_the_range_is_the_largest_non_burst_response_rounded_up_to_ten() -> None:
-    assert histogram_range_hz(responses_of([3.0, 57.1], [12.0], bursts_hz=(300.0,))) == 60.0
-    assert histogram_range_hz(responses_of([3.0, 60.0])) == 60.0
-    assert histogram_range_hz(responses_of([0.0, 0.0])) == 10.0
+@settings(max_examples=40, deadline=None)
+@given(
+    # In eighths of a Hz and few, so that many are equal and percentiles fall upon them.
+    eighths=st.lists(st.lists(st.integers(0, 40), min_size=1, max_size=40), min_size=3, max_size=3),
+    bins=st.sampled_from([10, 20, 40]),
+)
+def test_edges_at_percentiles_keep_every_share_that_a_threshold_asks_for(eighths: list[list[int]], bins: int) -> None:
+    values = [np.array(x) / 8 for x in eighths]
+    simulator = fit_histogram(responses_of(*values), bins=bins)
+    q = (np.arange(2_000) + 0.5) / 2_000
+    for i, x in enumerate(values):
+        drawn = np.asarray(jax.vmap(simulator.quantile, (None, 0))(jnp.int32(i), jnp.asarray(q, jnp.float32)))
+        for percentile in np.asarray(simulator.percentiles)[1:-1]:
+            in_data = np.mean(x.astype(np.float32) >= percentile)
+            assert np.mean(drawn >= percentile) == pytest.approx(in_data, abs=1 / 2_000)
+
+
+def test_edges_follow_a_culture_whose_responses_fall() -> None:
+    # Late responses, and one large outlier in them: seventy and ten Hz wide ranges would both be wrong.
+    rng = np.random.default_rng(3)
+    late = [0.2 * rng.gamma(6.0, mean / 6.0, 100) for mean in (30.0, 36.0, 42.0, 48.0, 54.0)]
+    late[4][0] = 500.0
+    simulator = fit_histogram(responses_of(*late))
+    assert simulator.edges_hz.shape == (21,)
+    np.testing.assert_allclose(simulator.edges_hz, np.percentile(np.concatenate(late), np.arange(0, 101, 5)), rtol=1e-6)
 
 
 def test_percentiles_pool_the_non_burst_responses_of_all_conditions() -> None:
@@ -155,10 +176,13 @@ def test_a_timeline_answers_with_the_newest_recording() -> None:
     assert float(held.at(25.0).quantile(jnp.int32(0), jnp.float32(0.5))) == 21.0
 
 
-def test_a_timeline_keeps_the_first_recordings_range() -> None:
-    timeline = fit_timeline([responses_of([55.0] * 9, start_min=0.0), responses_of([155.0] * 9, start_min=10.0)])
-    assert float(timeline.at(10.0).edges_hz[-1]) == 60.0
-    above = [f.sentence for f in timeline.findings if f.name == "above-range"]
+def test_a_timelines_edges_are_each_recordings_own_unless_a_range_is_given() -> None:
+    series = [responses_of([55.0] * 9, start_min=0.0), responses_of([155.0] * 9, start_min=10.0)]
+    own, given = fit_timeline(series), fit_timeline(series, range_hz=120.0)
+    assert [float(own.at(minute).edges_hz[-1]) for minute in (0.0, 10.0)] == [55.0, 155.0]
+    assert [float(given.at(minute).edges_hz[-1]) for minute in (0.0, 10.0)] == [120.0, 120.0]
+    assert [kept.n_above_range for kept in given.fidelities] == [0, 9]
+    above = [f.sentence for f in given.findings if f.name == "above-range"]
     assert len(above) == 1
     assert above[0].startswith("at 10 min: 9 responses")
 

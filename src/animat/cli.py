@@ -47,7 +47,7 @@ class Fitting(Responding):
     bins: int = 20
     """Bins of a histogram"""
     range_hz: float | None = None
-    """Upper end of a histogram's range, in Hz (the paper: 120); default: from the first recording"""
+    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
     despite: tuple[str, ...] = ()
     """Findings to go on in spite of, by name, such as dead-window"""
 

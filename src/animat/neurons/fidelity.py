@@ -44,7 +44,7 @@ class Fidelity:
                     "binning",
                     "warning",
                     f"the histogram changes P(x >= P50) of {self.labels[worst]} from {self.in_data[worst]:.2f} to "
-                    f"{self.in_simulator[worst]:.2f}: take more bins, a smaller range, or the empirical simulator",
+                    f"{self.in_simulator[worst]:.2f}: leave the range out (edges are then percentiles), take more bins, or the empirical simulator",
                     float(loss[worst]),
                 )
             )
@@ -78,6 +78,6 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     x = jax.jit(jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None)))(conditions, uniforms)
     above = 0
     if isinstance(simulator, HistogramSimulator):
-        above = int(np.count_nonzero(responses.rate_hz[kept] > float(simulator.edges_hz[-1])))
+        above = int(np.count_nonzero(responses.rate_hz[kept].astype(np.float32) > np.asarray(simulator.edges_hz)[-1]))
     labels = tuple(condition.label for condition in responses.conditions)
     return Fidelity(labels, in_data, np.asarray(jnp.mean(x >= median, axis=1), np.float64), above)

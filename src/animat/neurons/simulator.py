@@ -109,23 +109,19 @@ class EmpiricalSimulator(NeuronSimulator):
         return self.values_hz[condition, row]
 
 
-def histogram_range_hz(responses: Responses) -> float:
-    """The upper end of a histogram's range: the largest non-burst response, rounded up to 10 Hz (at least 10 Hz).
-
-    The paper's 0-120 Hz was chosen for its culture; on another one a bin can hold several percentiles, and the
-    differences between conditions are lost. So the range is data.
-    """
-    return max(10.0, 10.0 * float(np.ceil(np.max(_non_burst(responses)) / 10.0)))
-
-
 def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
     """Fit a histogram per condition to the non-burst responses.
 
+    The paper's bins are equally wide, over a range that was chosen for its culture. On another one a bin can hold
+    several percentiles, and the differences between conditions that the mapping listens to are lost; responses that
+    fall over the hours lose them later on. So by default the edges are percentiles of the responses themselves: with
+    20 bins P0, P5, ..., P100 of all conditions together, and what lies on either side of P10, P20, ..., P90 is kept.
+
     Args:
         responses: of one recording, every condition with at least one non-burst response.
-        bins: number of bins from 0 to `range_hz` (the paper: 20).
-        range_hz: upper end of the range (the paper: 120); None: `histogram_range_hz(responses)`. Responses above it
-            count into the last bin, and `fidelity` says how many they are.
+        bins: how many (the paper: 20); a multiple of ten keeps all shares that thresholds ask for.
+        range_hz: equally wide bins from 0 to here instead (the paper: 120). Responses above it count into the last
+            bin, and `fidelity` says how many they are.
 
     Raises:
         InvalidArgument: for fewer bins than one or more than `LARGEST_BINS`, or a range that is not positive.
@@ -133,17 +129,20 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
     """
     if not 1 <= bins <= LARGEST_BINS:
         raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS}, got {bins}; the empirical simulator has none")
-    upper = histogram_range_hz(responses) if range_hz is None else range_hz
-    if not (np.isfinite(upper) and upper > 0):
-        raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {upper:g}")
-    edges = np.linspace(0.0, upper, bins + 1)
-    counts = np.array([np.histogram(np.minimum(x, upper), edges)[0] for x in _by_condition(responses)])
+    if range_hz is None:
+        edges = np.percentile(_non_burst(responses), np.linspace(0.0, 100.0, bins + 1))
+    elif np.isfinite(range_hz) and range_hz > 0:
+        edges = np.linspace(0.0, range_hz, bins + 1)
+    else:
+        raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {range_hz:g}")
+    # Counted in the precision that thresholds are compared in: a response that is a percentile lies above its edge.
+    edges = edges.astype(np.float32)
+    values = [np.minimum(x.astype(np.float32), edges[-1]) for x in _by_condition(responses)]
+    counts = np.array([np.histogram(x, edges)[0] for x in values])
     # Whole counts are added up before dividing, so that the last share is exactly 1 and no empty bin is ever drawn.
     below = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
     cumulative = below / below[:, -1:]
-    return HistogramSimulator(
-        jnp.asarray(cumulative, jnp.float32), jnp.asarray(edges, jnp.float32), pooled_percentiles(responses)
-    )
+    return HistogramSimulator(jnp.asarray(cumulative, jnp.float32), jnp.asarray(edges), pooled_percentiles(responses))
 
 
 def fit_empirical(responses: Responses, *, room: int | None = None) -> EmpiricalSimulator:

@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import Kind, NeuronSimulator, fit_empirical, fit_histogram, histogram_range_hz
+from animat.neurons.simulator import Kind, NeuronSimulator, fit_empirical, fit_histogram
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 
@@ -69,8 +69,8 @@ def fit_timeline(
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
         kind: `"histogram"` (the paper) or `"empirical"` (draw a measured value).
         bins: of a histogram.
-        range_hz: upper end of a histogram's range, Hz; None: from the first recording (`histogram_range_hz`), the
-            same for all.
+        range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
+            percentiles are the edges (`fit_histogram`).
 
     Raises:
         InvalidArgument: if there are no responses or the kind is unknown.
@@ -94,8 +94,7 @@ def fit_timeline(
         raise Mismatch(f"start_min: expected one recording a minute mark, got two at {twice:g} min")
 
     if kind == "histogram":
-        upper = histogram_range_hz(first) if range_hz is None else range_hz
-        fitted: list[NeuronSimulator] = [fit_histogram(r, bins=bins, range_hz=upper) for r in ordered]
+        fitted: list[NeuronSimulator] = [fit_histogram(r, bins=bins, range_hz=range_hz) for r in ordered]
     elif kind == "empirical":
         room = max(int(np.bincount(r.condition[~r.is_burst]).max()) for r in ordered)
         fitted = [fit_empirical(r, room=room) for r in ordered]

@@ -95,7 +95,7 @@ class Simulators:
     """How responses are read and neuron simulators made of them; as the options of `animat train`.
 
     Attributes:
-        kind, bins, range_hz: of the simulators; 20 bins up to the first recording's largest response by default.
+        kind, bins, range_hz: of the simulators; by default 20 bins with edges at each recording's own percentiles.
         conditions: what the agent picks from, such as `frequency` or `interval:5,10+-25%`; empty: by frequency.
         window_ms: start and end of the response window.
         burst_threshold: share of active channels above which a response is a burst; None: by Otsu's method.
