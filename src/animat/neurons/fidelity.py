@@ -44,7 +44,8 @@ class Fidelity:
                     "binning",
                     "warning",
                     f"the histogram changes P(x >= P50) of {self.labels[worst]} from {self.in_data[worst]:.2f} to "
-                    f"{self.in_simulator[worst]:.2f}: leave the range out (edges are then percentiles), take more bins, or the empirical simulator",
+                    f"{self.in_simulator[worst]:.2f}: leave the range out (edges are then percentiles), or take "
+                    "more bins or the empirical simulator",
                     float(loss[worst]),
                 )
             )
