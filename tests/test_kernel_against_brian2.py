@@ -1,8 +1,9 @@
 """The tissue's kernel against the same equations in Brian2, an independent simulator.
 
-The kernel computes in single precision, Brian2 in double. Where a spike grazes its threshold it can fall on the next
-step, and what follows from it too: of twelve runs (six seeds, with and without a pulse) ten are the same step by step
-and one stays within one step; seed 3 with a pulse has a spike whose consequences grow to three steps: left out.
+The kernel computes in single precision, Brian2 in double, and yet they give the same spikes, all of them, to the step.
+One thing they must have in common: B(V), which the kernel has as a polynomial that is true to 2e-6 (`test_tissue` holds
+it against the formula). Spikes graze thresholds by less than that: with the formula in Brian2's place three of 24
+runs have spikes one to three steps aside. Both are tested, and no seed is left out.
 
 Brian2 2.9 needs NumPy below 2.4, so it may have to live in an environment of its own: install `brian2`, `numba`,
 `gymnasium`, `jax`, `jaxtyping` and `pytest` there, and with `PYTHONPATH=src` run pytest with `-m oracle` on this file.
@@ -11,6 +12,7 @@ Brian2 2.9 needs NumPy below 2.4, so it may have to live in an environment of it
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -27,45 +29,61 @@ pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore")]
 DURATION_MS = 200.0
 
 
-def quiet(**changes: float) -> TissueParameters:
+def quiet() -> TissueParameters:
     """50 neurons without noise, driven so that they spike, close enough for delays under a refractory period."""
     parameters = TissueParameters(neurons=50, width_um=400.0, height_um=400.0, in_degree_e=12, in_degree_i=5)
-    return replace(parameters, noise_mv=0.0, drive_mv=24.0, **changes)
+    return replace(parameters, noise_mv=0.0, drive_mv=24.0)
 
 
-def both(seed: int, parameters: TissueParameters, pulses: list[Pulse]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Steps and neurons of the spikes of the kernel and of Brian2, each neuron's in the order of time."""
+def pulse() -> Pulse:
+    """On two electrodes, in the middle of the network."""
+    return Pulse(0.05, np.array([120.0, 300.0]), np.array([150.0, 280.0]))
+
+
+def steps_aside(
+    seed: int, pulses: list[Pulse], block: Literal["exact", "fitted"], told: TissueParameters | None = None
+) -> np.ndarray:
+    """By how many steps each spike of the kernel is aside from Brian2's; every neuron must spike as often in both.
+
+    `told` are other parameters for Brian2.
+    """
+    parameters = quiet()
     tissue = Tissue(seed, parameters)
     kicks = [tissue._coupling.kicks(pulse, round(pulse.time_s * 1000 / parameters.step_ms)) for pulse in pulses]
     reference = Brian2Tissue(
-        parameters,
+        told or parameters,
         tissue._network,
         tissue._wiring.needed,
         tissue._state.v_mv.astype(float),
         tissue._state.drive_mv.astype(float),
         kicks=kicks[0] if kicks else None,
+        block=block,
     )
     spikes = tissue.advance(DURATION_MS / 1000, pulses)
-    step = np.rint(spikes.time_s * 1000 / parameters.step_ms).astype(int)
-    results = []
-    for steps, neurons in ((step, spikes.neuron), reference.run(DURATION_MS)):
-        order = np.lexsort((steps, neurons))
-        results.append((steps[order], neurons[order]))
-    return results
+    step, neuron = np.rint(spikes.time_s * 1000 / parameters.step_ms).astype(int), spikes.neuron
+    expected_step, expected_neuron = reference.run(DURATION_MS)
+    order, expected_order = np.lexsort((step, neuron)), np.lexsort((expected_step, expected_neuron))
+    assert len(expected_step) > 100
+    if pulses:
+        assert np.sum(np.abs(expected_step - 250) < 25) > 10
+    np.testing.assert_array_equal(neuron[order], expected_neuron[expected_order])
+    return np.abs(step[order] - expected_step[expected_order])
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
-def test_the_same_spikes_to_one_step(seed: int) -> None:
-    (steps, neurons), (expected_steps, expected_neurons) = both(seed, quiet(), [])
-    assert len(expected_steps) > 100
-    np.testing.assert_array_equal(neurons, expected_neurons)
-    assert np.max(np.abs(steps - expected_steps)) <= 1
+@pytest.mark.parametrize("pulses", [[], [pulse()]], ids=["without", "with a pulse"])
+@pytest.mark.parametrize("seed", range(1, 21))
+def test_the_same_spikes_to_one_step(seed: int, pulses: list[Pulse]) -> None:
+    assert np.max(steps_aside(seed, pulses, "fitted")) <= 1
 
 
-@pytest.mark.parametrize("seed", [1, 2, 4, 5, 6])
-def test_the_same_spikes_to_one_step_with_a_pulse(seed: int) -> None:
-    pulse = Pulse(0.05, np.array([120.0, 300.0]), np.array([150.0, 280.0]))
-    (steps, neurons), (expected_steps, expected_neurons) = both(seed, quiet(), [pulse])
-    assert np.sum(np.abs(expected_steps - 250) < 25) > 10
-    np.testing.assert_array_equal(neurons, expected_neurons)
-    assert np.max(np.abs(steps - expected_steps)) <= 1
+@pytest.mark.parametrize("pulses", [[], [pulse()]], ids=["without", "with a pulse"])
+@pytest.mark.parametrize("seed", range(1, 13))
+def test_with_the_exact_block_of_nmda_no_spike_is_a_millisecond_aside(seed: int, pulses: list[Pulse]) -> None:
+    assert np.max(steps_aside(seed, pulses, "exact")) < 5
+
+
+@pytest.mark.parametrize("change", [{"nmda_ms": 110.1}, {"membrane_e_ms": 20.01}, {"hyperpolarisation": 0.00551}])
+def test_what_is_a_little_different_is_noticed(change: dict[str, float]) -> None:
+    with pytest.raises(AssertionError):
+        for seed in range(1, 6):
+            assert np.max(steps_aside(seed, [pulse()], "fitted", told=replace(quiet(), **change))) <= 1
