@@ -13,13 +13,19 @@ from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
 from animat.evaluation.statistics import compare, holm, interquartile_mean, normalised_score, p_of_u
-from animat.studies.evaluating import last_minute
+from animat.studies.evaluating import as_recorded, last_minute
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
 from animat.studies.paper import PRINTED
-from animat.studies.places import TIMELINE, episodes_file, limits_file, policies_folder, read_table, table_file
+from animat.studies.places import (
+    controls_file,
+    episodes_file,
+    limits_file,
+    policies_folder,
+    read_table,
+    table_file,
+)
 from animat.studies.places import write_table as write
-from animat.studies.simulating import load_timeline
 from animat.studies.specification import Body, Study, StudyCondition
 from animat.training.policy import Policy
 
@@ -81,7 +87,7 @@ class Tabulate(Task):
     """Write `tables/`: scores, comparisons, controls, learning-curves, limits, controllability, findings."""
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        study, timeline = as_recorded(study, folder)
         last = last_minute(timeline)
         files: list[Path] = []
 
@@ -155,21 +161,15 @@ class References:
         return same[0] if same else None
 
 
-def controls_file(folder: Path, body: Body, condition: StudyCondition, what: str = "") -> Path:
-    """The table of controls of a condition's mapping."""
-    held = "-held" if condition.percentiles == "first" else ""
-    return episodes_file(folder, body.name, f"controls-{condition.mapping}{held}{what}")
-
-
 def performances(
-    folder: Path, body: Body, condition: StudyCondition, at_min: float
+    folder: Path, body: Body, condition: StudyCondition, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
-    """Each policy's mean return over its episodes at a minute: the paper's measure of a policy."""
+    """Each policy's mean return over its first `episodes` at a minute, or all: the paper's measure of a policy."""
     returns: dict[str, list[float]] = defaultdict(list)
-    for row in read_table(episodes_file(folder, body.name, condition.slug)):
+    for row in read_table(episodes_file(folder, body, condition)):
         if row["at_min"] == at_min:
             returns[row["actor"]].append(row["return"])
-    return np.array([np.mean(of_policy) for of_policy in returns.values()])
+    return np.array([np.mean(of_policy[:episodes]) for of_policy in returns.values()])
 
 
 def _scores(study: Study, folder: Path, last: float, references: dict[str, References]) -> Iterable[tuple[Any, ...]]:
@@ -178,7 +178,7 @@ def _scores(study: Study, folder: Path, last: float, references: dict[str, Refer
         for condition in study.conditions:
             for at_min, episodes in sorted(study.minutes_of(condition, last).items()):
                 means = performances(folder, body, condition, at_min)
-                middle = interquartile_mean(means, seed=study.seed)
+                middle = interquartile_mean(means)
                 limit = known.limit(condition, at_min) or {}
                 yield (
                     body.name,
@@ -206,8 +206,8 @@ def _comparisons(study: Study, folder: Path, last: float, references: dict[str, 
         at_min = last if compared.at_min is None else compared.at_min
         first, second = study.condition(compared.first), study.condition(compared.second)
         for body in study.robots:
-            a, b = (performances(folder, body, condition, at_min) for condition in (first, second))
-            made.append((compared, body, first, second, at_min, a, b, compare(a, b, seed=study.seed)))
+            a, b = (performances(folder, body, side, at_min, compared.episodes) for side in (first, second))
+            made.append((compared, body, first, second, at_min, a, b, compare(a, b)))
     corrected = holm({f"{compared.name}/{body.name}": told.p_normal for compared, body, *_, told in made})
     rows = []
     for compared, body, first, second, at_min, a, b, told in made:
