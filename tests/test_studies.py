@@ -179,7 +179,7 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
     means = []
     for slug in ("before-training", "1-threshold"):
         returns = defaultdict(list)
-        for row in rows(finished / f"episodes/navigation/{slug}.csv"):
+        for row in rows(finished / f"episodes/navigation/{slug}/episodes.csv"):
             if float(row["at_min"]) == 0.0:
                 returns[row["actor"]].append(float(row["return"]))
         assert {len(of_policy) for of_policy in returns.values()} == {5}

@@ -16,7 +16,7 @@ from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.neurons.timeline import SimulatorTimeline
 from animat.studies.jobs import Report, Task
 from animat.studies.paths import record_paths
-from animat.studies.places import TIMELINE, episodes_file, policies_folder, write_table
+from animat.studies.places import TIMELINE, controls_file, episodes_file, policies_folder, write_table
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.training import training_of
@@ -34,7 +34,7 @@ class Evaluate(Task):
     condition: StudyCondition
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        study, timeline = as_recorded(study, folder)
         setting = setting_of(study, self.body, self.condition, timeline)
         networks = _networks(study, folder, self.body, self.condition)
         robot, slug, n = self.body.name, self.condition.slug, study.policies
@@ -42,7 +42,7 @@ class Evaluate(Task):
         for at_min, episodes in study.minutes_of(self.condition, last_minute(timeline)).items():
             seed = draw_seed(study.seed, robot, slug, at_min)
             rows += _rows(at_min, setting.run(networks, n, at_min, episodes, seed), [f"p{i}" for i in range(n)])
-        files = [write_table(episodes_file(folder, robot, slug), HEAD, rows)]
+        files = [write_table(episodes_file(folder, self.body, self.condition), HEAD, rows)]
         if self.condition.through_neurons and timeline is not None:
             over_time = []
             for i, at_min in enumerate(timeline.start_min.tolist()):
@@ -50,7 +50,7 @@ class Evaluate(Task):
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
                 means = setting.run(networks, n, at_min, study.episodes_over_time, seed).returns.mean(axis=1)
                 over_time += [(at_min, f"p{i}", mean) for i, mean in enumerate(means.tolist())]
-            path = episodes_file(folder, robot, f"{slug}-over-time")
+            path = episodes_file(folder, self.body, self.condition, "over-time")
             files.append(write_table(path, ("at_min", "actor", "mean_return"), over_time))
         return [*files, self._paths(study, folder, setting, networks, last_minute(timeline))]
 
@@ -63,7 +63,7 @@ class Evaluate(Task):
             for i in range(length + 1)
         ]
         head = ("actor", "iteration", *(q.name for q in setting.environment.robot.quantities), "command")
-        return write_table(episodes_file(folder, self.body.name, f"{self.condition.slug}-paths"), head, rows)
+        return write_table(episodes_file(folder, self.body, self.condition, "paths"), head, rows)
 
 
 @final
@@ -79,7 +79,7 @@ class Control(Task):
     plain: StudyCondition
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        study, timeline = as_recorded(study, folder)
         condition, robot = replace(self.plain, delivery="chosen"), self.body.name
         setting = setting_of(study, self.body, condition, timeline)
         name = f"controls-{condition.mapping}" + ("-held" if condition.percentiles == "first" else "")
@@ -92,14 +92,14 @@ class Control(Task):
                 seed = draw_seed(study.seed, robot, name, at_min, control)
                 ran = of.run(actor, n, at_min, study.episodes, seed)
                 rows += [(control, *row) for row in _rows(at_min, ran, [f"p{i}" if n > 1 else "" for i in range(n)])]
-        files = [write_table(episodes_file(folder, robot, name), ("control", *HEAD), rows)]
+        files = [write_table(controls_file(folder, self.body, condition), ("control", *HEAD), rows)]
         if timeline is not None and condition.through_neurons:
             over_time = []
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
                 random = setting.run(Uniform(), 1, at_min, study.episodes, seed)
                 over_time.append((at_min, random.returns.mean().item()))
-            path = episodes_file(folder, robot, f"{name}-over-time")
+            path = controls_file(folder, self.body, condition, "over-time")
             files.append(write_table(path, ("at_min", "random"), over_time))
         return files
 
@@ -155,6 +155,12 @@ def setting_of(study: Study, body: Body, condition: StudyCondition, timeline: Si
         timeline = timeline.with_first_percentiles()
     labels = tuple(each.label for each in timeline.conditions)
     return Setting(training.environment(len(timeline.conditions)), timeline, labels)
+
+
+def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | None]:
+    """The study with its comparisons at the minutes of its recordings, and their simulators; None without neurons."""
+    timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+    return study.at_recordings([] if timeline is None else timeline.start_min.tolist()), timeline
 
 
 def is_usual(condition: StudyCondition) -> bool:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import final
 
 from animat.evaluation.optimum import Case, Optimum, best_returns
-from animat.studies.evaluating import last_minute, setting_of
+from animat.studies.evaluating import as_recorded, last_minute, setting_of
 from animat.studies.jobs import Report, Task
-from animat.studies.places import TIMELINE, limits_file, write_table
-from animat.studies.simulating import load_timeline
+from animat.studies.places import limits_file, write_table
 from animat.studies.specification import Body, Study, StudyCondition
 
 HEAD = (
@@ -52,7 +51,7 @@ class Limit(Task):
     over_time: bool = False
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        study, timeline = as_recorded(study, folder)
         last = last_minute(timeline)
         kinds, minutes = kinds_of(study), study.limit_minutes(last)
         resolution, episodes = self.body.limit_resolution or study.limit_resolution, study.limit_episodes

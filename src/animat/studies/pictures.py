@@ -26,13 +26,20 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, save_figure
-from animat.studies.evaluating import last_minute
+from animat.studies.evaluating import as_recorded, last_minute
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
-from animat.studies.places import RECORDINGS, TIMELINE, episodes_file, limits_file, read_table, table_file
-from animat.studies.simulating import load_timeline, read_series
+from animat.studies.places import (
+    RECORDINGS,
+    controls_file,
+    episodes_file,
+    limits_file,
+    read_table,
+    table_file,
+)
+from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
-from animat.studies.tabulating import References, controls_file, performances
+from animat.studies.tabulating import References, performances
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,7 +84,7 @@ class RobotPictures(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         robot, name = self.body.robot(), self.body.name
-        timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
+        study, timeline = as_recorded(study, folder)
         last = last_minute(timeline)
         known = References(study, folder, self.body)
         figures: dict[str, Figure] = {}
@@ -148,7 +155,7 @@ def _pairs(study: Study, folder: Path, body: Body, known: References, last: floa
             groups.append(
                 Group(
                     condition.name,
-                    performances(folder, body, condition, at_min),
+                    performances(folder, body, condition, at_min, compared.episodes),
                     known.random(condition, at_min),
                     None if limit is None else limit["best_return"],
                 )
@@ -163,13 +170,13 @@ def _draw_course(study: Study, folder: Path, body: Body, start_min: float) -> Fi
     for condition in [c for c in study.conditions if c.through_neurons][:_MOST_COURSES]:
         of_policy: dict[str, list[float]] = defaultdict(list)
         minutes: list[float] = []
-        for row in read_table(episodes_file(folder, body.name, f"{condition.slug}-over-time")):
+        for row in read_table(episodes_file(folder, body, condition, "over-time")):
             of_policy[row["actor"]].append(row["mean_return"])
             if row["actor"] == "p0":
                 minutes.append(row["at_min"])
         courses.append(Course(condition.name, np.array(minutes), np.array(list(of_policy.values()))))
     kind = next(kind for kind in kinds_of(study) if kind.through_neurons)
-    random = [row["random"] for row in read_table(controls_file(folder, body, kind, "-over-time"))]
+    random = [row["random"] for row in read_table(controls_file(folder, body, kind, "over-time"))]
     limit = [row["best_return"] for row in read_table(limits_file(folder, body.name, "over-time"))]
     return draw_over_time(
         courses,
@@ -204,7 +211,7 @@ def _controls(study: Study, folder: Path, body: Body, known: References, last: f
 def _paths(folder: Path, body: Body, condition: StudyCondition) -> list[tuple[np.ndarray, list[float]]]:
     """Observations and commands of each policy's episode."""
     of_actor: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for row in read_table(episodes_file(folder, body.name, f"{condition.slug}-paths")):
+    for row in read_table(episodes_file(folder, body, condition, "paths")):
         of_actor[row["actor"]].append(row)
     names = [quantity.name for quantity in body.robot().quantities]
     return [

@@ -24,9 +24,18 @@ def policies_folder(folder: Path, body: Body, condition: StudyCondition) -> Path
     return folder / "policies" / body.name / condition.slug
 
 
-def episodes_file(folder: Path, robot: str, what: str) -> Path:
-    """A table of episodes on a robot: of a condition, its paths or means over time, or of controls."""
-    return folder / "episodes" / robot / f"{what}.csv"
+def episodes_file(folder: Path, body: Body, condition: StudyCondition, what: str = "episodes") -> Path:
+    """A table of a condition's policies on a robot: their episodes, their paths, or their means over time.
+
+    Every condition has a folder of its own, so that no name of one can be a file of another's.
+    """
+    return folder / "episodes" / body.name / condition.slug / f"{what}.csv"
+
+
+def controls_file(folder: Path, body: Body, condition: StudyCondition, what: str = "episodes") -> Path:
+    """A table of the controls of a condition's mapping on a robot: their episodes, or random over time."""
+    held = "-held" if condition.percentiles == "first" else ""
+    return folder / "controls" / body.name / f"{condition.mapping}{held}" / f"{what}.csv"
 
 
 def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:

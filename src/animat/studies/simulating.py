@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -38,6 +38,7 @@ class Fit(Task):
         series = read_series(study, folder)
         settings = study.simulators
         timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+        timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)
         rows = (
             (responses.start_min, responses.conditions[c].label, x, ratio, int(burst))
@@ -52,6 +53,21 @@ class Fit(Task):
         )
         head = ("start_min", "condition", "rate_hz", "active_ratio", "is_burst")
         return [folder / TIMELINE, write_table(folder / RESPONSES, head, rows)]
+
+
+def _moved(study: Study, start_min: list[float]) -> list[Finding]:
+    """What is to be said of comparisons at minutes that no recording starts at."""
+    settled = study.at_recordings(start_min).comparisons
+    return [
+        Finding(
+            "comparison-minute",
+            "note",
+            f"{asked.name} was asked for at {asked.at_min:g} min and is made on the recording at {got.at_min:g} min",
+            got.at_min,
+        )
+        for asked, got in zip(study.comparisons, settled, strict=True)
+        if asked.at_min is not None and asked.at_min != got.at_min
+    ]
 
 
 def read_series(study: Study, folder: Path) -> list[Responses]:

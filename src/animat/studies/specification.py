@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from animat.errors import InvalidArgument
@@ -187,7 +188,7 @@ class Compared:
     Attributes:
         name: of the comparison.
         first, second: names of conditions; the second is the one expected to be better.
-        at_min: minute of the recording that they are evaluated on; None: the last.
+        at_min: minute of the recording that they are evaluated on, the nearest to it; None: the last recording.
         episodes: of each policy.
     """
 
@@ -201,6 +202,8 @@ class Compared:
         _check_name("comparisons.name", self.name)
         if self.episodes < 1:
             raise InvalidArgument(f"comparisons.episodes: expected at least 1, got {self.episodes}")
+        if self.at_min is not None and not math.isfinite(self.at_min):
+            raise InvalidArgument(f"comparisons.at_min: expected finite minutes, got {self.at_min:g}")
 
 
 @dataclass(frozen=True)
@@ -263,6 +266,9 @@ class Study:
                         f"comparisons.{side}: expected one of the conditions {', '.join(known)}, got {name!r} in "
                         f"{compared.name!r}"
                     )
+        if self.culture.kind != "files" and self.needs_neurons:
+            for compared in self.comparisons:
+                self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
         if self.algorithm:
             _check_algorithm(self.algorithm)
 
@@ -279,6 +285,32 @@ class Study:
                 minutes[at] = max(minutes.get(at, 0), compared.episodes)
         minutes.setdefault(last_min, self.episodes)
         return minutes
+
+    def at_recordings(self, start_min: Sequence[float]) -> Study:
+        """The same study with every comparison at the minute of a recording: the nearest to its own, or the last.
+
+        Args:
+            start_min: when the recordings start, rising; none without neurons, where every minute is the same.
+
+        Raises:
+            InvalidArgument: for a comparison before the first recording, or after the last by more than an interval.
+        """
+        settled = (replace(each, at_min=self._minute_of(each, start_min)) for each in self.comparisons)
+        return replace(self, comparisons=tuple(settled))
+
+    def _minute_of(self, compared: Compared, start_min: Sequence[float]) -> float:
+        if not start_min:
+            return 0.0
+        first, last = start_min[0], start_min[-1]
+        at = last if compared.at_min is None else compared.at_min
+        gaps = (later - earlier for earlier, later in itertools.pairwise(start_min))
+        longest = max(gaps, default=self.culture.interval_min)
+        if not first - longest <= at <= last + longest:
+            raise InvalidArgument(
+                f"comparisons.at_min: expected a minute of the recordings, from {first:g} to {last:g}, got {at:g} in "
+                f"{compared.name!r}"
+            )
+        return min(start_min, key=lambda start: (abs(start - at), start))
 
     def limit_minutes(self, last_min: float) -> list[float]:
         """Minutes at which anything is evaluated, rising."""
