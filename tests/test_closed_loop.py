@@ -12,14 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import (
     AnyCondition,
     Contender,
     HandMadeRule,
+    InTurn,
     OneCondition,
     controls,
     interleaved,
-    lean,
 )
 from animat.closed_loop.following import Following
 from animat.closed_loop.loop import Loop
@@ -35,7 +36,8 @@ from animat.neurons.responses import extract_responses
 from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
-from animat.robots import Cartpole, Navigation
+from animat.robots import Cartpole, Navigation, Robot
+from animat.robots.steering import steering
 from cultures import small_culture
 from fake_culture import CHANNELS, FakeCulture
 
@@ -315,12 +317,41 @@ def test_the_hand_made_rule_steers_the_right_way() -> None:
     assert rule.act(np.array([0.0, 0.0, 0.05, -1.0]), rng) == 0
     # By the robot itself: a push by the rule brings a leaning pole back sooner than the opposite one.
     navigation = Navigation()
-    # At the start the goal is to the right and below, that is, clockwise of facing right.
-    assert lean(navigation, np.array([0.0, 0.0, 0.0])) == pytest.approx(np.pi / 4)
-    assert lean(navigation, np.array([0.0, 0.0, np.pi])) == pytest.approx(-3 * np.pi / 4)
-    assert lean(navigation, np.array([0.9, 0.9, np.pi])) == pytest.approx(np.pi / 4)
-    names = [c.name for c in controls(Cartpole(), ["a", "b"], strongest=1, weakest=0, policy=rule)]
+    # The oracle is the angle itself: from the heading to the goal, the short way round.
+    places = rng.uniform([-1, -1, -np.pi], [1, 1, np.pi], (500, 3))
+    to_goal = np.arctan2(navigation.goal_y_m - places[:, 1], navigation.goal_x_m - places[:, 0]) - places[:, 2]
+    turn_rad = (to_goal + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_array_equal(np.sign(steering(navigation, places)), np.sign(turn_rad))
+    names = [c.name for c in controls(Cartpole(), ["a", "b"], strongest=1, weakest=0, policies={"p0": rule})]
     assert names == ["random", "constant a", "constant b", "silent", "shuffled", "hand-made"]
+
+
+@pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
+def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot: Robot[Any]) -> None:
+    """Commands of full power by the rule, and by the rule turned round."""
+    lasted = {}
+    for sign in (1, -1):
+        body = Body(robot, np.random.default_rng(1))
+        observation, total = body.reset(), 0.0
+        for _ in range(robot.episode_limit):
+            moved = body.step(sign * (1.0 if steering(robot, observation) > 0 else -1.0))
+            observation, total = moved.observation, total + moved.reward
+            if moved.terminated:
+                break
+        lasted[sign] = total
+    assert lasted[1] > lasted[-1] + 10
+
+
+def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
+    who = InTurn({f"p{i}": OneCondition(i) for i in range(3)})
+    contenders = [RANDOM, Contender("silent", "", who, "silent"), Contender("shuffled", "", who, "shuffled")]
+    with FakeCulture() as culture:
+        session = run_session(culture, loop_of(), contenders, tmp_path, episodes=5)
+    for name in ("silent", "shuffled"):
+        episodes = [episode.number for episode in session.episodes if episode.contender == name]
+        chosen = [{tick.chosen for tick in session.ticks if tick.episode == number} for number in episodes]
+        assert chosen == [{0}, {1}, {2}, {0}, {1}]
+    assert [told.get("in_turn") for told in session.log.header["contenders"]] == [None, *[["p0", "p1", "p2"]] * 2]
 
 
 def test_a_budget_is_kept_to_the_pulse() -> None:

@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
     "cultures": {"recordings"},
     "closed_loop": {"cultures", "neurons", "mapping", "robots", "recordings"},
-    "reality_gap": {"closed_loop", "cultures", "evaluation", "training", "animat", "neurons", "recordings"},
+    "reality_gap": {"closed_loop", "cultures", "evaluation", "training", "animat", "neurons", "robots", "recordings"},
     "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
     "studies": {

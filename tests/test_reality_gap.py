@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.animat import Animat
 from animat.cli import main
-from animat.closed_loop.contenders import lean
+from animat.closed_loop.contenders import HandMadeRule
 from animat.closed_loop.session import read_session
 from animat.cultures.budget import Account, Budget
 from animat.cultures.cl1 import CL1Culture
@@ -27,6 +28,7 @@ from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.mapping import Thresholds
 from animat.neurons.responses import Responses, extract_responses
+from animat.neurons.simulator import silenced
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, run_policies
 from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Presentation, Protocol
@@ -111,6 +113,15 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
             seed=1,
         )
         np.testing.assert_array_equal(rows[name].predicted, rolled.returns[0])
+    # Under the controls of the policies, all of them act.
+    both = networks_of(list(policies.values()), greedy=True)
+    for name, in_, on in (
+        ("silent", environment, silenced(calibration.simulator)),
+        ("shuffled", replace(environment, delivery="shuffled"), calibration.simulator),
+    ):
+        rolled = roll_out(in_, on, both, 2, episodes=PREDICTED_EPISODES, seed=1)
+        np.testing.assert_array_equal(rows[name].predicted, rolled.returns.ravel())
+    assert gap.session.log.header["contenders"][-2]["in_turn"] == ["p0", "p1"]
     # A silent culture commands -1 throughout; the robot of the test has no noise: one return, and it is lived too.
     assert np.ptp(rows["silent"].predicted) == 0
     assert rows["silent"].pulses_per_action == 0
@@ -128,12 +139,42 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     assert [row["name"] for row in told["rows"]] == list(rows)
     text = gap.to_text()
     assert all(name in text for name in rows)
+    beaten = {row.name for row in gap.rows[3:] if row.p is not None and row.p < 0.01 and row.wins is not None
+              and row.wins > 0.5}  # fmt: skip
+    assert gap.not_beaten is not None
+    assert set(gap.not_beaten) == {row.name for row in gap.rows[3:]} - beaten
+    assert gap.verdict() in text
+
+
+def test_the_verdict_says_which_controls_are_beaten_and_by_how_much_others_are_not(
+    tmp_path: Path, series: list[Responses]
+) -> None:
+    gap, _ = run(tmp_path, series, with_controls=False)
+    policies, *each, random = gap.rows
+
+    def verdict(p: float, wins: float, lived: float) -> str:
+        rows = (replace(policies, lived=np.full(20, lived)), *each, replace(random, p=p, wins=wins))
+        return replace(gap, rows=rows).verdict()
+
+    high = float(policies.predicted.max()) + 1
+    assert verdict(0.001, 0.9, high) == "the policies live larger returns than each control (p < 0.01)"
+    assert "do not live larger returns (p < 0.01) than: random (60 %)" in verdict(0.02, 0.6, high)
+    # Significantly worse is not beaten.
+    assert "random (10 %)" in verdict(0.001, 0.1, high)
+    assert "they live less than predicted" in verdict(0.001, 0.9, float(policies.predicted.min()) - 1)
+
+
+def test_a_policy_may_have_the_name_of_a_control_that_is_not_run(tmp_path: Path, series: list[Responses]) -> None:
+    named = {"silent": policy_of(0, series)}
+    with FakeCulture() as culture:
+        gap = run_policies(named, culture, Calibration.of_series(series), tmp_path, episodes=1, with_controls=False)
+    other, _ = run(tmp_path / "other", series, with_controls=False)
+    np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[1].predicted)
+    assert gap.rows[0].pulses_per_action == 2
 
 
 @pytest.mark.oracle
 def test_an_interval_of_the_gap_covers_it_as_often_as_it_says(series: list[Responses], tmp_path: Path) -> None:
-    from dataclasses import replace
-
     gap, _ = run(tmp_path, series, with_controls=False)
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
     rng = np.random.default_rng(5)
@@ -158,7 +199,7 @@ def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Re
         assert int(rule.right[0]) == 4
         observed = rng.uniform(low, high, (500, len(low)))
         predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros(500))
-        lived = np.where(np.array([lean(robot, o) for o in observed]) > 0, rule.right, rule.left)
+        lived = [HandMadeRule(robot, int(rule.right[0]), int(rule.left[0])).act(o, rng) for o in observed]
         np.testing.assert_array_equal(np.asarray(predicted), lived)
 
 
@@ -369,8 +410,6 @@ class TestCommand:
 
 
 def test_a_cl1_is_stimulated_through_the_patterns_that_it_was_recorded_with(recordings: list[Recording]) -> None:
-    from dataclasses import replace
-
     drawn = replace(recordings[0], provenance={"source": "CL1 (device) by animat.cultures.cl1", "pattern_seed": "7"})
     known = recorded_culture("cl1", [drawn], [])
     np.testing.assert_array_equal(culture_of("cl1", **known).patterns, CL1Culture(seed=7).patterns)

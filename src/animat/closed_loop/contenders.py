@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
-from animat.errors import InvalidArgument
 from animat.robots.base import Robot
-from animat.robots.cartpole import Cartpole
-from animat.robots.navigation import Navigation
+from animat.robots.steering import STEERED, steering
 
 Delivery = Literal["chosen", "shuffled", "silent"]
-
-FORESIGHT_S = 0.1
-"""The hand-made rule for the cartpole looks at where the pole will be after this time."""
 
 
 class Controller(Protocol):
@@ -65,7 +60,7 @@ class HandMadeRule:
     """Lean right, push right: the condition that is answered most strongly where the command should be positive.
 
     Attributes:
-        robot: one of those that `lean` knows.
+        robot: one that there is a rule for (`animat.robots.steering`).
         up, down: the conditions with the largest and the smallest mean command.
     """
 
@@ -75,30 +70,27 @@ class HandMadeRule:
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
         """Up or down."""
-        return self.up if lean(self.robot, observation) > 0 else self.down
+        return self.up if steering(self.robot, observation) > 0 else self.down
 
 
-def lean(robot: Robot[Any], observation: Any, xp: Any = np) -> Any:
-    """What a hand-made rule steers by, positive where the command should be: no learning, one line a robot.
+@dataclass(frozen=True)
+class InTurn:
+    """Several who take turns, an episode each: a control is then one of all policies, and not of one of them.
 
-    Cartpole: the pole's angle 0.1 s from now at its present rate, rad. Navigation: the turn that would face the goal,
-    in (-pi, pi], rad.
-
-    Args:
-        robot: whose observation it is.
-        observation: in the robot's own units, the observations on the last axis.
-        xp: the array library, numpy or jax.numpy.
-
-    Raises:
-        InvalidArgument: for a robot that no rule was made for.
+    Attributes:
+        by_name: who, in their order.
     """
-    if isinstance(robot, Cartpole):
-        return observation[..., 2] + FORESIGHT_S * observation[..., 3]
-    if isinstance(robot, Navigation):
-        x_m, y_m, heading_rad = observation[..., 0], observation[..., 1], observation[..., 2]
-        turn_rad = xp.arctan2(robot.goal_y_m - y_m, robot.goal_x_m - x_m) - heading_rad
-        return xp.pi - (xp.pi - turn_rad) % (2 * xp.pi)
-    raise InvalidArgument(f"robot: expected one with a hand-made rule (cartpole, navigation), got {robot.name}")
+
+    by_name: Mapping[str, Controller]
+
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int | float:
+        """The first one's choice; the loop takes each at its turn (`Contender.acting`)."""
+        return self.acting(0).act(observation, rng)
+
+    def acting(self, turn: int) -> Controller:
+        """Whose turn it is."""
+        controllers = tuple(self.by_name.values())
+        return controllers[turn % len(controllers)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +113,23 @@ class Contender:
     delivery: Delivery = "chosen"
     calibrates: bool = True
 
+    def acting(self, turn: int) -> Controller:
+        """Who chooses in the contender's episode number `turn`, counted from 0."""
+        return self.controller.acting(turn) if isinstance(self.controller, InTurn) else self.controller
+
+
+def random_control(n_conditions: int) -> Contender:
+    """The control that chooses any condition."""
+    return Contender("random", "any condition, equally likely", AnyCondition(n_conditions))
+
 
 def controls(
-    robot: Robot[Any], labels: Sequence[str], *, strongest: int, weakest: int, policy: Controller | None = None
+    robot: Robot[Any],
+    labels: Sequence[str],
+    *,
+    strongest: int,
+    weakest: int,
+    policies: Mapping[str, Controller] | None = None,
 ) -> list[Contender]:
     """The controls of the study.
 
@@ -131,15 +137,17 @@ def controls(
         robot: that is driven; without a hand-made rule for it, that control is left out.
         labels: of the conditions, in the order of their index.
         strongest, weakest: the conditions with the largest and the smallest mean command: for the hand-made rule.
-        policy: what acts under the silent and the shuffled control; without one these two are left out.
+        policies: by name, who act in turn under the silent and the shuffled control; without any these two are left
+            out.
     """
-    found = [Contender("random", "any condition, equally likely", AnyCondition(len(labels)))]
+    found = [random_control(len(labels))]
     for i, label in enumerate(labels):
         found.append(Contender(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
-    if policy is not None:
-        found.append(Contender("silent", "no pulse; the culture's own activity is read", policy, "silent"))
-        found.append(Contender("shuffled", "the delivered condition is drawn anew", policy, "shuffled"))
-    if isinstance(robot, Cartpole | Navigation):
+    if policies:
+        who = InTurn(dict(policies))
+        found.append(Contender("silent", "no pulse; the culture's own activity is read", who, "silent"))
+        found.append(Contender("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
+    if isinstance(robot, STEERED):
         rule = HandMadeRule(robot, strongest, weakest)
         found.append(Contender("hand-made", f"lean right, push right: {labels[strongest]} or {labels[weakest]}", rule))
     return found

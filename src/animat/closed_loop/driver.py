@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from animat.closed_loop.answers import in_words, wrong_with
 from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import Contender
+from animat.closed_loop.contenders import Contender, Controller
 from animat.closed_loop.following import Following
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
@@ -76,6 +76,7 @@ class Driver:
         self._percentiles = loop.percentiles
         self._patterns = [tuple(int(e) for e in row if e != UNKNOWN) for row in usable]
         self._deck: list[int] = []
+        self._begun: Counter[str] = Counter()
         self._presented = self._stretches = 0
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
@@ -97,6 +98,8 @@ class Driver:
 
     def _run_episode(self, episode: int, contender: Contender) -> None:
         loop = self._loop
+        controller = contender.acting(self._begun[contender.name])
+        self._begun[contender.name] += 1
         observation = self._body.reset()
         self._last_command = 0.0
         self._see((), loop.pause_s, pause=True)
@@ -108,7 +111,7 @@ class Driver:
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
         for iteration in range(loop.robot.episode_limit):
-            chosen = self._choose(contender, observation)
+            chosen = self._choose(contender, controller, observation)
             repeats = 0
             while True:
                 delivered = chosen
@@ -122,11 +125,13 @@ class Driver:
                 break
             observation = np.array(tick.observation)
 
-    def _choose(self, contender: Contender, observation: Float64[np.ndarray, " observations"]) -> int:
+    def _choose(
+        self, contender: Contender, controller: Controller, observation: Float64[np.ndarray, " observations"]
+    ) -> int:
         n = len(self._loop.conditions)
         self._expect(contender.name)
         try:
-            chosen = int(contender.controller.act(observation, self._rng))
+            chosen = int(controller.act(observation, self._rng))
         except Exception as error:
             raise Stop(Ending("controller", f"{contender.name} raised {in_words(error)}")) from error
         if not 0 <= chosen < n:

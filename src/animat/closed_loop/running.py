@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.answers import in_words
-from animat.closed_loop.contenders import Contender, interleaved
+from animat.closed_loop.contenders import Contender, InTurn, interleaved
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.interrupts import told_instead
 from animat.closed_loop.log import LogWriter, Record
@@ -222,10 +222,18 @@ def _header(
         "provenance": culture.provenance,
         "limits": asdict(culture.limits),
         "loop": loop.to_dict(),
-        "contenders": [{"name": c.name, "meaning": c.meaning, "delivery": c.delivery} for c in contenders],
+        "contenders": [_told(contender) for contender in contenders],
         "turns": [contenders[turn].name for turn in turns],
         "seed": seed,
     }
+
+
+def _told(contender: Contender) -> dict[str, Any]:
+    told: dict[str, Any] = {"name": contender.name, "meaning": contender.meaning, "delivery": contender.delivery}
+    if isinstance(contender.controller, InTurn):
+        # Episode after episode of this contender, over and over.
+        told["in_turn"] = list(contender.controller.by_name)
+    return told
 
 
 def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episodes: int, seed: int) -> None:

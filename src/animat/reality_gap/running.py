@@ -12,7 +12,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.animat import Animat
-from animat.closed_loop.contenders import Contender, Greedy, controls
+from animat.closed_loop.contenders import (
+    AnyCondition,
+    Contender,
+    Greedy,
+    HandMadeRule,
+    InTurn,
+    OneCondition,
+    controls,
+    random_control,
+)
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
@@ -27,6 +36,7 @@ from animat.progress import Progress
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding
+from animat.robots.steering import STEERED
 from animat.training.policy import Policy
 
 PREDICTED_EPISODES = 200
@@ -52,8 +62,8 @@ def run_policies(
 ) -> RealityGap:
     """Run policies, and the controls of the study between them, in closed loop, and compare with the prediction.
 
-    Episodes of all of them are interleaved in random order on the one culture, so that drift hits all alike. The silent
-    and the shuffled control are the first policy's.
+    Episodes of all of them are interleaved in random order on the one culture, so that drift hits all alike. Under the
+    silent and the shuffled control the policies take turns, episode after episode.
 
     Args:
         policies: by name, of one robot, mapping and set of conditions.
@@ -97,35 +107,23 @@ def run_policies(
     contenders = [Contender(name, "as trained", controller) for name, controller in acting.items()]
     rule = None
     if with_controls:
-        rule = hand_made(environment, simulator)
+        rule = hand_made(environment, simulator) if isinstance(loop.robot, STEERED) else None
         contenders += controls(
             loop.robot,
             [condition.label for condition in loop.conditions],
-            strongest=int(np.ravel(rule.right)[0]),
-            weakest=int(np.ravel(rule.left)[0]),
-            policy=acting[next(iter(policies))],
+            strongest=0 if rule is None else int(np.ravel(rule.right)[0]),
+            weakest=0 if rule is None else int(np.ravel(rule.left)[0]),
+            policies=acting,
         )
     else:
-        contenders += controls(loop.robot, [c.label for c in loop.conditions], strongest=0, weakest=0)[:1]
+        contenders.append(random_control(len(loop.conditions)))
 
     def predict(contender: Contender) -> Float64[np.ndarray, " episodes"]:
         """The same contender on the simulator."""
-        in_, on = environment, simulator
-        actor: Actor = networks_of([policies.get(contender.name, first)], greedy=greedy)
-        if contender.name == "random":
-            actor = Uniform()
-        elif contender.name.startswith("constant "):
-            actor = Constant(jnp.array([contender.controller.act(np.empty(0), np.random.default_rng())]))
-        elif contender.name == "hand-made" and rule is not None:
-            actor = rule
-        elif contender.name == "silent":
-            on = silenced(simulator)
-        elif contender.name == "shuffled":
-            in_ = replace(environment, delivery="shuffled")
-        returns: Float64[np.ndarray, " episodes"] = roll_out(
-            in_, on, actor, 1, episodes=PREDICTED_EPISODES, seed=seed
-        ).returns[0]
-        return returns
+        actor, many = _actor(contender.controller, rule, greedy=greedy)
+        in_ = replace(environment, delivery="shuffled") if contender.delivery == "shuffled" else environment
+        on = silenced(simulator) if contender.delivery == "silent" else simulator
+        return roll_out(in_, on, actor, many, episodes=PREDICTED_EPISODES, seed=seed).returns.ravel()
 
     predicted = {contender.name: predict(contender) for contender in contenders}
     session = run_session(
@@ -142,6 +140,19 @@ def run_policies(
         account,
         (*noticed, *findings, *calibration.findings),
     )
+
+
+def _actor(controller: Any, rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
+    """Who acts on the simulator as a controller does on the culture, and how many they are."""
+    if isinstance(controller, AnyCondition):
+        return Uniform(), 1
+    if isinstance(controller, OneCondition):
+        return Constant(jnp.array([controller.condition])), 1
+    if isinstance(controller, HandMadeRule) and rule is not None:
+        return rule, 1
+    acting = list(controller.by_name.values()) if isinstance(controller, InTurn) else [controller]
+    policies: list[Any] = [each.policy if isinstance(each, Greedy) else each for each in acting]
+    return networks_of(policies, greedy=greedy), len(policies)
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

@@ -15,6 +15,7 @@ from animat.evaluation.statistics import Interval
 from animat.recordings.findings import Finding
 
 CONFIDENCE = 0.95
+BEATEN_P = 0.01
 _RESAMPLES = 10_000
 
 
@@ -96,6 +97,32 @@ class RealityGap:
     account: Account
     findings: tuple[Finding, ...]
 
+    @property
+    def not_beaten(self) -> tuple[str, ...] | None:
+        """Controls that the policies do not live larger returns than (p < 0.01, by rank); None if none was lived."""
+        controls = [row for row in self.rows if row.p is not None]
+        beaten = [row for row in controls if row.p is not None and row.p < BEATEN_P and (row.wins or 0) > 0.5]
+        return tuple(row.name for row in controls if row not in beaten) if controls else None
+
+    def verdict(self) -> str:
+        """Whether the policies beat the controls, by how much they do not, and what the gap may come from."""
+        names = self.not_beaten
+        if names is None:
+            return "no control was lived to its end: nothing can be said of the policies beside them"
+        if not names:
+            said = f"the policies live larger returns than each control (p < {BEATEN_P:g})"
+        else:
+            rows = {row.name: row for row in self.rows}
+            told = ", ".join(f"{name} ({100 * (rows[name].wins or 0):.0f} %)" for name in names)
+            said = (
+                f"the policies do not live larger returns (p < {BEATEN_P:g}) than: {told}; in brackets, the pairs of "
+                "episodes in which theirs is larger"
+            )
+        policies = self.rows[0]
+        if len(policies.lived) and policies.gap.high < 0:
+            said += "; they live less than predicted: a simulator has no memory and does not tire, a culture does both"
+        return said
+
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
@@ -104,6 +131,8 @@ class RealityGap:
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
             "rows": [row.to_dict() for row in self.rows],
+            "not_beaten": self.not_beaten,
+            "verdict": self.verdict(),
             "session": self.session.to_dict(),
             "folder": str(self.session.folder),
             "budget": self.account.to_dict(),
@@ -131,6 +160,7 @@ class RealityGap:
                 f"{p:>8}  {row.meaning}"
             )
         outline = self.session.to_dict()
+        lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies live no other returns than this control; stimulation: {self.account}")
         lines.append(
             f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
