@@ -62,6 +62,29 @@ def test_a_strong_response_is_no_artefact() -> None:
     assert "artefact-spikes" not in findings(MadeUpCulture(seed=2).record(0.0))
 
 
+@pytest.mark.parametrize("peak_ms", [2.6, 3.0, 4.0])
+def test_an_early_and_sharp_response_is_no_artefact_and_hides_none(peak_ms: float) -> None:
+    source = answering({5: 0.0, 10: 0.0})
+    rng = np.random.default_rng(2)
+    response = [(t + 1e-3 * rng.normal(peak_ms, 0.6), c % 40) for t in source.stimuli.time_s for c in range(20)]
+    assert "artefact-spikes" not in findings(with_spikes(source, np.array(response)))
+    # A pulse counted as a spike on some channels, before it, is one still.
+    artefact = [(t + 1e-3 * rng.uniform(0, 0.5), c) for t in source.stimuli.time_s for c in range(5)]
+    found = findings(with_spikes(source, np.vstack([response, artefact])))["artefact-spikes"]
+    assert found.severity == "note"
+    assert "from 0 to 0.5 ms there are 5" in found.sentence
+
+
+@pytest.mark.parametrize("hit", [1, 2])
+def test_a_burst_that_falls_on_a_stimulus_is_no_artefact(hit: int) -> None:
+    source = answering({5: 10.0, 10: 30.0}, n=15)
+    rng = np.random.default_rng(3)
+    burst = [
+        (t + 1e-3 * rng.uniform(-1, 2.4), c) for t in source.stimuli.time_s[:hit] for c in range(40) for _ in range(9)
+    ]
+    assert "artefact-spikes" not in findings(with_spikes(source, np.vstack([spikes_of(source), burst])))
+
+
 @pytest.mark.parametrize(("until_ms", "severity"), [(2.0, "note"), (3.0, "note"), (6.0, "warning")])
 def test_a_blanked_stretch_is_told_from_a_quiet_culture(until_ms: float, severity: str) -> None:
     source = answering({5: 30.0, 10: 60.0}, n=150)

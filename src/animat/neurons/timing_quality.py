@@ -23,6 +23,9 @@ TIMES = 5.0
 AFTERWARDS = 6
 """Bins after an artefact that tell whether a response follows."""
 TIMES_RESPONSE = 2.0
+LEFT_OUT, LEFT_OUT_SHARE = 2, 0.02
+"""Stimuli with the most spikes in the artefact's largest bin, without which it must still be one: a burst may have
+happened to fall there."""
 ENOUGH = 10.0
 """Spikes expected without a blank, to tell one."""
 
@@ -30,12 +33,14 @@ ENOUGH = 10.0
 def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
     """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
 
-    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around the
-    largest one before 2 ms in which b is above five times both the spontaneous rate and the median of b from 3 to 20 ms
-    after, above twice the upper quartile of the latter, which is the response where there is one, and, if the culture
-    goes on firing afterwards, above a third of the largest bin. The blank is the run of bins around 0, without the
-    artefact, in which b is below a fifth of the spontaneous rate; it is looked for where 10 spikes or more would be in
-    it.
+    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around
+    the largest one before 2 ms in which b is above five times both the spontaneous rate and the median of b from 3
+    to 20 ms after, above twice the upper quartile of the latter, which is the response where there is one, and, if
+    the culture goes on firing afterwards or rises again, above a third of the largest bin. Where the bins rise from
+    there to twice as much without a valley, the response begins early and there is no artefact; nor where the
+    largest bin is not above all that without the two stimuli, or the fiftieth of them, that have the most spikes in
+    it. The blank is the run of bins around 0, without the artefact, in which b is below a fifth of the spontaneous
+    rate; it is looked for where 10 spikes or more would be in it.
 
     Args:
         recording: with stimuli.
@@ -59,7 +64,8 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
     usual = max(spontaneous, float(np.median(later)), 1.0)
     # Responses can begin before 2 ms: what is no sharper than the response later on is one.
     usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
-    artefact = _artefact(centre_ms, count, usual, max(spontaneous, 1.0))
+    times_s = stimuli.time_s[chosen]
+    artefact = _artefact(centre_ms, count, usual, max(spontaneous, 1.0), recording.spike_times_s, times_s)
     if artefact is not None:
         yield _artefact_finding(centre_ms, count, artefact, usual, recording, histogram.n_stimuli, window_ms)
     if quiet_s > 0 and spontaneous > 0:
@@ -67,19 +73,34 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
 
 
 def _artefact(
-    centre_ms: Float64[np.ndarray, " bins"], count: Float64[np.ndarray, " bins"], usual: float, spontaneous: float
+    centre_ms: Float64[np.ndarray, " bins"],
+    count: Float64[np.ndarray, " bins"],
+    usual: float,
+    spontaneous: float,
+    spike_times_s: Float64[np.ndarray, " spikes"],
+    stimulus_s: Float64[np.ndarray, " stimuli"],
 ) -> tuple[int, int] | None:
     """First and last bin of the artefact; None where there is none."""
     above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
     early = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
-    if not len(early):
-        return None
-    largest = int(early[np.argmax(count[early])])
-    first, last = _run(above, largest)
-    if np.mean(count[last + 1 : last + 1 + AFTERWARDS]) > spontaneous:
-        # A response may follow at once: the artefact ends where its spikes are a third as many as at its height.
-        first, last = _run(above & (count >= count[largest] / 3), largest)
-    return first, last
+    for largest in early[np.argsort(-count[early], kind="stable")].tolist():
+        first, last = _run(above, largest)
+        height, after = count[largest], count[largest : last + 1]
+        top, low = int(np.argmax(after)), np.flatnonzero(after < height / 3)
+        if after[top] >= TIMES_RESPONSE * height and after[: top + 1].min() >= height / 2:
+            # Artefacts are largest first: this is how a response begins.
+            continue
+        rises_again = len(low) > 0 and after[low[0] :].max() >= height / 2
+        edges_s = stimulus_s[:, None] + 1e-3 * (centre_ms[largest] + np.array([-0.5, 0.5]) * BIN_MS)
+        of_each = np.sort(np.diff(np.searchsorted(spike_times_s, edges_s), axis=1)[:, 0])
+        left_out = max(LEFT_OUT, round(LEFT_OUT_SHARE * len(of_each)))
+        if of_each[: max(len(of_each) - left_out, 0)].sum() <= TIMES * usual:
+            continue
+        if rises_again or np.mean(count[last + 1 : last + 1 + AFTERWARDS]) > spontaneous:
+            # A response may follow at once: the artefact ends where its spikes are a third as many as at its height.
+            first, last = _run(above & (count >= height / 3), largest)
+        return first, last
+    return None
 
 
 def _run(flags: Bool[np.ndarray, " bins"], start: int) -> tuple[int, int]:
