@@ -16,7 +16,7 @@ from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import commands_of
 from animat.evaluation.grid import Axis, Grid, grid_for
-from animat.evaluation.optimum import best_return, best_returns
+from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import cubic
 from animat.mapping import Linear, Thresholds
@@ -78,6 +78,7 @@ def test_gamblers_ruin() -> None:
     assert abs(found.without_clock - truth) < 4 * found.without_clock_standard_error
     json.dumps(found.to_dict())
     assert f"{found.value:.1f}" in found.to_text()
+    assert not found.findings()
 
 
 @pytest.mark.parametrize(("limit", "truth"), [(1, 0.0), (2, 0.36), (3, 0.36), (4, 0.36 + 2 * 0.24 * 0.36)])
@@ -190,11 +191,45 @@ def test_more_separated_conditions_allow_more() -> None:
 def test_the_controller_gets_what_was_promised(robot: Robot[Any], mapping: Any) -> None:
     environment = Animat(robot, mapping, 5)
     found = best_return(environment, SIMULATOR)
-    assert abs(found.monte_carlo - found.value) < 4 * found.standard_error + 2 * found.grid_error
+    assert not found.findings()
     assert found.without_clock < found.value + 4 * found.without_clock_standard_error
     for action in range(5):
         constant = roll_out(environment, SIMULATOR, Constant(jnp.array([action])), 1, episodes=1000, seed=2).returns
         assert constant.mean() - 4 * constant.std() / math.sqrt(1000) < found.value
+
+
+def test_without_running_the_controller_only_the_value_is_known() -> None:
+    environment = Animat(Stairs(), Thresholds(1), 2)
+    run, alone = (best_return(environment, coins(3, 6), grid=STEPS, episodes=episodes) for episodes in (20, 0))
+    assert (alone.value, alone.grid_error, alone.nodes) == (run.value, run.grid_error, run.nodes)
+    assert alone.episodes == 0
+    assert alone.to_dict()["monte_carlo"] is None
+    assert "run" not in alone.to_text()
+    assert not alone.findings()
+
+
+def test_a_value_that_its_controller_does_not_get_is_told() -> None:
+    """3 standard errors and the grid's error apart is chance and grid; more is a bracket, or a grid too rough."""
+    assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
+    (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
+    assert "between the two" in above.sentence and above.value == pytest.approx(2.1)
+    (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)
+    assert "too rough" in below.sentence
+
+
+def test_a_grid_too_rough_is_noticed() -> None:
+    """Nine places for an arena in which the goal is a tenth of it."""
+    grid = grid_for(Navigation()).scaled(0.12)
+    found = best_return(WithoutNeurons(Navigation(), None), None, grid=grid, episodes=200)
+    (told,) = found.findings()
+    assert told.name == "limit"
+
+
+def test_the_grid_error_looks_at_headings_too() -> None:
+    """A resolution keeps the headings that turns lead to; the grid that the value is compared with does not."""
+    grid = grid_for(Navigation()).scaled(0.3)
+    assert grid.scaled(0.75).rows[1].nodes == 100
+    assert grid.scaled(0.75, periodic=True).rows[1].nodes == 75
 
 
 @pytest.mark.oracle

@@ -139,16 +139,20 @@ class Grid:
             offsets = (offsets[:, None] + np.arange(TAPS, dtype=np.int32) * np.int32(stride)).ravel()
         return offsets
 
-    def scaled(self, factor: float) -> Grid:
+    def scaled(self, factor: float, *, periodic: bool = False) -> Grid:
         """The same grid with `factor` times as many steps along each axis.
 
-        An axis with a middle node keeps one, as the start is often there; a periodic axis, whose nodes are matched to
-        the turns that a robot makes, is left as it is.
+        An axis with a middle node keeps one, as the start is often there.
+
+        Args:
+            factor: positive.
+            periodic: also along periodic axes, which are left as they are else: their nodes are matched to the turns
+                that a robot makes.
         """
 
         def of(axis: Axis) -> Axis:
             if axis.periodic:
-                return axis
+                return replace(axis, nodes=max(TAPS, round(factor * axis.nodes))) if periodic else axis
             half = max(2, round(factor * (axis.nodes - 1) / 2))
             nodes = 2 * half + 1 if axis.nodes % 2 else max(TAPS, round(factor * (axis.nodes - 1)) + 1)
             return replace(axis, nodes=nodes)

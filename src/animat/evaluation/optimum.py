@@ -20,6 +20,7 @@ from animat.evaluation.landings import Motion
 from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
+from animat.recordings.findings import Finding
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
 """What a limit is asked for: an environment, and the simulator in it (None without neurons)."""
@@ -35,14 +36,16 @@ class Optimum:
     """The best possible mean return of any controller, and how well it is known.
 
     Attributes:
-        value: by dynamic programming, of a controller that knows the time left.
+        value: by dynamic programming, of a controller that knows the time left. What the grid cannot resolve raises it
+            more often than it lowers it, as the best of several values is taken: the upper end of a bracket.
         grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
-        monte_carlo: mean return of that controller, run on the environment itself: a return that can be had.
+        monte_carlo: mean return of that controller, run on the environment itself: a return that can be had, the lower
+            end of the bracket; NaN where it was not run, as the three that follow.
         standard_error: of `monte_carlo`.
         without_clock: mean return of the same controller if it acts as if all of the episode lay ahead, always: what
             can be had without knowing the time, as a policy does not. A better one may exist, not above `value`.
         without_clock_standard_error: of `without_clock`.
-        episodes: that both were measured in.
+        episodes: that both were measured in; 0 where the controller was not run.
         nodes: of the grid.
         horizon_observed: that `value` knows the time left; policies do not.
     """
@@ -58,16 +61,40 @@ class Optimum:
     horizon_observed: bool = True
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        return asdict(self)
+        """Everything as plain data; None where the controller was not run."""
+        told = asdict(self)
+        return {name: None if value != value else value for name, value in told.items()}
 
     def to_text(self) -> str:
         """In a line: the value and how well it is known."""
-        return (
-            f"best possible return {self.value:.1f} (grid {self.grid_error:.1f}); its controller, run: "
-            f"{self.monte_carlo:.1f} ± {self.standard_error:.1f}, without knowing the time left "
-            f"{self.without_clock:.1f} ± {self.without_clock_standard_error:.1f}"
-        )
+        text = f"best possible return {self.value:.1f} (grid {self.grid_error:.1f})"
+        if self.episodes:
+            text += (
+                f"; its controller, run: {self.monte_carlo:.1f} ± {self.standard_error:.1f}, without knowing the time "
+                f"left {self.without_clock:.1f} ± {self.without_clock_standard_error:.1f}"
+            )
+        return text
+
+    def findings(self) -> tuple[Finding, ...]:
+        """A warning where the value and its controller's return part by more than chance and the grid's error."""
+        return bracket_findings(self.value, self.grid_error, self.monte_carlo, self.standard_error)
+
+
+def bracket_findings(value: float, grid_error: float, monte_carlo: float, standard_error: float) -> tuple[Finding, ...]:
+    """A warning where a value parts from its controller's return by more than 3 standard errors and the grid's error.
+
+    Args:
+        value, grid_error, monte_carlo, standard_error: as in `Optimum`.
+    """
+    apart = value - monte_carlo
+    if not abs(apart) > 3 * standard_error + grid_error:
+        return ()  # Neither has NaN, where the controller was not run, anything to tell.
+    told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± "
+    if apart > 0:
+        told += f"{standard_error:.2f} part: the best possible return lies between the two"
+    else:
+        told += f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution"
+    return (Finding("limit", "warning", told, apart),)
 
 
 def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
@@ -97,7 +124,7 @@ def best_returns(
         cases: environments, all of the same robot, each with its simulator (None without neurons).
         grid: over the robot's states; None: `grid_for(robot)`.
         resolution: steps of the grid along each axis, as a multiple; 0.6 is fast and rough.
-        episodes: to run the controller in.
+        episodes: to run the controller in; 0: not at all, which is quicker.
         seed: decides every random draw.
         progress: what to report to.
 
@@ -107,8 +134,8 @@ def best_returns(
     """
     if not cases:
         raise InvalidArgument("cases: expected at least one environment, got none")
-    if episodes < 2:
-        raise InvalidArgument(f"episodes: expected at least 2, got {episodes}")
+    if episodes < 2 and episodes != 0:
+        raise InvalidArgument(f"episodes: expected at least 2, or 0 to run no controller, got {episodes}")
     if not (math.isfinite(resolution) and resolution > 0):
         raise InvalidArgument(f"resolution: expected a positive number, got {resolution!r}")
     robot = cases[0][0].robot
@@ -116,7 +143,7 @@ def best_returns(
         if environment.robot != robot:
             raise Mismatch(f"cases: expected all of one robot, got {robot} and {environment.robot}")
     fine = (grid_for(robot) if grid is None else grid).scaled(resolution)
-    coarse = fine.scaled(COARSER)
+    coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
 
     kept_mib = 2 * fine.size * robot.episode_limit / 2**20
@@ -126,25 +153,33 @@ def best_returns(
         batch = cases[start : start + at_once]
         rough = _Programme(coarse, batch).run(None, seed)
         programme = _Programme(fine, batch)
-        tables = _Tables(fine, len(batch), robot.episode_limit)
+        tables = _Tables(fine, len(batch), robot.episode_limit) if episodes else None
         values = programme.run(tables, seed)
         for case in range(len(batch)):
-            known = programme.play(tables, case, episodes, seed, clock=True)
-            unknown = programme.play(tables, case, episodes, seed, clock=False)
+            known, unknown = (
+                _mean_with_error(None if tables is None else programme.play(tables, case, episodes, seed, clock=clock))
+                for clock in (True, False)
+            )
             optima.append(
                 Optimum(
                     value=float(values[case]),
                     grid_error=float(abs(values[case] - rough[case])),
-                    monte_carlo=float(known.mean()),
-                    standard_error=float(known.std(ddof=1) / math.sqrt(episodes)),
-                    without_clock=float(unknown.mean()),
-                    without_clock_standard_error=float(unknown.std(ddof=1) / math.sqrt(episodes)),
+                    monte_carlo=known[0],
+                    standard_error=known[1],
+                    without_clock=unknown[0],
+                    without_clock_standard_error=unknown[1],
                     episodes=episodes,
                     nodes=fine.size,
                 )
             )
             progress.update(len(optima), len(cases), f"limit {values[case]:.1f}")
     return tuple(optima)
+
+
+def _mean_with_error(returns: Float64[np.ndarray, " episodes"] | None) -> tuple[float, float]:
+    if returns is None:
+        return math.nan, math.nan
+    return float(returns.mean()), float(returns.std(ddof=1) / math.sqrt(len(returns)))
 
 
 class _Tables:
