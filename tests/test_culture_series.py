@@ -102,6 +102,37 @@ def test_a_state_that_is_behind_its_recordings_catches_up(undisturbed: list[Path
     assert same(record(tmp_path / "behind"), undisturbed)
 
 
+def test_killed_after_the_last_recording_its_state_is_made_too(
+    undisturbed: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_state = VirtualCulture.save_state
+
+    def killed_at_the_last(self: VirtualCulture, path: Path, *, sessions: int) -> None:
+        if sessions == 4:
+            raise KeyboardInterrupt
+        save_state(self, path, sessions=sessions)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(VirtualCulture, "save_state", killed_at_the_last)
+        with pytest.raises(KeyboardInterrupt):
+            record(tmp_path / "series")
+    assert len(list((tmp_path / "series").glob("*.nwb"))) == 4
+    (tmp_path / "series" / "selection.json").unlink()
+    assert same(record(tmp_path / "series"), undisturbed)
+    for name in (STATE_FILE, "selection.json"):
+        assert (tmp_path / "series" / name).read_bytes() == (undisturbed[0].parent / name).read_bytes()
+
+
+def test_a_complete_series_gets_its_selection_back_and_needs_no_state(undisturbed: list[Path], tmp_path: Path) -> None:
+    folder = copied(undisturbed, tmp_path / "series")
+    selection = (folder / "selection.json").read_bytes()
+    (folder / "selection.json").unlink()
+    (folder / STATE_FILE).unlink()
+    record(folder)
+    assert (folder / "selection.json").read_bytes() == selection
+    assert not (folder / STATE_FILE).exists()
+
+
 def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path], tmp_path: Path) -> None:
     folder = undisturbed[0].parent
     with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture and protocol \(seed 2\)"):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import json
+import os
 import random
 import re
 import shutil
@@ -14,7 +16,9 @@ import sys
 import time
 from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,6 +27,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.mapping import mapping_named
@@ -31,12 +36,14 @@ from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.selection import SelectionRule
 from animat.report.html import cell
 from animat.robots import Cartpole, Navigation
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
+from animat.studies.folder import sums_of
 from animat.studies.identity import settle_identity
-from animat.studies.jobs import Job, Report, Task, in_order
+from animat.studies.jobs import Job, Receipt, Report, Task, in_order, receipt_of
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
@@ -45,6 +52,7 @@ from animat.studies.simulating import Fit, load_timeline
 from animat.studies.specification import Body, Compared, Simulators, Source, Study, StudyCondition
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import Policy
+from cultures import small_culture
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 
@@ -140,32 +148,178 @@ def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) ->
         run_study(read_study(TINY), tmp_path / "a-file")
 
 
+def test_nothing_of_another_s_folder_is_touched(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    (home / "sub").mkdir(parents=True)
+    for name in ("thesis.txt", "sub/.draft.partial.odt", ".notes.txt.abcd1234.partial.txt"):
+        (home / name).write_text("mine")
+    before = files(home)
+    with pytest.raises(Mismatch, match="other files in it"):
+        run_study(read_study(TINY), home)
+    assert files(home) == before
+
+
+def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    shutil.copytree(finished, folder)
+    unfinished = [".study.toml.abcd1234.partial.toml", "figures/.culture-psth.png.x_y_z_12.partial.png"]
+    kept = ["figures/.my.partial.odt", "mine/.report.html.abcd1234.partial.html"]
+    for name in (*unfinished, *kept):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("half")
+    assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
+    assert not any((folder / name).exists() for name in unfinished)
+    assert all((folder / name).exists() for name in kept)
+
+
+def test_a_second_run_in_a_folder_at_work_is_refused(finished: Path) -> None:
+    with (finished / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(Mismatch, match="another run is at work in this folder"):
+            run_study(read_study(TINY), finished, base=TINY.parent)
+    assert run_study(read_study(TINY), finished, base=TINY.parent).done_now == {}
+
+
+def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = Path.open
+
+    def open_(self: Path, mode: str = "r", *args: Any, **options: Any) -> Any:
+        if mode[0] in "wax":
+            raise PermissionError(13, "Permission denied")
+        return opened(self, mode, *args, **options)
+
+    folder = tmp_path / "archive"
+    shutil.copytree(finished, folder)
+    monkeypatch.setattr(Path, "open", open_)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
+    (folder / "tables/scores.csv").unlink()
+    with pytest.raises(InvalidFile, match=r"archive: .* left, but it cannot be written"):
+        run_study(read_study(TINY), folder, base=TINY.parent)
+    with pytest.raises(InvalidFile, match="cannot be written"):
+        run_study(read_study(TINY), tmp_path / "new", base=TINY.parent)
+
+
+def test_a_specification_can_be_corrected_before_anything_is_made(tmp_path: Path) -> None:
+    study = replace(read_study(TINY), seed=1)
+    for seed in (1, 2):
+        with pytest.raises(AnimatError, match="halted"):
+            run_study(replace(study, seed=seed), tmp_path / "study", executor=Halts())
+    assert read_study(tmp_path / "study" / "study.toml").seed == 2
+    assert json.loads((tmp_path / "study" / "study.json").read_text())["study"]["seed"] == 2
+
+
+@pytest.mark.parametrize("damage", ["fewer spikes", "garbage", "gone"])
+def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Path, damage: str) -> None:
+    folder = tmp_path / "study"
+    shutil.copytree(finished, folder)
+    file = folder / "recordings" / "recording_0000_min.nwb"
+    if damage == "fewer spikes":
+        recording = read_recording(file)
+        kept = np.arange(len(recording.spike_times_s)) % 3 > 0
+        replace(
+            recording,
+            spike_times_s=recording.spike_times_s[kept],
+            spike_channels=recording.spike_channels[kept],
+        ).save(file)
+    elif damage == "garbage":
+        file.write_bytes(b"garbage")
+    else:
+        file.unlink()
+    ran = run_study(read_study(TINY), folder, base=TINY.parent, workers=1)
+    assert set(ran.done_now) == {"record"}
+    assert files(folder) == files(finished)
+
+
+def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rule = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=100)
+    monkeypatch.setattr("animat.cultures.virtual.VirtualCulture", partial(small_culture, rule=rule))
+    study = Study(culture=Source(sessions=2, interval_min=2.0, presentations=2))
+
+    def record(name: str) -> Receipt:
+        job = Job("record", Record(tmp_path))
+        made = job.task.run(study, tmp_path / name, lambda share, words: None)
+        return receipt_of(job, "study", tmp_path / name, made, {})
+
+    undisturbed = record("undisturbed")
+    assert sorted(undisturbed.outputs) == [
+        "recordings/recording_0000_min.nwb", "recordings/recording_0002_min.nwb", "recordings/selection.json",
+    ]  # fmt: skip
+    save_state = VirtualCulture.save_state
+
+    def killed(self: VirtualCulture, path: Path, *, sessions: int) -> None:
+        if sessions == 2:
+            raise KeyboardInterrupt
+        save_state(self, path, sessions=sessions)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(VirtualCulture, "save_state", killed)
+        with pytest.raises(KeyboardInterrupt):
+            record("killed")
+    assert record("killed") == undisturbed
+    assert files(tmp_path / "killed") == files(tmp_path / "undisturbed")
+
+
+def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    for day in ("day1", "day2"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "rec[1]_spikes.csv").write_text(day)
+        (tmp_path / day / "rec[1]_stimuli.csv").write_text(day)
+    both = [tmp_path / day / "rec[1]_spikes.csv" for day in ("day1", "day2")]
+    sums = sums_of(both, tmp_path)
+    assert list(sums) == [f"{day}/rec[1]_{of}.csv" for day in ("day1", "day2") for of in ("spikes", "stimuli")]
+    assert len(set(sums.values())) == 2
+    with pytest.raises(InvalidArgument, match="each file once"):
+        sums_of([both[0], both[0]], tmp_path)
+    with pytest.raises(InvalidFile, match="no such file"):
+        sums_of([tmp_path / "none.nwb"], tmp_path)
+
+
+def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
+    for i, start_min in enumerate((1234567.0, 1234567.25)):
+        make_up_recording(1, start_min=start_min, patterns=5, channels=16).save(tmp_path / f"{i}.nwb")
+    study = Study(culture=Source("files", files=("0.nwb", "1.nwb")))
+    with pytest.raises(InvalidFile, match=r"two that would both be recording_1\.23457e"):
+        Record(tmp_path).run(study, tmp_path / "study", lambda share, words: None)
+
+
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     made = tmp_path / "made"
     write_made_up_series(1, made, sessions=2, patterns=5, channels=16)
     study = Study(culture=Source("files", files=("made",)), robots=(Body("navigation", iterations=100),))
-    with pytest.raises(AnimatError, match="halted"):
-        run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
+    with pytest.raises(AnimatError, match="fit: halted"):
+        run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
     make_up_recording(2, start_min=0.0, patterns=5, channels=16).save(sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
 
 
 class Halts(Executor):
-    """An executor whose first job fails."""
+    """An executor that runs some jobs in this process; the next one fails."""
 
-    def __init__(self) -> None:
-        self._job = ""
+    def __init__(self, after: int = 0) -> None:
+        self._left = after
+        self._told: list[Event] = []
 
     @property
     def free(self) -> int:
-        return int(not self._job)
+        return int(not self._told)
 
     def start(self, job: Job, study: Study, folder: Path) -> None:
-        self._job = job.name
+        if self._left == 0:
+            self._told = [Event(job.name, "failed", words="halted")]
+            return
+        self._left -= 1
+        ran = job.task.run(study, folder, lambda share, words: None)
+        self._told = [Event(job.name, "done", files=tuple(str(file) for file in ran))]
 
     def wait(self) -> list[Event]:
-        return [Event(self._job, "failed", words="halted")]
+        told, self._told = self._told, []
+        return told
 
     def close(self) -> None:
         """Nothing runs."""
@@ -447,7 +601,7 @@ def test_the_rule_made_by_hand_goes_where_it_should(mapping: str) -> None:
         # At the top, looking right: the goal is below, which is clockwise.
         (Navigation(), [0.5, 0.0, 0.0]),
     ):
-        environment = Animat(robot, mapping_named(mapping), 5)
+        environment: Animat[Any] = Animat(robot, mapping_named(mapping), 5)
         rule = hand_made(environment, simulator)
         seen = np.array([lean_right, lean_right]) / environment.scales
         if isinstance(robot, Cartpole):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from animat.errors import InvalidFile
+
+_UNFINISHED = re.compile(r"\..+\.[a-z0-9_]{8}\.partial(\.[^.]*)?")
 
 
 @contextmanager
@@ -44,6 +47,11 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether a file's name is one that `written_whole` gives to what it is just writing, or was when it was killed."""
+    return _UNFINISHED.fullmatch(path.name) is not None
 
 
 def keep_name(folder: Path) -> None:

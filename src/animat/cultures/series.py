@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
@@ -37,8 +38,8 @@ def record_virtual_series(
     """Record a virtual culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
 
     Whatever interrupts it, at whatever moment, calling it again gives the very recordings that an undisturbed run
-    gives. Every file is complete or absent. After each recording the culture's state is written (`culture.state`); a
-    series goes on from it. What lies between the state and the recordings that are there is recorded again and
+    gives, and the state after the last. Every file is complete or absent. After each recording the culture's state is
+    written (`culture.state`); a series goes on from it. What lies between the state and the recordings that are there is recorded again and
     compared; where there is no state, that is all. The electrodes in use are written to `selection.json`.
 
     Args:
@@ -69,10 +70,13 @@ def record_virtual_series(
     for session, file in enumerate(files):
         if file.exists():
             _expect_of_series(file, fresh, protocol, session, 60 * session * interval_min)
-    if there == sessions:
+    _remove_leftovers(folder)
+    if there == sessions and not _is_behind(make_culture(), folder / STATE_FILE, sessions):
+        if not (folder / SELECTION_FILE).exists():
+            with fresh:
+                fresh.selection.save(folder / SELECTION_FILE)
         progress.update(sessions, sessions, "all there already")
         return files
-    _remove_leftovers(folder)
     culture, recorded = _resume(make_culture, folder / STATE_FILE, there)
     with culture:
         if not recorded or not (folder / SELECTION_FILE).exists():
@@ -103,6 +107,19 @@ def _remove_leftovers(folder: Path) -> None:
     for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
         for leftover in folder.glob(f"{name}.*.partial*"):
             leftover.unlink(missing_ok=True)
+
+
+def _is_behind(culture: VirtualCulture, state: Path, sessions: int) -> bool:
+    """Whether a run was killed between the last recording and the state after it: the series is to end with both.
+
+    A state that is missing was taken away, as one is written before the first recording; one that cannot be read
+    matters to a series that goes on, not to one that is complete.
+    """
+    if not state.exists():
+        return False
+    with suppress(InvalidFile, Mismatch):
+        return culture.restore_state(state)["sessions"] < sessions
+    return False
 
 
 def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int) -> tuple[VirtualCulture, int]:

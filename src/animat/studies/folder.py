@@ -6,21 +6,24 @@ import fcntl
 import hashlib
 import importlib.metadata
 import json
+import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from animat.errors import InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.recordings.formats.csv import stimuli_beside
 from animat.studies.jobs import sha256
+from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
-from animat.writing import written_whole
+from animat.writing import is_unfinished, written_whole
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
-_LOCK = ".running"
+_LOCK = ".lock"
 _PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "matplotlib", "jinja2")
 
 
@@ -29,7 +32,7 @@ def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
 
     Args:
         study: the specification.
-        sources: SHA-256 of each file of recordings, by name.
+        sources: SHA-256 of each file of recordings, by its place.
     """
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     told: dict[str, Any] = {
@@ -57,73 +60,103 @@ def source_files(study: Study, base: Path) -> list[Path]:
     return list_recordings([base / name for name in study.culture.files])
 
 
-def sums_of(files: list[Path]) -> dict[str, str]:
-    """SHA-256 of each file, by its name; stimuli beside CSV spikes belong to them."""
-    sums = {}
+def sums_of(files: list[Path], base: Path) -> dict[str, str]:
+    """SHA-256 of each file, by its place as seen from `base`; stimuli beside CSV spikes belong to them.
+
+    Raises:
+        InvalidFile: if one is missing or cannot be read.
+        InvalidArgument: if one is named twice.
+    """
+    sums: dict[str, str] = {}
     for file in files:
-        beside = sorted(file.parent.glob(f"{file.name.split('_spikes.csv')[0]}_stimuli.csv*"))
-        for each in [file, *(beside if "_spikes.csv" in file.name else [])]:
-            if not each.is_file():
-                raise InvalidFile(f"{each}: no such file")
-            sums[each.name] = sha256(each)
+        place = _place(file, base)
+        if place in sums:
+            raise InvalidArgument(f"culture.files: expected each file once, got {file} twice")
+        beside = stimuli_beside(file)
+        for each in [file, *([] if beside is None else [beside])]:
+            try:
+                sums[_place(each, base)] = sha256(each)
+            except FileNotFoundError as error:
+                raise InvalidFile(f"{each}: no such file") from error
+            except OSError as error:
+                raise InvalidFile(f"{each}: cannot be read: {error.strerror or error}") from error
     return dict(sorted(sums.items()))
 
 
-def claim(folder: Path, study: Study, manifest: dict[str, Any]) -> None:
-    """Make the folder this study's, or see that it is.
-
-    Raises:
-        Mismatch: if it is another study's, or holds other files.
-        InvalidFile: if it cannot be read or written.
-    """
-    path = folder / MANIFEST
-    if path.exists():
-        try:
-            found = json.loads(path.read_text())
-            fingerprint = found["fingerprint"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InvalidFile(f"{path}: expected a study's description, got a file that cannot be read") from error
-        if fingerprint != manifest["fingerprint"]:
-            raise Mismatch(
-                f"{folder}: expected a folder of this study, got one of another ({_first_difference(found, manifest)}"
-                "); give another folder, or remove this one"
-            )
-    elif folder.is_dir() and any(entry.name != _LOCK for entry in folder.iterdir()):
-        raise Mismatch(f"{folder}: expected an empty folder or one of this study, got one with other files in it")
-    else:
-        with written_whole(path) as beside:
-            beside.write_text(json.dumps(manifest, indent=1, sort_keys=True) + "\n")
-    if not (folder / SPECIFICATION).exists():
-        with written_whole(folder / SPECIFICATION) as beside:
-            beside.write_text(study_to_toml(study))
+def _place(file: Path, base: Path) -> str:
+    """So that a study and its files can be moved together."""
+    return (file.relative_to(base) if file.is_relative_to(base) else file).as_posix()
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Keep other runs out of the folder, and clear away what a killed one was just writing.
+def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]:
+    """Make the folder this study's, or see that it is; keep other runs out; clear away what a killed one was writing.
+
+    Nothing in the folder is touched before it is known to be this study's. A finished folder that cannot be written
+    to is held without a lock, as nothing can change in it.
 
     Raises:
-        Mismatch: if another run is at work in it.
-        InvalidFile: if the folder cannot be made.
+        Mismatch: if it is another study's, holds other files, or another run is at work in it.
+        InvalidFile: if it cannot be read or made.
     """
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the study, got a file")
+    ours = _is_ours(folder, manifest)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / _LOCK).open("w")
+        # It stays: were it removed, one run could lock the removed file and another one a new file of the same name.
+        lock = (folder / _LOCK).open("a")
     except OSError as error:
+        if ours and not os.access(folder, os.W_OK):
+            yield
+            return
         raise InvalidFile(f"{folder}: cannot be written: {error.strerror or error}") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise Mismatch(f"{folder}: another run is at work in this folder; wait for it, or stop it") from error
-        for leftover in folder.rglob(".*.partial*"):
-            leftover.unlink(missing_ok=True)
-        try:
-            yield
-        finally:
-            (folder / _LOCK).unlink(missing_ok=True)
+        if not _is_ours(folder, manifest):
+            for path, words in (
+                (folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True) + "\n"),
+                (folder / SPECIFICATION, study_to_toml(study)),
+            ):
+                with written_whole(path) as beside:
+                    beside.write_text(words)
+        for leftover in [*folder.iterdir(), *(path for name in OWN_FOLDERS for path in (folder / name).rglob("*"))]:
+            if is_unfinished(leftover):
+                leftover.unlink(missing_ok=True)
+        yield
+
+
+def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
+    """Whether the study is already in the folder; not if it is free for it.
+
+    Raises:
+        Mismatch: if it is another study's, or holds other files.
+        InvalidFile: if its description cannot be read.
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        others = [e for e in folder.iterdir() if e.name != _LOCK and not is_unfinished(e)] if folder.is_dir() else []
+        if others:
+            raise Mismatch(f"{folder}: expected an empty folder or one of this study, got one with other files in it")
+        return False
+    try:
+        found = json.loads(path.read_text())
+        fingerprint = found["fingerprint"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InvalidFile(f"{path}: expected a study's description, got a file that cannot be read") from error
+    if fingerprint == manifest["fingerprint"]:
+        return (folder / SPECIFICATION).exists()
+    # A study that stopped at its first step left a specification and no more.
+    begun = (path for path in folder.rglob("*") if not path.is_dir() and not is_unfinished(path))
+    if any(path.name not in (_LOCK, MANIFEST, SPECIFICATION) for path in begun):
+        raise Mismatch(
+            f"{folder}: expected a folder of this study, got one of another ({_first_difference(found, manifest)}"
+            "); give another folder, or remove this one"
+        )
+    return False
 
 
 def _first_difference(found: Any, wanted: Any, name: str = "") -> str:

@@ -79,7 +79,11 @@ class Receipt:
 
     def is_kept(self, folder: Path) -> bool:
         """Whether all files are there as they were left."""
-        return all((folder / name).is_file() and sha256(folder / name) == sum_ for name, sum_ in self.outputs.items())
+        return not self.changed(folder)
+
+    def changed(self, folder: Path) -> list[str]:
+        """The files that are not there any more as they were left."""
+        return [name for name, sum_ in self.outputs.items() if not _is_file_of(folder / name, sum_)]
 
     @staticmethod
     def load(folder: Path, job: str) -> Receipt | None:
@@ -113,6 +117,13 @@ def sha256(path: Path) -> str:
     """Of a file's contents."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_file_of(path: Path, sum_: str) -> bool:
+    try:
+        return sha256(path) == sum_
+    except OSError:
+        return False
 
 
 def in_order(jobs: Sequence[Job]) -> list[Job]:

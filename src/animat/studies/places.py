@@ -17,6 +17,19 @@ RESPONSES = "simulators/responses.csv"
 REPORT = "report.html"
 UNFINISHED = ".unfinished"
 """For checkpoints; gone when the study is finished."""
+OWN_FOLDERS = (
+    RECORDINGS,
+    "simulators",
+    "policies",
+    "episodes",
+    "controls",
+    "limits",
+    "tables",
+    "figures",
+    "jobs",
+    UNFINISHED,
+)
+"""All that a study makes in its folder, beside the report, the specification and its description."""
 
 
 def policies_folder(folder: Path, body: Body, condition: StudyCondition) -> Path:

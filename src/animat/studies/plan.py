@@ -24,7 +24,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     from animat.studies.evaluating import Evaluate
     from animat.studies.pictures import CulturePictures, RobotPictures
     from animat.studies.publishing import Publish
-    from animat.studies.recording import Record
+    from animat.studies.recording import JOB, Record
     from animat.studies.simulating import Fit
     from animat.studies.tabulating import Tabulate
     from animat.studies.training import TrainGroup
@@ -35,9 +35,9 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     if study.needs_neurons:
         sessions = study.culture.sessions
         jobs += [
-            Job("record", Record(base), (), 2 + (2.5 if study.culture.kind == "virtual" else 0.3) * sessions),
-            Job("fit", Fit(), ("record",), 3),
-            Job("pictures/culture", CulturePictures(), ("record", "fit"), 15),
+            Job(JOB, Record(base), (), 2 + (2.5 if study.culture.kind == "virtual" else 0.3) * sessions),
+            Job("fit", Fit(), (JOB,), 3),
+            Job("pictures/culture", CulturePictures(), (JOB, "fit"), 15),
         ]
         neurons = ("fit",)
     for body in study.robots:

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from animat.cultures.series import record_virtual_series, recording_name
+from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series, recording_name
+from animat.errors import InvalidFile
 from animat.studies.folder import source_files
 from animat.studies.identity import settle_identity
-from animat.studies.jobs import Report, Task
+from animat.studies.jobs import Receipt, Report, Task
 from animat.studies.places import RECORDINGS
 from animat.studies.specification import Study
+
+JOB = "record"
 
 
 @final
@@ -27,23 +30,37 @@ class Record(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         out = folder / RECORDINGS
+        _remove_changed(folder)
         files = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[study.culture.kind](
             study, out, _Told(report)
         )
         for file in files:
             settle_identity(file)
-        return sorted(file for file in out.iterdir() if not file.name.startswith("."))
+        selection = out / SELECTION_FILE
+        return [*files, *([selection] if study.culture.kind == "virtual" else [])]
 
     def _copies(self, study: Study, out: Path, progress: _Told) -> list[Path]:
         from animat.recordings.reading import read_recordings
 
-        copies = []
+        copies: list[Path] = []
         recordings = read_recordings(source_files(study, self.base))
         for i, recording in enumerate(recordings):
-            copies.append(out / recording_name(recording.start_min))
-            recording.save(copies[-1])
+            copy = out / recording_name(recording.start_min)
+            if copy in copies:
+                raise InvalidFile(
+                    f"culture.files: expected recordings of different minutes, got two that would both be {copy.name}"
+                )
+            copies.append(copy)
+            recording.save(copy)
             progress.update(i + 1, len(recordings))
         return copies
+
+
+def _remove_changed(folder: Path) -> None:
+    """Remove recordings that are no longer as they were left: nobody else can tell, as they may still be good ones."""
+    receipt = Receipt.load(folder, JOB)
+    for name in () if receipt is None else receipt.changed(folder):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
@@ -51,7 +68,7 @@ def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
     from animat.recordings.protocol import Protocol
 
     culture = study.culture
-    return record_virtual_series(
+    files = record_virtual_series(
         lambda: VirtualCulture(culture.seed),
         Protocol(order=culture.order, pulses=culture.pulses, presentations=culture.presentations),
         out,
@@ -59,6 +76,9 @@ def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
         interval_min=culture.interval_min,
         progress=progress,
     )
+    # For a series that goes on. This one is complete, and the file tells which run made it.
+    (out / STATE_FILE).unlink(missing_ok=True)
+    return files
 
 
 def _made_up(study: Study, out: Path, progress: _Told) -> list[Path]:

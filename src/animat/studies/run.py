@@ -7,10 +7,10 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from animat.errors import AnimatError, InvalidArgument
+from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.progress import Progress, Silent
 from animat.studies.executor import Event, Executor, Processes
-from animat.studies.folder import claim, describe_study, held, source_files, sums_of
+from animat.studies.folder import describe_study, held, source_files, sums_of
 from animat.studies.jobs import Job, Receipt, in_order, receipt_of
 from animat.studies.places import REPORT, UNFINISHED
 from animat.studies.plan import plan_study
@@ -65,13 +65,16 @@ def run_study(
     if workers is not None and workers < 1:
         raise InvalidArgument(f"workers: expected at least 1, got {workers}")
     folder, base = Path(folder).absolute(), Path(base).absolute()
-    with held(folder):
-        manifest = describe_study(study, sums_of(source_files(study, base)))
-        claim(folder, study, manifest)
+    manifest = describe_study(study, sums_of(source_files(study, base), base))
+    with held(folder, study, manifest):
         jobs = in_order(plan_study(study, base))
         receipts = _kept(jobs, folder, manifest["fingerprint"])
         run = _Run(study, folder, manifest["fingerprint"], jobs, receipts, progress or Silent())
         if len(receipts) < len(jobs):
+            if not os.access(folder, os.W_OK):
+                raise InvalidFile(
+                    f"{folder}: {len(jobs) - len(receipts)} of {len(jobs)} jobs are left, but it cannot be written to"
+                )
             at = executor or Processes(workers)
             try:
                 run.finish(at)
