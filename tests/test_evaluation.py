@@ -141,7 +141,14 @@ def test_on_a_changed_robot_a_policy_sees_what_it_would_when_deployed() -> None:
 def test_the_table_has_every_control_beside_the_policies() -> None:
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, seed=1), "b": policy_of(timeline, seed=2)}
-    evaluation = evaluate(policies, timeline, at_min=14.0, episodes=20)
+    told: list[tuple[float, float, str]] = []
+
+    class Noting:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            told.append((done, total, note))
+
+    evaluation = evaluate(policies, timeline, at_min=14.0, episodes=20, progress=Noting())
+    assert told == [(i + 1, 7, row.name) for i, row in enumerate(evaluation.rows)]
     assert [row.name for row in evaluation.rows] == [
         "policies",
         "random",
@@ -152,8 +159,8 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
         "shuffled",
     ]
     assert evaluation.recorded_at_min == 10.0
-    told = evaluation.to_dict()
-    assert told["policies"] == {"a": told["rows"][0]["mean_returns"][0], "b": told["rows"][0]["mean_returns"][1]}
+    plain = evaluation.to_dict()
+    assert plain["policies"] == {"a": plain["rows"][0]["mean_returns"][0], "b": plain["rows"][0]["mean_returns"][1]}
     for row in evaluation.rows:
         assert row.name in evaluation.to_text()
 

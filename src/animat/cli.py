@@ -22,6 +22,7 @@ from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
 from animat.recordings.findings import Finding
 
 if TYPE_CHECKING:
+    from animat.neurons.conditions import Conditions
     from animat.neurons.timeline import SimulatorTimeline
     from animat.progress import Progress
 
@@ -152,10 +153,9 @@ class Inspect(Responding):
     def run(self) -> dict[str, Any]:
         """Inspect each file."""
         from animat.neurons.conditions import conditions_named
-        from animat.neurons.inspection import inspect_recording
-        from animat.recordings.reading import list_recordings, read_recording
-        from animat.report.inspection import draw_inspection, figure_stem, inspection_text
-        from animat.report.series import draw_series
+        from animat.progress import Bar
+        from animat.recordings.reading import list_recordings
+        from animat.report.inspection import figure_stem
 
         by = None if self.conditions is None else conditions_named(self.conditions)
         files = list_recordings(self.recordings)
@@ -167,19 +167,34 @@ class Inspect(Responding):
                 f"--out: expected recordings of different names, got figures that would all be called {alike}-...; "
                 "inspect them apart, or rename one"
             )
+        with Bar("inspecting") as progress:
+            return self._inspect(files, by, progress)
+
+    def _inspect(self, files: Sequence[Path], by: Conditions | None, progress: Progress) -> dict[str, Any]:
+        from animat.neurons.inspection import inspect_recording
+        from animat.recordings.reading import read_recording
+        from animat.report.inspection import draw_inspection, inspection_text
+        from animat.report.series import draw_series
+
         inspected, series = [], []
-        for file in files:
+        # Reading is one step of each file, drawing another, and the figures of the series are the last.
+        steps = 1 if self.out is None else 2
+        total = steps * len(files) + (self.out is not None)
+        for number, file in enumerate(files):
+            progress.update(steps * number, total, file.name)
             recording = read_recording(file, stimuli=self.stimuli, part=self.part)
             inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.out is not None:
+                progress.update(steps * number + 1, total, f"{file.name}, figures")
                 figures = [str(figure) for figure in draw_inspection(recording, inspection, self.out, self.format)]
                 print(f"figures: {', '.join(figures)}\n")
                 inspected[-1]["figures"] = figures
                 series.append((recording.start_min, file, inspection.responses))
         if self.out is None or not series:
             return {"recordings": inspected}
+        progress.update(total - 1, total, "figures of the series")
         first = read_recording(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
         try:
             figures = [str(figure) for figure in draw_series(first, [one[2] for one in series], self.out, self.format)]
@@ -297,6 +312,7 @@ class Evaluate(Fitting):
     def run(self) -> dict[str, Any]:
         """Evaluate."""
         from animat.compilation import keep_compilations
+        from animat.progress import Bar
         from animat.training.policy import load_policies
 
         if self.episodes < 1:
@@ -311,9 +327,16 @@ class Evaluate(Fitting):
         from animat.evaluation.table import evaluate
 
         keep_compilations()
-        evaluation = evaluate(
-            policies, timeline, at_min=self.at_min, episodes=self.episodes, seed=self.seed, greedy=not self.drawn
-        )
+        with Bar("evaluating") as progress:
+            evaluation = evaluate(
+                policies,
+                timeline,
+                at_min=self.at_min,
+                episodes=self.episodes,
+                seed=self.seed,
+                greedy=not self.drawn,
+                progress=progress,
+            )
         _say_findings(evaluation.findings)
         print(evaluation.to_text())
         return evaluation.to_dict()

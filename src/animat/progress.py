@@ -46,6 +46,8 @@ class Bar:
                 TimeRemainingColumn(),
                 TextColumn("{task.fields[note]}"),
                 console=Console(stderr=True),
+                # What is printed appears above the bar; a file or a pipe that it goes to gets it as ever.
+                redirect_stdout=sys.stdout.isatty(),
             )
             self._rich.start()
             self._task = self._rich.add_task(self._title, total=1.0, note="")

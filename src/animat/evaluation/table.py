@@ -12,9 +12,10 @@ from jaxtyping import Float64
 
 from animat.animat import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.rollouts import Constant, Episodes, Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.robots.base import Robot
 from animat.training.policy import Policy
@@ -115,6 +116,7 @@ def evaluate(
     seed: int = 1,
     greedy: bool = True,
     robot: Robot[Any] | None = None,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Run policies and the controls beside them on the simulator of one minute.
 
@@ -130,6 +132,7 @@ def evaluate(
         seed: decides every random draw.
         greedy: whether the most probable action is taken, or one drawn from the policy as in training.
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
+        progress: told after the policies and each control.
 
     Raises:
         InvalidArgument: for no policies, fewer episodes than one, or an `at_min` or a seed that is none.
@@ -165,18 +168,22 @@ def evaluate(
 
     networks = networks_of(list(policies.values()), greedy=greedy)
     n = len(policies)
-
-    def run(name: str, meaning: str, in_: Environment[Any], on: NeuronSimulator | None, actors: Any, many: int) -> Row:
-        return Row(name, meaning, roll_out(in_, on, actors, many, episodes=episodes, seed=seed))
-
-    rows = [run("policies", "as trained", environment, simulator, networks, n)]
-    rows.append(run("random", "any action, equally likely", environment, simulator, Uniform(), 1))
+    acting: list[tuple[str, str, Environment[Any], NeuronSimulator | None, Actor, int]] = [
+        ("policies", "as trained", environment, simulator, networks, n),
+        ("random", "any action, equally likely", environment, simulator, Uniform(), 1),
+    ]
     for i, label in enumerate(_action_labels(first)):
-        rows.append(run(f"constant {label}", "this one always", environment, simulator, Constant(jnp.array([i])), 1))
+        constant = Constant(jnp.array([i]))
+        acting.append((f"constant {label}", "this one always", environment, simulator, constant, 1))
     if isinstance(environment, Animat) and simulator is not None:
-        rows.append(run("silent", "the culture always answers 0", environment, silenced(simulator), networks, n))
+        acting.append(("silent", "the culture always answers 0", environment, silenced(simulator), networks, n))
         shuffled = replace(environment, delivery="shuffled")
-        rows.append(run("shuffled", "the delivered condition is drawn anew", shuffled, simulator, networks, n))
+        acting.append(("shuffled", "the delivered condition is drawn anew", shuffled, simulator, networks, n))
+    rows = []
+    for name, meaning, in_, on, actors, many in acting:
+        rows.append(Row(name, meaning, roll_out(in_, on, actors, many, episodes=episodes, seed=seed)))
+        if progress is not None:
+            progress.update(len(rows), len(acting), name)
     return Evaluation(
         body.name, None if first.mapping is None else first.mapping.name, minute, tuple(policies), tuple(rows), findings
     )

@@ -1,0 +1,45 @@
+"""The progress bar: drawn on a terminal, and never in the way of what is printed."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+from animat.progress import Bar
+
+SCRIPT = """
+from animat.progress import Bar
+with Bar("counting") as progress:
+    for i in range(5):
+        progress.update(i, 5, f"at {i}")
+    print("the result")
+"""
+
+
+def test_what_is_printed_under_a_bar_goes_where_it_should() -> None:
+    terminal, line = pty.openpty()
+    ran = subprocess.run([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, stderr=line, text=True)
+    os.close(line)
+    drawn = b""
+    while True:
+        try:
+            piece = os.read(terminal, 65536)
+        except OSError:
+            break
+        if not piece:
+            break
+        drawn += piece
+    os.close(terminal)
+    assert ran.stdout == "the result\n"
+    assert b"counting" in drawn
+    assert b"the result" not in drawn
+
+
+def test_nothing_is_drawn_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with Bar("counting") as progress:
+        progress.update(1, 2)
+    assert capsys.readouterr() == ("", "")
