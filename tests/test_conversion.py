@@ -100,6 +100,53 @@ def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pyte
     assert "expected one of well000/rec0000; got well7" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("age", ["P42D", "P6W", "P1Y2M3DT4H", "P2.5W", "PT36H", "P20D/P22D", "P90Y/"])
+def test_an_age_is_a_duration(age: str) -> None:
+    assert Origin(subject_id="c", age=age).words()["age"] == age
+
+
+@pytest.mark.parametrize(
+    "age", ["banana", "42", "P", "PT", "P42", "42D", "P1D2Y", "P1DT", "/P3D", "P3D/banana", "p3d", "P٣D"]
+)
+def test_an_age_that_is_none_is_refused_before_anything_is_read(
+    age: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.nwb"
+    assert main(["convert", str(tmp_path / "none.h5"), "--out", str(out), f"--age={age}"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"age: expected an ISO 8601 duration such as P42D (days), P6W or P3M, got {age!r}" in said
+    with pytest.raises(InvalidArgument, match="recorded_at: expected an ISO 8601 date"):
+        Origin(recorded_at="yesterday")
+
+
+def test_spikes_without_traces_are_told_from_a_damaged_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.csv").write_text("time_s,channel\n0.1,3\n")
+    (tmp_path / "a.rhd").write_bytes(b"\xc6\x91\x12\xd6" + bytes(40))
+    expected = {"a.rhd": "got another file; for traces in another format name it with --reader, such as intan"}
+    expected["a.csv"] = "got CSV, which holds spikes (leave out --raw to convert these)"
+    expected[rig_file("npz", tmp_path).name] = "got NPZ, which holds spikes (leave out --raw to convert these)"
+    for name, message in expected.items():
+        assert main(["convert", str(tmp_path / name), "--out", str(tmp_path / "out.nwb"), "--raw"]) == 1
+        said = capsys.readouterr().err
+        assert "expected HDF5 with raw traces (MaxWell, CL1, NWB), " + message in said
+        assert said.count("\n") == 1
+    assert main(["convert", str(tmp_path), "--out", str(tmp_path / "out.nwb"), "--raw"]) == 1
+    assert "expected one recording, got a folder" in capsys.readouterr().err
+
+
+def test_text_under_the_name_of_hdf5_is_said_to_be_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.nwb").write_text("<html>not found</html>\n")
+    for more in ([], ["--raw"]):
+        assert main(["convert", str(tmp_path / "a.nwb"), "--out", str(tmp_path / "out.nwb"), *more]) == 1
+        said = capsys.readouterr().err
+        assert "a.nwb: expected HDF5 " in said
+        assert said.count("\n") == 1
+    # What a file is its content says: spikes under a wrong name are read.
+    (tmp_path / "b.nwb").write_text("time_s,channel\n0.1,3\n")
+    assert len(read_recording(tmp_path / "b.nwb").spike_times_s) == 1
+
+
 def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
     path = rig_file("maxwell", tmp_path)
     before = path.read_bytes()

@@ -380,13 +380,15 @@ def test_a_truncated_gzip_is_one_clear_line(share: float, tmp_path: Path) -> Non
 def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros(3))
     (tmp_path / "empty.nwb").touch()
-    (tmp_path / "b.nwb").write_bytes(b"\xff\xfe\x00binary")
+    for name in ("b.nwb", "b.bin"):
+        (tmp_path / name).write_bytes(b"\xff\xfe\x00binary")
     (tmp_path / "a_stimuli.csv").write_text("1\n")
     for path, message in {
         "none.nwb": "no such file",
         "a.npy": "expected NPZ .* got NPY",
         "empty.nwb": "got an empty file",
-        "b.nwb": "expected CSV .text in UTF-8., got something else",
+        "b.nwb": "expected HDF5 in a file of this name, got something else",
+        "b.bin": "expected CSV .text in UTF-8., got something else",
         "a_stimuli.csv": "expected a file of spikes, got the stimuli beside it",
         ".": "got a folder; read_recordings reads folders",
     }.items():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from datetime import datetime
 from pathlib import Path
 
 from animat.errors import InvalidArgument
@@ -12,6 +14,13 @@ from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+
+DURATION = re.compile(
+    r"P(?=.)(\d+(\.\d+)?Y)?(\d+(\.\d+)?M)?(\d+(\.\d+)?W)?(\d+(\.\d+)?D)?"
+    r"(T(?=\d)(\d+(\.\d+)?H)?(\d+(\.\d+)?M)?(\d+(\.\d+)?S)?)?",
+    re.ASCII,
+)
+"""ISO 8601: P, years, months, weeks and days, and after a T hours, minutes and seconds; one of them at least."""
 
 
 @dataclass(frozen=True)
@@ -22,13 +31,16 @@ class Origin:
         subject_id: the culture's own name.
         species: in Latin, such as `Mus musculus`.
         sex: `U` for unknown, as of most cultures.
-        age: ISO 8601 duration, such as `P42D`.
+        age: ISO 8601 duration, such as `P42D`, or a range of two with a slash between, as NWB has it.
         subject_description: such as `dissociated cortical culture`.
         experimenter: `Last, First`; several separated by semicolons.
         institution, lab: where.
         keywords: separated by commas.
         recorded_at: ISO 8601 date.
         experiment_description: in words.
+
+    Raises:
+        InvalidArgument: for an `age` that is no duration, or a `recorded_at` that is no date.
     """
 
     subject_id: str | None = None
@@ -43,10 +55,29 @@ class Origin:
     recorded_at: str | None = None
     experiment_description: str | None = None
 
+    def __post_init__(self) -> None:
+        # Here and not when the file is written: finding spikes takes minutes.
+        if self.age is not None and not all(DURATION.fullmatch(part) for part in _range(self.age)):
+            raise InvalidArgument(
+                f"age: expected an ISO 8601 duration such as P42D (days), P6W or P3M, got {self.age!r}"
+            )
+        if self.recorded_at is not None:
+            try:
+                datetime.fromisoformat(self.recorded_at)
+            except ValueError as error:
+                expected = "an ISO 8601 date such as 2024-05-31T14:00:00+09:00"
+                raise InvalidArgument(f"recorded_at: expected {expected}, got {self.recorded_at!r}") from error
+
     def words(self) -> Mapping[str, str]:
         """What is given, as entries of `Recording.provenance`. A subject without a sex is of an unknown one."""
         given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         return {"sex": "U", **given} if "subject_id" in given else given
+
+
+def _range(age: str) -> tuple[str, ...]:
+    """The one duration of an age, or the two of a range, of which the last may be open."""
+    first, slash, last = age.partition("/")
+    return (first, last) if slash and last else (first,)
 
 
 def convert_recording(

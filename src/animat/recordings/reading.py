@@ -20,6 +20,8 @@ from animat.recordings.recording import Recording
 HDF5 = b"\x89HDF\r\n\x1a\n"
 ZIP = b"PK"
 NPY = b"\x93NUMPY"
+HDF5_NAMES = (".nwb", ".h5", ".hdf5")
+TEXT_NAMES = (".csv", ".csv.gz", ".tsv", ".txt")
 IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz")
 """Names that are taken from a folder for recordings."""
 
@@ -70,7 +72,7 @@ def read_recording(
         elif magic.startswith(NPY):
             raise InvalidFile(f"{path}: expected NPZ (several arrays by name), got NPY (one array)")
         else:
-            recording = read_csv(path, stimuli_path=stimuli_path)
+            recording = _read_text(path, stimuli_path)
     except (UnusableData, InvalidArgument) as error:
         # These name the column at fault but not the file.
         raise InvalidFile(f"{path}: {error}") from error
@@ -78,6 +80,36 @@ def read_recording(
         # What no reader foresaw: still a file that cannot be read, and one line.
         raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
     return recording if start_min is None else dataclasses.replace(recording, start_min=float(start_min))
+
+
+def expect_traces(path: Path) -> None:
+    """Refuse a file that cannot hold raw traces, by its first bytes.
+
+    Raises:
+        InvalidFile: for anything but HDF5.
+    """
+    magic = _first_bytes(path)
+    if magic.startswith(HDF5):
+        return
+    held = "another file"
+    if magic.startswith(ZIP) or path.name.endswith(TEXT_NAMES):
+        held = f"{'NPZ' if magic.startswith(ZIP) else 'CSV'}, which holds spikes (leave out --raw to convert these)"
+    raise InvalidFile(
+        f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {held}; for traces in another format name it "
+        "with --reader, such as intan"
+    )
+
+
+def _read_text(path: Path, stimuli_path: str | os.PathLike[str] | None) -> Recording:
+    try:
+        return read_csv(path, stimuli_path=stimuli_path)
+    except InvalidFile as error:
+        if path.suffix.lower() not in HDF5_NAMES or stimuli_path is not None:
+            raise
+        raise InvalidFile(
+            f"{path}: expected HDF5 in a file of this name, got something else (text, perhaps, or the answer of a "
+            "server in its place); copy it again"
+        ) from error
 
 
 def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording]:

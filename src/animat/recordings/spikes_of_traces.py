@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -36,7 +37,9 @@ def read_traces(
         InvalidArgument: for settings that the traces do not allow.
     """
     from animat.recordings.formats.traces import open_traces
+    from animat.recordings.reading import expect_traces
 
+    expect_traces(Path(path))
     traces, base = open_traces(path, part=part, stimuli=stimuli)
     return with_spikes_of(traces, base, settings, progress=progress)
 
