@@ -45,6 +45,7 @@ from animat.studies.folder import sums_of
 from animat.studies.identity import settle_identity
 from animat.studies.jobs import Job, Receipt, Report, Task, in_order, receipt_of
 from animat.studies.paper import PRINTED, paper_study
+from animat.studies.places import controls_file, episodes_file
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
@@ -459,6 +460,9 @@ def test_the_paper_is_kept_to() -> None:
     }
 
 
+COMPARED = "[[comparisons]]\nname = 'a'\nfirst = '1 threshold'\nsecond = '1 threshold'\nat_min = {}"
+
+
 @pytest.mark.parametrize(
     ("toml", "said"),
     [
@@ -485,6 +489,17 @@ def test_the_paper_is_kept_to() -> None:
         ("[simulators]\nwindow_ms = [2]", "simulators.window_ms: expected 2 values"),
         ("[algorithm]\nhiden = 8", "algorithm: expected settings among"),
         ("[algorithm]\nhidden = 'x'", "algorithm.hidden: expected a number"),
+        ("[algorithm]\nhidden = 64.0", "algorithm.hidden: expected a whole number, got 64.0"),
+        ("seed = 9999999999", "seed: expected a whole number from 0 to 4294967295, got 9999999999"),
+        ("[culture]\nseed = -1", "culture.seed: expected a whole number from 0 to 4294967295, got -1"),
+        ("[simulators]\nbins = 0", "simulators.bins: expected 1 to"),
+        ("[simulators]\nrange_hz = -5", "simulators.range_hz: expected a positive number, got -5"),
+        ("[simulators]\nwindow_ms = [10, 2]", "simulators.window_ms: expected 0 <= start < end"),
+        ("[simulators]\nburst_threshold = 7", "simulators.burst_threshold: expected a share of channels from 0 to 1"),
+        ("[simulators]\nconditions = 'bogus'", "simulators.conditions: expected one of all, frequency"),
+        (COMPARED.format("nan"), "comparisons.at_min: expected finite minutes, got nan"),
+        (COMPARED.format("500"), "comparisons.at_min: expected a minute of the recordings, from 0 to 140, got 500"),
+        (COMPARED.format("-20"), "comparisons.at_min: expected a minute of the recordings, from 0 to 140, got -20"),
     ],
 )
 def test_mistakes_in_a_specification_are_told_in_one_line(
@@ -497,6 +512,58 @@ def test_mistakes_in_a_specification_are_told_in_one_line(
     assert said in error and "study.toml: " in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_choices_are_checked_from_python_too() -> None:
+    for make in (
+        lambda: Source(kind="alive"),  # type: ignore[arg-type]
+        lambda: Simulators(kind="exact"),  # type: ignore[arg-type]
+        lambda: StudyCondition("a", delivery="none"),  # type: ignore[arg-type]
+        lambda: Study(actions="best"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(InvalidArgument, match="expected one of"):
+            make()
+
+
+def test_comparisons_are_made_at_the_nearest_recording() -> None:
+    def at(minutes: list[float | None], start_min: list[float]) -> list[float | None]:
+        compared = tuple(Compared(f"c{i}", "1 threshold", "1 threshold", at) for i, at in enumerate(minutes))
+        study = Study(culture=Source("files", files=("a.nwb",)), comparisons=compared)
+        return [each.at_min for each in study.at_recordings(start_min).comparisons]
+
+    start_min = [0.0, 10.02, 60.0]
+    assert at([None, 0.0, 10.0, 36.0, 59.98, 70.0, -1.0], start_min) == [60.0, 0.0, 10.02, 60.0, 60.0, 60.0, 0.0]
+    assert at([None, 500.0], []) == [0.0, 0.0]
+    assert at([5.0], [0.0]) == [0.0]
+    for beyond in (-60.0, 120.0):
+        with pytest.raises(InvalidArgument, match=r"at_min: expected a minute of the recordings, from 0 to 60, got"):
+            at([beyond], start_min)
+
+
+def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
+    write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
+    moved = Compared("before and after", "1 threshold", "1 threshold", at_min=29.0)
+    study = Study(culture=Source("files", files=("made",)), comparisons=(moved, replace(moved, name="b", at_min=30.0)))
+    Record(tmp_path).run(study, tmp_path / "study", lambda share, words: None)
+    kept, _ = Fit().run(study, tmp_path / "study", lambda share, words: None)
+    (told,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
+    assert told.sentence == "before and after was asked for at 29 min and is made on the recording at 30 min"
+    with pytest.raises(InvalidArgument, match="at_min"):
+        Fit().run(replace(study, comparisons=(replace(moved, at_min=99.0),)), tmp_path / "study", lambda s, w: None)
+
+
+def test_no_two_conditions_or_controls_share_a_file(tmp_path: Path) -> None:
+    names = ("a", "a paths", "a over-time", "controls", "controls-1-threshold", "over-time")
+    body = Body("navigation")
+    conditions = [StudyCondition(name, percentiles=held) for name in names for held in ("moving", "first")]
+    places = {
+        of(tmp_path, body, condition, what)
+        for condition in conditions
+        for of in (episodes_file, controls_file)
+        for what in ("episodes", "paths", "over-time")
+    }
+    # A condition's name is its own, however its percentiles are held; controls are of a way to hold them.
+    assert len(places) == 3 * len(names) + 3 * 2
 
 
 def test_a_missing_file_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

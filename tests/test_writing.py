@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from animat.errors import InvalidFile
-from animat.writing import written_whole
+from animat.writing import is_unfinished, written_whole
 
 
 def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_path: Path) -> None:
@@ -18,6 +18,7 @@ def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_
         with written_whole(path) as beside:
             assert beside.parent == path.parent
             assert beside.suffix == ".txt"
+            assert is_unfinished(beside) and not is_unfinished(path)
             beside.write_text(content)
             assert not path.exists() or path.read_text() == "old"
     assert path.read_text() == "new"

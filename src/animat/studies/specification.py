@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from animat.errors import InvalidArgument
 from animat.mapping import MAPPING_NAMES
@@ -24,10 +24,13 @@ MAPPINGS = (*MAPPING_NAMES, "none")
 def _check_algorithm(settings: dict[str, float]) -> None:
     from animat.training.sac import SAC
 
-    known = SAC.__dataclass_fields__
-    for name in settings:
+    known = get_type_hints(SAC)
+    for name, value in settings.items():
         if name not in known:
             raise InvalidArgument(f"algorithm: expected settings among {', '.join(known)}, got {name!r}")
+        # 64.0 is as large as 64, but no shape of an array.
+        if known[name] is int and not isinstance(value, int):
+            raise InvalidArgument(f"algorithm.{name}: expected a whole number, got {value!r}")
     SAC(**settings)  # type: ignore[arg-type]
 
 
@@ -52,6 +55,21 @@ def _at_least(where: str, owner: object, **least: int) -> None:
         if getattr(owner, name) < value:
             prefix = f"{where}." if where else ""
             raise InvalidArgument(f"{prefix}{name}: expected at least {value}, got {getattr(owner, name)}")
+
+
+def _one_of(where: str, owner: object) -> None:
+    """Every choice is one of those that its type names."""
+    for name, hint in get_type_hints(type(owner)).items():
+        if get_origin(hint) is Literal and getattr(owner, name) not in get_args(hint):
+            prefix = f"{where}." if where else ""
+            expected = ", ".join(get_args(hint))
+            raise InvalidArgument(f"{prefix}{name}: expected one of {expected}, got {getattr(owner, name)!r}")
+
+
+def _seed(name: str, value: int) -> None:
+    # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
+    if not 0 <= value < 2**32:
+        raise InvalidArgument(f"{name}: expected a whole number from 0 to 4294967295, got {value}")
 
 
 def _positive(name: str, value: float) -> None:
@@ -85,7 +103,9 @@ class Source:
     def __post_init__(self) -> None:
         if (self.kind == "files") != bool(self.files):
             raise InvalidArgument(f"culture.files: expected some for kind = 'files' only, got {len(self.files)}")
-        _at_least("culture", self, seed=0, sessions=1, pulses=1, presentations=2, channels=1)
+        _one_of("culture", self)
+        _seed("culture.seed", self.seed)
+        _at_least("culture", self, sessions=1, pulses=1, presentations=2, channels=1)
         _positive("culture.interval_min", self.interval_min)
         if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
             raise InvalidArgument("culture.order: a made-up culture is recorded blocked with one pulse, got otherwise")
@@ -110,6 +130,28 @@ class Simulators:
     window_ms: tuple[float, float] = (2.0, 10.0)
     burst_threshold: float | None = None
     despite: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        from animat.neurons.conditions import conditions_named
+        from animat.neurons.simulator import LARGEST_BINS
+        from animat.neurons.windows import check_window
+
+        # All before anything is recorded: whoever corrects it later needs another folder.
+        _one_of("simulators", self)
+        if not 1 <= self.bins <= LARGEST_BINS:
+            raise InvalidArgument(f"simulators.bins: expected 1 to {LARGEST_BINS}, got {self.bins}")
+        if self.range_hz is not None:
+            _positive("simulators.range_hz", self.range_hz)
+        if self.burst_threshold is not None and not 0 <= self.burst_threshold <= 1:
+            raise InvalidArgument(
+                f"simulators.burst_threshold: expected a share of channels from 0 to 1, got {self.burst_threshold:g}"
+            )
+        try:
+            check_window(self.window_ms)
+            if self.conditions:
+                conditions_named(self.conditions)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"simulators.{error}") from error
 
 
 @dataclass(frozen=True)
@@ -167,6 +209,7 @@ class StudyCondition:
 
     def __post_init__(self) -> None:
         _check_name("conditions.name", self.name)
+        _one_of("conditions", self)
         if self.mapping not in MAPPINGS:
             raise InvalidArgument(f"conditions.mapping: expected one of {', '.join(MAPPINGS)}, got {self.mapping!r}")
 
@@ -254,7 +297,9 @@ class Study:
         _unlike("robots", [body.name for body in self.robots])
         _unlike("conditions", [condition.slug for condition in self.conditions])
         _unlike("comparisons", [compared.name for compared in self.comparisons])
-        _at_least("", self, policies=1, seed=0, episodes=1, episodes_over_time=1, limit_episodes=2)
+        _one_of("", self)
+        _seed("seed", self.seed)
+        _at_least("", self, policies=1, episodes=1, episodes_over_time=1, limit_episodes=2)
         _positive("training_min", self.training_min)
         _positive("limit_resolution", self.limit_resolution)
         known = [condition.name for condition in self.conditions]
