@@ -14,7 +14,7 @@ from animat.training.sac import Batch, Network, Trained, initial_networks
 
 def drawn_networks(seed: int, n: int, hidden: int, n_actions: int | None) -> tuple[Trained, Network]:
     """Actor, critics, log alpha and target critics with weights of ordinary size everywhere, biases included."""
-    inputs, values, outputs = (n + 1, 1, 2) if n_actions is None else (n, n_actions, n_actions)
+    inputs, values, outputs = (n + 2, 1, 2) if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics, targets = initial_networks(
         jax.random.key(seed),
         ((n, hidden, hidden, outputs), ()),
@@ -30,12 +30,12 @@ def drawn_networks(seed: int, n: int, hidden: int, n_actions: int | None) -> tup
 
 
 def drawn_batch(seed: int, size: int, n: int, n_actions: int | None) -> Batch:
-    """Transitions of a task that does not exist, a third of them terminated."""
+    """Transitions of a task that does not exist, a third of them the last of their episode."""
     rng = np.random.default_rng(seed)
     action = rng.uniform(-1, 1, size) if n_actions is None else rng.integers(0, n_actions, size)
     columns = (
-        rng.normal(size=(size, n)),
-        rng.normal(size=(size, n)),
+        rng.normal(size=(size, n + 1)),
+        rng.normal(size=(size, n + 1)),
         action,
         rng.normal(0, 5, size),
         rng.random(size) < 1 / 3,
@@ -74,18 +74,21 @@ def log_density(action_z: float, mean: float, log_std: float) -> float:
 def discrete_losses(
     trained: Trained, targets: Network, batch: Batch, *, discount: float, entropy_wanted: float
 ) -> tuple[float, float, float]:
-    """Losses of critics, actor and alpha (Christodoulou 2019, equations 10 to 12), averaged over the batch."""
+    """Losses of critics, actor and alpha (Christodoulou 2019, equations 10 to 12), averaged over the batch.
+
+    The last number of a state, its time left, is not for the actor.
+    """
     alpha = np.exp(trained.log_alpha)
     critic_losses, actor_losses, alpha_losses = [], [], []
-    for s, s_next, a, r, terminated in zip(*batch, strict=True):
+    for s, s_next, a, r, ended in zip(*batch, strict=True):
         target = r
-        if not terminated:
-            pi = probabilities(outputs(trained.actor, s_next))
+        if not ended:
+            pi = probabilities(outputs(trained.actor, s_next[:-1]))
             q_next = [min(outputs(targets, s_next, i)[b] for i in (0, 1)) for b in range(len(pi))]
             target = r + discount * sum(p * (q - alpha * np.log(p)) for p, q in zip(pi, q_next, strict=True))
         q = [outputs(trained.critics, s, i) for i in (0, 1)]
         critic_losses.append(sum((q[i][int(a)] - target) ** 2 for i in (0, 1)) / 2)
-        pi = probabilities(outputs(trained.actor, s))
+        pi = probabilities(outputs(trained.actor, s[:-1]))
         actor_losses.append(sum(p * (alpha * np.log(p) - min(q0, q1)) for p, q0, q1 in zip(pi, *q, strict=True)))
         alpha_losses.append(trained.log_alpha * (-sum(p * np.log(p) for p in pi) - entropy_wanted))
     return float(np.mean(critic_losses)), float(np.mean(actor_losses)), float(np.mean(alpha_losses))
@@ -98,7 +101,7 @@ def continuous_losses(
     alpha = np.exp(trained.log_alpha)
 
     def drawn(s: np.ndarray, uniform: float) -> tuple[float, float]:
-        mean, log_std = outputs(trained.actor, s)
+        mean, log_std = outputs(trained.actor, s[:-1])
         log_std = min(max(log_std, -5.0), 2.0)
         z = stats.norm.ppf(uniform, mean, np.exp(log_std))
         return np.tanh(z), log_density(z, mean, log_std)
@@ -107,10 +110,10 @@ def continuous_losses(
         return float(outputs(critics, np.append(s, a), which)[0])
 
     critic_losses, actor_losses, alpha_losses = [], [], []
-    for s, s_next, a, r, terminated, u_next, u_new in zip(*batch, *uniforms, strict=True):
+    for s, s_next, a, r, ended, u_next, u_new in zip(*batch, *uniforms, strict=True):
         a_next, log_p = drawn(s_next, u_next)
         target = r
-        if not terminated:
+        if not ended:
             target = r + discount * (min(value(targets, s_next, a_next, i) for i in (0, 1)) - alpha * log_p)
         critic_losses.append(sum((value(trained.critics, s, a, i) - target) ** 2 for i in (0, 1)) / 2)
         a_new, log_p = drawn(s, u_new)

@@ -113,12 +113,12 @@ def test_gradients_equal_finite_differences_of_the_reference(continuous: bool) -
                 np.testing.assert_allclose(got, slope, rtol=2e-3, atol=2e-3, err_msg=f"{name} leaf {which} at {place}")
 
 
-def test_terminated_transitions_do_not_look_ahead() -> None:
+def test_the_last_transitions_of_episodes_do_not_look_ahead() -> None:
     trained, targets, batch, _ = problem(3, continuous=False)
-    elsewhere = batch._replace(next_observation=batch.next_observation + 100.0)
-    for terminated, changes in ((1.0, False), (0.0, True)):
+    elsewhere = batch._replace(next_state=batch.next_state + 100.0)
+    for ended, changes in ((1.0, False), (0.0, True)):
         losses = [
-            compiled_losses(trained, targets, b._replace(terminated=jnp.full(SIZE, terminated)), None)[0]
+            compiled_losses(trained, targets, b._replace(ended=jnp.full(SIZE, ended)), None)[0]
             for b in (batch, elsewhere)
         ]
         assert (abs(losses[0] - losses[1]) > 1e-3) == changes
@@ -208,7 +208,7 @@ def test_continuous_actions_follow_the_squashed_normal() -> None:
 
 def test_a_stack_of_networks_is_each_of_them() -> None:
     trained, _ = reference.drawn_networks(6, N, HIDDEN, ACTIONS)
-    inputs = jax.random.normal(jax.random.key(0), (7, N))
+    inputs = jax.random.normal(jax.random.key(0), (7, N + 1))
     stacked = np.asarray(forward(trained.critics, inputs))
     critics = reference.in_float64(trained.critics)
     for which in (0, 1):

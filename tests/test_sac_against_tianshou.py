@@ -55,12 +55,13 @@ def optimiser() -> Any:
 class Outputs(torch.nn.Module):  # type: ignore[misc]
     """A network of observations as tianshou calls an actor or a discrete critic."""
 
-    def __init__(self, network: Any, *, with_state: bool) -> None:
+    def __init__(self, network: Any, *, with_state: bool, without_time: bool = False) -> None:
         super().__init__()
-        self.network, self.with_state = network, with_state
+        self.network, self.with_state, self.without_time = network, with_state, without_time
 
     def forward(self, obs: Any, state: Any = None, info: Any = None) -> Any:
-        outputs = self.network(torch.as_tensor(np.asarray(obs), dtype=torch.float64))
+        seen = torch.as_tensor(np.asarray(obs), dtype=torch.float64)
+        outputs = self.network(seen[:, :-1] if self.without_time else seen)
         return (outputs, state) if self.with_state else outputs
 
 
@@ -85,11 +86,12 @@ class OfAction(torch.nn.Module):  # type: ignore[misc]
 
 
 def in_buffer(batch: Batch, *, continuous: bool) -> Any:
-    """The batch in tianshou's own replay, every third transition terminated and every fifth cut off by a time limit."""
+    """The batch in tianshou's own replay, every third transition the last of its episode, the time
+    limit among what ends it, and some others cut off where looking ahead goes on."""
     buffer = tianshou_data.ReplayBuffer(size=SIZE)
-    s, s_next, a, r, terminated = (np.asarray(column, np.float64) for column in batch)
+    s, s_next, a, r, ended = (np.asarray(column, np.float64) for column in batch)
     for i in range(SIZE):
-        ends = bool(terminated[i])
+        ends = bool(ended[i])
         buffer.add(
             tianshou_data.Batch(
                 obs=s[i],
@@ -122,7 +124,7 @@ def updated(algorithm: Any, buffer: Any) -> tuple[Any, np.ndarray]:
 def problem(seed: int, n_actions: int | None) -> tuple[Trained, Network, Batch]:
     trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions)
     batch = reference.drawn_batch(seed, SIZE, N, n_actions)
-    return trained, targets, batch._replace(terminated=jnp.arange(SIZE) % 3 == 0)
+    return trained, targets, batch._replace(ended=jnp.arange(SIZE) % 3 == 0)
 
 
 def shared_arguments(trained: Trained, wrapped: list[Any], wanted: float) -> dict[str, Any]:
@@ -162,7 +164,7 @@ def test_discrete_losses_targets_and_gradients(seed: int) -> None:
     trained, targets, batch = problem(seed, ACTIONS)
     actor, critics = as_modules(trained.actor), [as_modules(trained.critics, i) for i in (0, 1)]
     policy = tianshou_discrete_sac.DiscreteSACPolicy(
-        actor=Outputs(actor, with_state=True), action_space=gymnasium.spaces.Discrete(ACTIONS)
+        actor=Outputs(actor, with_state=True, without_time=True), action_space=gymnasium.spaces.Discrete(ACTIONS)
     )
     wrapped = [Outputs(critic, with_state=False) for critic in critics]
     wanted = SETTINGS.entropy_share * math.log(ACTIONS)
@@ -186,13 +188,16 @@ def test_continuous_losses_targets_and_gradients(seed: int, monkeypatch: pytest.
     from scipy.special import ndtri
 
     trained, targets, batch = problem(seed, None)
-    # tianshou keeps its logarithm from overflowing by adding 1e-7 inside, which shows where tanh is near 1.
+    # tianshou keeps its logarithm from overflowing by adding 1e-7 inside, which shows where tanh is near 1: so
+    # means near 0, and deviations near exp(-1), that do not lead there.
     last = trained.actor[-1]
-    trained = trained._replace(actor=(*trained.actor[:-1], Layer(0.05 * last.weight, 0.05 * last.bias)))
+    narrow = Layer(0.05 * last.weight, 0.05 * last.bias - jnp.array([0.0, 1.0]))
+    trained = trained._replace(actor=(*trained.actor[:-1], narrow))
     uniforms = np.random.default_rng(seed).uniform(0.01, 0.99, (2, SIZE))
     actor, critics = as_modules(trained.actor), [as_modules(trained.critics, i) for i in (0, 1)]
     policy = tianshou_sac.SACPolicy(
-        actor=MeanAndDeviation(actor, with_state=True), action_space=gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+        actor=MeanAndDeviation(actor, with_state=True, without_time=True),
+        action_space=gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64),
     )
     wrapped = [OfAction(critic) for critic in critics]
     algorithm = tianshou_sac.SAC(policy=policy, **shared_arguments(trained, wrapped, SETTINGS.entropy_nats))

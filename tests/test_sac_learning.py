@@ -63,17 +63,18 @@ def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> No
     limit = 3  # no divisor of the five rounds that the replay holds, so a row tells which round it is of
     environment = WithoutNeurons(Payer(pay=7.0, shows_iteration=True, episode_limit=limit), DISCRETE)
     learner, finished = trained_for(environment, SMALL, rounds)
-    expected_rows = np.full((5, 2, 5), np.nan)
+    expected_rows = np.full((5, 2, 7), np.nan)
     for index in range(rounds):
         counted = index % limit
-        # scaled by 1/2; the next observation is the one before the reset, at the time limit too, which is no end
-        expected_rows[index % 5, :, :2] = counted / 2, (counted + 1) / 2
-        expected_rows[index % 5, :, 4] = 0.0
-    rows = np.asarray(learner.replay).reshape(5, 2, 5)
+        # scaled by 1/2, then the time left; the next state is the one before the reset, at the time limit too
+        expected_rows[index % 5, :, :4] = counted / 2, 1 - 2 * counted / 3, (counted + 1) / 2, 1 - 2 * (counted + 1) / 3
+        expected_rows[index % 5, :, 6] = counted + 1 == limit
+    rows = np.asarray(learner.replay).reshape(5, 2, 7)
     written = ~np.isnan(expected_rows[:, :, 0])
-    np.testing.assert_array_equal(rows[written][:, [0, 1, 4]], expected_rows[written][:, [0, 1, 4]])
+    of_states = [0, 1, 2, 3, 6]
+    np.testing.assert_allclose(rows[written][:, of_states], expected_rows[written][:, of_states], atol=1e-6)
     np.testing.assert_allclose(
-        rows[written][:, 3], SMALL.reward_scale * 7.0 * np.array(DISCRETE)[rows[written][:, 2].astype(int)], rtol=1e-6
+        rows[written][:, 5], SMALL.reward_scale * 7.0 * np.array(DISCRETE)[rows[written][:, 4].astype(int)], rtol=1e-6
     )
     assert not rows[~written].any()
     assert float(finished.episodes) == 2 * (rounds // limit)
@@ -82,7 +83,7 @@ def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> No
 def test_terminations_are_remembered_and_episodes_start_anew() -> None:
     environment = WithoutNeurons(Payer(ends=True, shows_iteration=True), DISCRETE)
     rows = np.asarray(trained_for(environment, SMALL, 5)[0].replay)
-    np.testing.assert_array_equal(rows[:, [0, 1, 4]], np.tile([0.0, 0.5, 1.0], (10, 1)))
+    np.testing.assert_array_equal(rows[:, [0, 2, 6]], np.tile([0.0, 0.5, 1.0], (10, 1)))
 
 
 def test_returns_are_counted_in_the_tasks_own_units() -> None:
@@ -113,7 +114,7 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
     after, _ = trained_for(environment, settings, 1, learner=before)
-    n = environment.n_observations
+    n = environment.n_observations + 1
     rows = jnp.tile(after.replay[:1], (4, 1))
     batch = Batch(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1], rows[:, 2 * n + 2])
 
@@ -157,18 +158,21 @@ def soft_solution(pay: float) -> tuple[float, float, float]:
     return alpha, p, ((2 * p - 1) * pay + alpha * wanted) / (1 - CLOSED_FORM.discount)
 
 
-@pytest.mark.parametrize("ending", ["never", "truncated", "terminated"])
-def test_critics_converge_to_the_closed_form(ending: str) -> None:
-    """One state, two actions: time limits look ahead as if nothing ended, terminations do not."""
-    robot = Payer(pay=0.8, ends=ending == "terminated", episode_limit=1 if ending == "truncated" else 10**9)
+@pytest.mark.parametrize(("limit", "ends"), [(10**9, False), (10**9, True), (1, False), (3, False)])
+def test_critics_converge_to_the_closed_form(limit: int, ends: bool) -> None:
+    """One state, two actions: what is ahead ends with the episode, and critics know how much of it is left."""
+    robot = Payer(pay=0.8, ends=ends, episode_limit=limit)
     environment = WithoutNeurons(robot, DISCRETE)
     learner, _ = trained_for(environment, CLOSED_FORM, 3000)
     pay = CLOSED_FORM.reward_scale * robot.pay
     alpha, p, value = soft_solution(pay)
-    ahead = 0.0 if ending == "terminated" else CLOSED_FORM.discount * value
     observation = jnp.ones((1, 1))
-    q = np.asarray(forward(learner.trained.critics, observation))[:, 0]
-    np.testing.assert_allclose(q, np.tile([ahead - pay, ahead + pay], (2, 1)), atol=0.02)
+    for iteration in range(min(limit, 3)):
+        # V_n = V (1 - discount^n), with n iterations to come after this one.
+        ahead = 0.0 if ends else CLOSED_FORM.discount * value * (1 - CLOSED_FORM.discount ** (limit - iteration - 1))
+        state = jnp.array([[1.0, 1.0 - 2.0 * iteration / limit]])
+        q = np.asarray(forward(learner.trained.critics, state))[:, 0]
+        np.testing.assert_allclose(q, np.tile([ahead - pay, ahead + pay], (2, 1)), atol=0.02)
     assert float(jnp.exp(learner.trained.log_alpha)) == pytest.approx(alpha, rel=0.06)
     policy = jax.nn.softmax(forward(learner.trained.actor, observation))[0]
     assert float(policy[1]) == pytest.approx(p, abs=0.02)

@@ -4,6 +4,12 @@ Discrete actions after Christodoulou (2019, arXiv:1910.07207), continuous ones a
 arXiv:1812.05905), with two critics, target critics that follow slowly, and an entropy bonus whose weight alpha is
 learned so that the policy keeps a wanted entropy.
 
+An episode is judged by its whole return up to a fixed length, and what pays depends on how much of it is left: near its
+end a cart may roll where it would be lost later. So the critics see the time left and the return ends with the episode
+(Pardo et al. 2018, arXiv:1712.00378); the actor, which is what is deployed, does not see it, and learns what is best on
+average over the times at which a state comes up (critics that see more than the actor: Pinto et al. 2018,
+arXiv:1710.06542).
+
 Made for many small policies: everything of one policy is one pytree (`Learner`), so `jax.vmap` trains several side by
 side; a transition is one packed row; the random numbers of an iteration are one block; time limits bootstrap and
 terminations do not.
@@ -57,7 +63,7 @@ class SAC:
     replay: int = 131_072
     hidden: int = 64
     learning_rate: float = 1e-3
-    discount: float = 0.98
+    discount: float = 0.99
     follow: float = 0.005
     reward_scale: float = 0.1
     averaging: int = 8
@@ -117,13 +123,27 @@ class Learner(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Transitions; observations and rewards are scaled, actions and terminations are floats."""
+    """Transitions; observations and rewards are scaled, actions and endings are floats.
 
-    observation: Float[Array, "batch observations"]
-    next_observation: Float[Array, "batch observations"]
+    The last number of a state is the time left, from 1 at the start of an episode to -1 at its limit; the actor sees
+    the others, `observation`.
+    """
+
+    state: Float[Array, "batch state"]
+    next_state: Float[Array, "batch state"]
     action: Float[Array, " batch"]
     reward: Float[Array, " batch"]
-    terminated: Float[Array, " batch"]
+    ended: Float[Array, " batch"]
+
+    @property
+    def observation(self) -> Float[Array, "batch _"]:
+        """What the actor saw."""
+        return self.state[:, :-1]
+
+    @property
+    def next_observation(self) -> Float[Array, "batch _"]:
+        """What the actor saw next."""
+        return self.next_state[:, :-1]
 
 
 class Finished(NamedTuple):
@@ -185,20 +205,21 @@ def discrete_losses(
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """The losses of critics, actor and alpha; each has a gradient for its own parameters only.
 
-    With Q the smaller of the two critics (of the two target critics where it says Q_target) and d for terminated:
+    With Q the smaller of the two critics (of the two target critics where it says Q_target), d for ended, s a state
+    with its time left and o the observation in it:
 
-    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) sum_a' pi(a'|s') (Q_target(s', a') - alpha log pi(a'|s')))^2 / 2
-    actor:   mean sum_a pi(a|s) (alpha log pi(a|s) - Q(s, a))
-    alpha:   mean log alpha (H(pi(.|s)) - H_wanted)
+    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) sum_a' pi(a'|o') (Q_target(s', a') - alpha log pi(a'|o')))^2 / 2
+    actor:   mean sum_a pi(a|o) (alpha log pi(a|o) - Q(s, a))
+    alpha:   mean log alpha (H(pi(.|o)) - H_wanted)
     """
     fixed = jax.lax.stop_gradient
     alpha = jnp.exp(fixed(trained.log_alpha))
 
     log_next = jax.nn.log_softmax(forward(fixed(trained.actor), batch.next_observation))
-    next_q = jnp.min(forward(targets, batch.next_observation), axis=0)
+    next_q = jnp.min(forward(targets, batch.next_state), axis=0)
     next_value = jnp.sum(jnp.exp(log_next) * (next_q - alpha * log_next), axis=-1)
-    target = fixed(batch.reward + settings.discount * (1.0 - batch.terminated) * next_value)
-    q = forward(trained.critics, batch.observation)
+    target = fixed(batch.reward + settings.discount * (1.0 - batch.ended) * next_value)
+    q = forward(trained.critics, batch.state)
     taken = jax.nn.one_hot(batch.action.astype(jnp.int32), q.shape[-1])
     critic_loss = 0.5 * jnp.sum(jnp.mean((jnp.sum(q * taken, axis=-1) - target) ** 2, axis=-1))
 
@@ -216,24 +237,24 @@ def continuous_losses(
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """The same for one continuous action, with a' and a_new drawn from the policy (reparameterised).
 
-    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - alpha log pi(a'|s')))^2 / 2
-    actor:   mean alpha log pi(a_new|s) - Q(s, a_new)
-    alpha:   mean log alpha (-log pi(a_new|s) - H_wanted)
+    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - alpha log pi(a'|o')))^2 / 2
+    actor:   mean alpha log pi(a_new|o) - Q(s, a_new)
+    alpha:   mean log alpha (-log pi(a_new|o) - H_wanted)
     """
     fixed = jax.lax.stop_gradient
     alpha = jnp.exp(fixed(trained.log_alpha))
 
-    def critic(critics: Network, observation: Array, action: Array) -> Float[Array, "2 batch"]:
-        return forward(critics, jnp.concatenate([observation, action[:, None]], axis=1))[..., 0]
+    def critic(critics: Network, state: Array, action: Array) -> Float[Array, "2 batch"]:
+        return forward(critics, jnp.concatenate([state, action[:, None]], axis=1))[..., 0]
 
     next_action, log_next = squashed_normal(forward(fixed(trained.actor), batch.next_observation), uniforms[0])
-    next_q = jnp.min(critic(targets, batch.next_observation, next_action), axis=0)
-    target = batch.reward + settings.discount * (1.0 - batch.terminated) * (next_q - alpha * log_next)
-    q = critic(trained.critics, batch.observation, batch.action)
+    next_q = jnp.min(critic(targets, batch.next_state, next_action), axis=0)
+    target = batch.reward + settings.discount * (1.0 - batch.ended) * (next_q - alpha * log_next)
+    q = critic(trained.critics, batch.state, batch.action)
     critic_loss = 0.5 * jnp.sum(jnp.mean((q - fixed(target)) ** 2, axis=-1))
 
     action, log_pi = squashed_normal(forward(trained.actor, batch.observation), uniforms[1])
-    new_q = jnp.min(critic(fixed(trained.critics), batch.observation, action), axis=0)
+    new_q = jnp.min(critic(fixed(trained.critics), batch.state, action), axis=0)
     actor_loss = jnp.mean(alpha * log_pi - new_q)
 
     alpha_loss = trained.log_alpha * jnp.mean(fixed(-log_pi) - settings.entropy_nats)
@@ -247,7 +268,7 @@ def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Le
     """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
     n, n_actions, hidden = environment.n_observations, environment.n_actions, settings.hidden
-    inputs, values, outputs = (n + 1, 1, 2) if n_actions is None else (n, n_actions, n_actions)
+    inputs, values, outputs = (n + 2, 1, 2) if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics = initial_networks(
         weight_key, ((n, hidden, hidden, outputs), ()), ((inputs, hidden, hidden, values), (2,))
     )
@@ -257,7 +278,7 @@ def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Le
         deployed=actor,
         targets=critics,
         optimiser=_adam(settings).init(trained),
-        replay=jnp.zeros((settings.replay, 2 * n + 3)),
+        replay=jnp.zeros((settings.replay, 2 * n + 5)),
         episodes=jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments)),
         returns=jnp.zeros(settings.environments),
         key=key,
@@ -320,15 +341,17 @@ def _act(
     """One step of every environment, remembered in the replay; ended episodes start anew."""
     scales = environment.scales
 
-    observation = jax.vmap(environment.observe)(learner.episodes) / scales
-    action = draw_action(environment, learner.trained.actor, observation, uniforms[:, 0])
-    outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], learner.episodes, action, simulator)
-    # The observation before a reset: at a time limit the value of what would have come next is still wanted.
-    next_observation = jax.vmap(environment.observe)(outcome.state) / scales
-    row = jnp.stack([action, settings.reward_scale * outcome.reward, outcome.terminated], axis=1, dtype=jnp.float32)
-    rows = jnp.concatenate([observation, next_observation, row], axis=1)
+    def state_of(episodes: EpisodeState) -> Float[Array, "environments state"]:
+        left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
+        return jnp.concatenate([jax.vmap(environment.observe)(episodes) / scales, left], axis=1)
 
+    state = state_of(learner.episodes)
+    action = draw_action(environment, learner.trained.actor, state[:, :-1], uniforms[:, 0])
+    outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], learner.episodes, action, simulator)
     ended = outcome.terminated | outcome.truncated
+    row = jnp.stack([action, settings.reward_scale * outcome.reward, ended], axis=1, dtype=jnp.float32)
+    rows = jnp.concatenate([state, state_of(outcome.state), row], axis=1)
+
     returns = learner.returns + outcome.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
     learner = learner._replace(
@@ -362,7 +385,7 @@ def _learn(
 ) -> Learner:
     """`settings.updates` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
-    n = environment.n_observations
+    n = environment.n_observations + 1
 
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
         if environment.n_actions is None:
