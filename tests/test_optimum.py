@@ -81,6 +81,15 @@ def test_gamblers_ruin() -> None:
     assert not found.findings()
 
 
+def test_the_best_of_many_conditions_is_found() -> None:
+    """As many as an array has electrodes; only the last is the better coin."""
+    environment = Animat(Stairs(), Thresholds(1), 300)
+    found = best_return(environment, coins(*[3] * 299, 6), grid=STEPS, episodes=1000)
+    truth = 1 / (1 + (0.4 / 0.6) ** 2)
+    assert found.value == pytest.approx(truth, abs=1e-5)
+    assert abs(found.monte_carlo - truth) < 4 * found.standard_error
+
+
 @pytest.mark.parametrize(("limit", "truth"), [(1, 0.0), (2, 0.36), (3, 0.36), (4, 0.36 + 2 * 0.24 * 0.36)])
 def test_short_horizons_by_hand(limit: int, truth: float) -> None:
     """Two up, or one down on the way: p p, then (p q + q p) p p more."""

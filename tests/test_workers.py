@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from animat.studies.executor import Event, Processes
 from animat.studies.jobs import Job, Task
 from animat.studies.specification import Study
 from animat.studies.toml import read_study
-from worker_tasks import Die, Fail, TellProcess
+from worker_tasks import Die, Fail, Stumble, TellProcess
 
 STUDY = Study()
 
@@ -43,6 +44,29 @@ def test_a_worker_stays_until_it_has_grown_large(tmp_path: Path) -> None:
     (first,), (second,), (third,) = (event.files for event in ran)
     assert first == second != third
     assert re.fullmatch(r"\[\d+\]", Path(third).read_text()), "pinned to one core"
+
+
+@pytest.mark.usefixtures("tasks_importable")
+def test_an_error_that_nobody_foresaw_is_told_in_one_line_and_the_worker_goes_on(tmp_path: Path) -> None:
+    at = Processes(workers=1)
+    try:
+        failed = run(at, Stumble(), tmp_path)[-1]
+        assert failed.kind == "failed"
+        place = r"\(in run, worker_tasks\.py, line \d+\)"
+        assert re.fullmatch(rf"TypeError: expected an int, got a float {place}", failed.words)
+        assert run(at, TellProcess(), tmp_path)[-1].kind == "done"
+    finally:
+        at.close()
+
+
+@pytest.mark.usefixtures("tasks_importable")
+def test_ctrl_c_of_the_terminal_does_not_reach_a_worker(tmp_path: Path) -> None:
+    at = Processes(workers=1)
+    try:
+        (told,) = run(at, TellProcess(), tmp_path)[-1].files
+        assert os.getpgid(int(Path(told).name)) != os.getpgid(0)
+    finally:
+        at.close()
 
 
 @pytest.mark.usefixtures("tasks_importable")

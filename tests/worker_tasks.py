@@ -42,3 +42,11 @@ class Fail(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         raise InvalidFile("a.nwb: expected a recording, got none")
+
+
+@dataclass(frozen=True)
+class Stumble(Task):
+    """Fails with an error that nobody foresaw."""
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        raise TypeError("expected an int, got a float\nand so on")

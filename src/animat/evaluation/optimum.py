@@ -275,7 +275,7 @@ class _Programme:
         state = jax.vmap(environment.reset)(jax.random.split(first, episodes))
         returns = np.zeros(episodes)
         going = np.ones(episodes, bool)
-        chosen = np.zeros(episodes, np.uint8)
+        chosen = np.zeros(episodes, np.int32)
         for iteration, key in enumerate(jax.random.split(others, limit)):
             remaining = limit - 1 - iteration if clock else limit - 1
             landings = self._motion.from_states(state.robot)

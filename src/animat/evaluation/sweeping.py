@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Float32, Int32
 
 f4 = np.float32
 ONE, TWO, HALF, SIXTH = f4(1), f4(2), f4(0.5), f4(1 / 6)
@@ -146,7 +146,7 @@ def look_ahead(
     row_offsets: Int32[np.ndarray, " taps"],
     weights: Float32[np.ndarray, "actions landings"],
     remaining: int,
-    chosen: UInt8[np.ndarray, " states"],
+    chosen: Int32[np.ndarray, " states"],
 ) -> None:
     """The best action of each of some states, by what the states that follow are worth (see `step_back`).
 

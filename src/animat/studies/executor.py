@@ -135,7 +135,8 @@ class Processes(Executor):
 
     def _spawn(self, core: int) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "animat.studies.worker", str(core)]
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+        # In a process group of its own: Ctrl-C reaches this process alone, which then ends the worker without a word.
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, process_group=0)
         assert process.stdout is not None
         self._selector.register(process.stdout, selectors.EVENT_READ, core)
         return process

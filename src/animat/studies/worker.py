@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import signal
 import sys
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,6 @@ def main() -> int:
     # Before JAX or BLAS are loaded: they size their threads by the cores they may use.
     os.sched_setaffinity(0, {int(sys.argv[1])})
     end_with_parent()
-    # Ctrl-C goes to all processes of a terminal; the one that started this one ends it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     # What libraries print must not end up among the events.
     events = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
@@ -62,11 +60,21 @@ def main() -> int:
         except AnimatError as error:
             tell(kind="failed", words=str(error))
             continue
+        except Exception as error:
+            # Nobody foresaw it: where it came from is told too, in one line, and the next job finds a worker.
+            tell(kind="failed", words=_unforeseen(error))
+            continue
         leaves = _resident_mib() > _LARGEST_MIB
         cpu_s = time.process_time() - began_s
         tell(kind="done", files=[str(file) for file in files], cpu_s=cpu_s, leaves=leaves)
         if leaves:
             return 0
+
+
+def _unforeseen(error: Exception) -> str:
+    lines = str(error).strip().splitlines() or ["no more is known"]
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {lines[0]} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"
 
 
 def _resident_mib() -> float:
