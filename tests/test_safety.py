@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from animat.cultures.history import History
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Guard, Limits
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
@@ -29,9 +30,11 @@ LIMITS = Limits(
 )
 
 
-def is_safe(limits: Limits, sites: Sequence[int], past: list[Stimulus], request: list[Stimulus]) -> bool:
-    """Whether every limit holds for all that was ever delivered and the request together, `time_s` on one clock."""
-    if len(past) + len(request) > limits.stimuli_per_session and request:
+def is_safe(
+    limits: Limits, sites: Sequence[int], past: list[Stimulus], request: list[Stimulus], in_session: int
+) -> bool:
+    """Whether every limit holds for all that was delivered before and the request together, `time_s` on one clock."""
+    if in_session + len(request) > limits.stimuli_per_session and request:
         return False
     for stimulus in request:
         electrodes = list(stimulus.electrodes)
@@ -112,15 +115,15 @@ class Requests:
 def try_requests(seed: int, number: int) -> tuple[int, int]:
     """Put random requests before guards and the oracle; returns how many were safe and how many not."""
     requests, safe, unsafe = Requests(seed), 0, 0
-    guard, past, now_us = Guard(LIMITS, SITES), [], 0
+    history, past, now_us = History(), [], 0
+    guard = Guard(LIMITS, SITES, history)
     for _ in range(number):
         if requests.rng.random() < 0.1:
-            guard.begin_session()
-            past, now_us = [], 0
+            guard = Guard(LIMITS, SITES, history, now_us / 1_000_000)
         request = requests.stimuli()
         shifted = [replace(s, time_s=float(Fraction(now_us, 1_000_000) + Fraction(s.time_s))) for s in request]
         before = guard.delivered
-        expected = is_safe(LIMITS, SITES, past, shifted)
+        expected = is_safe(LIMITS, SITES, past, shifted, before)
         try:
             admitted = guard.admit(request, now_us / 1_000_000)
         except UnsafeStimulus as error:
@@ -131,7 +134,8 @@ def try_requests(seed: int, number: int) -> tuple[int, int]:
             assert expected, f"an unsafe request passed: {request} after {past}"
             assert list(admitted.stimuli) == request
             assert guard.delivered == before + len(request)
-            past += shifted
+            # All that is less than a second back is among the last of them.
+            past = [*past, *shifted][-3 * LIMITS.stimuli_per_s :]
             safe += 1
         last_us = round(request[-1].time_s * 1_000_000) if request else 0
         now_us += last_us + int(requests.pick(750, 100_000, 500_000, 1_000_000))
@@ -213,8 +217,7 @@ def test_an_emergency_stop_refuses_everything_until_a_new_session() -> None:
     with pytest.raises(UnsafeStimulus, match="stopped: an emergency stop is in force \\(smoke\\)"):
         guard.admit([one()], 0.0)
     assert guard.admit([], 0.0).stimuli == ()
-    guard.begin_session()
-    guard.admit([one()], 0.0)
+    Guard(WIDE, SITES, History(), 0.0).admit([one()], 0.0)
 
 
 def test_only_a_guard_admits() -> None:

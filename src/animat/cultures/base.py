@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 from jaxtyping import Int64
 
+from animat.cultures.history import History
 from animat.cultures.observed import Observed, Spikes, assembled, stimulus_table
 from animat.cultures.safety import Admitted, Guard, Limits
 from animat.errors import InvalidArgument
@@ -48,6 +49,8 @@ class Culture(abc.ABC):
     def __init__(self, limits: Limits | None = None) -> None:
         self._asked_limits = limits
         self._guard: Guard | None = None
+        # Of all sessions: a rate limit must not be passed by closing and opening again.
+        self._history = History()
 
     # What a backend is: data. Valid once it is open.
 
@@ -74,7 +77,7 @@ class Culture(abc.ABC):
     @property
     @abc.abstractmethod
     def now_s(self) -> float:
-        """The culture's clock."""
+        """The culture's clock; where it can, it goes on while the culture is closed."""
 
     @property
     @abc.abstractmethod
@@ -114,6 +117,9 @@ class Culture(abc.ABC):
     def open(self) -> Self:
         """Get ready, and begin a session: stimuli are counted anew and an emergency stop is lifted.
 
+        What was delivered in the second before is remembered from session to session. Where the last delivery was
+        broken off, or the clock began anew, all of its last second counts as delivered just now.
+
         Raises:
             InvalidArgument: if it is open already, or its limits are looser than the device's.
         """
@@ -123,7 +129,7 @@ class Culture(abc.ABC):
             self._asked_limits.check_within(self.device_limits)
         try:
             self._open()
-            self._guard = Guard(self.limits, self.stimulation_electrodes)
+            self._guard = Guard(self.limits, self.stimulation_electrodes, self._history, self.now_s)
         except BaseException:
             self._close()
             raise

@@ -16,6 +16,7 @@ from jaxtyping import Int64
 
 from animat.cultures.base import Culture
 from animat.cultures.cl1_delivery import Delivery
+from animat.cultures.history import History
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace
 from animat.cultures.safety import Admitted, Limits
@@ -124,6 +125,7 @@ class CL1Culture(Culture):
         self._neurons: Any = None
         self._stream: Any = None
         self._delivery: Delivery | None = None
+        self._begun = History()
         self._is_halted = False
         self._lock = threading.RLock()
         self.spikes_not_on_electrodes = 0
@@ -201,7 +203,7 @@ class CL1Culture(Culture):
         self._delivery = Delivery(
             self._cl,
             self._neurons,
-            Pace(self.limits, SITES),
+            Pace(self.limits, SITES, self._begun, self.now_s),
             ticks_per_s=self._ticks_per_s,
             margin_frames=self._margin_frames,
             jitter=self._jitter,

@@ -153,6 +153,23 @@ class CultureContract(abc.ABC):
         culture._asked_limits = replace(device, amplitude=2 * device.amplitude + 1)
         _expect(InvalidArgument, culture.open)
 
+    def test_a_rate_is_not_passed_by_closing_and_opening_again(self) -> None:
+        culture = self.make_culture()
+        with culture:
+            culture._asked_limits = replace(culture.device_limits, stimuli_per_s=1)
+        with culture:
+            culture.deliver([self.stimulus(culture)], 0.1)
+        with culture:
+            # Where time is the world's, opening may take longer than a second.
+            if self.is_repeatable:
+                error = _expect(UnsafeStimulus, lambda: culture.deliver([self.stimulus(culture)], 0.1))
+                assert isinstance(error, UnsafeStimulus)
+                assert error.limit == "stimuli_per_s"
+            assert culture.delivered == 0
+            culture.rest(1.0)
+            culture.deliver([self.stimulus(culture)], 0.1)
+            assert culture.delivered == 1
+
     def test_a_recording_is_what_the_protocol_says(self) -> None:
         protocol = self.protocol
         with self.make_culture() as culture:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
+from animat.cultures.history import History
 from animat.cultures.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
 from animat.cultures.maxone_stream import SpikeStream, ZmqSpikes
 from animat.cultures.maxone_wiring import Wiring, wire
@@ -100,8 +101,10 @@ class MaxOneCulture(Culture):
         self._wiring: Wiring | None = None
         self._sequences: Sequences | None = None
         self._pace: Pace | None = None
+        self._begun = History()
         self._lsb_mv = 0.0
-        self._zero_frame = 0
+        # The first frame, and the last one before it was closed.
+        self._zero_frame, self._last_frame = 0, -1
         self._is_halted = False
         self.spikes_not_recorded = 0
         """Spikes that the device reported on amplifiers that no recording electrode is routed to; left out."""
@@ -134,7 +137,7 @@ class MaxOneCulture(Culture):
 
     @property
     def now_s(self) -> float:
-        """Frames since it was opened, by the newest one that came."""
+        """Time since it was first opened, by the newest frame that came."""
         return (self._streaming().frame() - self._zero_frame) / FRAMES_PER_S
 
     @property
@@ -179,8 +182,13 @@ class MaxOneCulture(Culture):
                 f"MaxOne: expected a device to open, got {type(error).__name__}: {' '.join(str(error).split())}: is "
                 "MaxLab Live's server running?"
             ) from error
-        self._zero_frame = self._stream.frame()
-        self._pace = Pace(self.limits, self.stimulation_electrodes)
+        frame = self._stream.frame()
+        if self._last_frame < 0:
+            self._zero_frame = frame
+        elif frame < self._last_frame:
+            # Frames are counted anew: the clock goes on from where it was.
+            self._zero_frame += frame - self._last_frame
+        self._pace = Pace(self.limits, self.stimulation_electrodes, self._begun, frame / FRAMES_PER_S)
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         try:
@@ -258,6 +266,8 @@ class MaxOneCulture(Culture):
                     self._sequences.delete()
         finally:
             if stream is not None:
+                # A stream that heard nothing has none.
+                self._last_frame = stream.frame() if stream.frame() >= 0 else self._last_frame
                 stream.stop()
             # What it was wired as stays readable; `device_limits` too, for the next opening.
             self._mx = self._stream = self._sequences = self._pace = None

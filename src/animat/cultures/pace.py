@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+from animat.cultures.history import History
 from animat.cultures.safety import Guard, Limits
 from animat.errors import UnsafeStimulus
 from animat.recordings.stimulus import Stimulus
@@ -12,7 +13,7 @@ from animat.recordings.stimulus import Stimulus
 LATER_S = 0.001
 """How much later stimuli are tried when they would come too soon after what was delivered before."""
 PATIENCE_S = 2.0
-"""All limits on pace look back a second: what does not fit after two is no matter of pace."""
+"""Rates look back a second: what does not fit after two is no matter of a late start."""
 _PACE = frozenset({"overlap", "gap_us", "interval_us", "stimuli_per_electrode_s", "stimuli_per_s"})
 
 
@@ -26,10 +27,12 @@ class Pace:
     Args:
         limits: in force.
         sites: electrodes that can stimulate.
+        history: of the sessions before, on the device's clock.
+        now_s: the device's clock.
     """
 
-    def __init__(self, limits: Limits, sites: Iterable[int]) -> None:
-        self._guard = Guard(limits, sites)
+    def __init__(self, limits: Limits, sites: Iterable[int], history: History, now_s: float) -> None:
+        self._guard = Guard(limits, sites, history, now_s)
 
     def soonest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
         """The soonest time from `from_s` on, on the device's clock, at which the stimuli may begin.

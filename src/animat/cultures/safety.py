@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from math import floor, isfinite
-from typing import Final, NamedTuple
+from typing import Final
 
+from animat.cultures.history import NS, Event, History
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.recordings.stimulus import Kind, Phase, Pulse, Stimulus
 
-NS = 1_000_000_000
 _MAY_ADMIT: Final = object()
 _REMEMBERED_PULSES = 1000
 
@@ -158,14 +157,8 @@ class Admitted:
         self.stimuli = tuple(stimuli)
 
 
-class _Event(NamedTuple):
-    start_ns: int
-    end_ns: int
-    electrodes: tuple[int, ...]
-
-
 class Guard:
-    """Checks every stimulus of a request against limits, remembering what was delivered before.
+    """Checks every stimulus of one session against limits, remembering what was delivered before.
 
     A request passes as a whole or not at all. Times are compared in whole nanoseconds, so that pulses exactly a second
     apart are a second apart.
@@ -173,14 +166,22 @@ class Guard:
     Args:
         limits: what may be delivered.
         sites: electrodes that can stimulate.
+        history: of the sessions before on the same culture: limits on pace look back on it too. None: there were none.
+        now_s: the culture's clock, where there is a history.
     """
 
-    def __init__(self, limits: Limits, sites: Iterable[int]) -> None:
+    def __init__(
+        self, limits: Limits, sites: Iterable[int], history: History | None = None, now_s: float = 0.0
+    ) -> None:
         self.limits = limits
         self._sites = frozenset(sites)
         self._safe_pulses: dict[Pulse, None] = {}
         self._stopped: str | None = None
-        self.begin_session()
+        self._delivered = 0
+        self._history = History()
+        if history is not None:
+            self._history = history
+            history.go_on(round(now_s * NS))
 
     @property
     def delivered(self) -> int:
@@ -192,17 +193,8 @@ class Guard:
         """Whether an emergency stop is in force."""
         return self._stopped is not None
 
-    def begin_session(self) -> None:
-        """Forget what was delivered, and lift an emergency stop."""
-        # The stimuli of the last second, and of each electrode; times are on the culture's clock.
-        self._recent: deque[int] = deque()
-        self._recent_on: dict[int, deque[int]] = {}
-        self._busy_until_ns = -NS
-        self._delivered = 0
-        self._stopped = None
-
     def stop(self, reason: str) -> None:
-        """Refuse everything from now on, until a new session begins."""
+        """Refuse everything from now on; a new session has a guard of its own."""
         self._stopped = reason
 
     def check(self, stimuli: Sequence[Stimulus], now_s: float) -> None:
@@ -224,14 +216,11 @@ class Guard:
             UnsafeStimulus: as `check` does; nothing is then remembered.
         """
         events = self._examine(stimuli, now_s)
-        for event in events:
-            self._remember(event, self._recent, self._recent_on)
-            self._busy_until_ns = event.end_ns
+        self._history.add(events, round(now_s * NS))
         self._delivered += len(events)
-        self._forget()
         return Admitted(stimuli, by=_MAY_ADMIT)
 
-    def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> list[_Event]:
+    def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> list[Event]:
         limits = self.limits
         if not stimuli:
             return []
@@ -243,9 +232,9 @@ class Guard:
                 f"expected at most {limits.stimuli_per_session} stimuli in a session, got {len(stimuli)} more after "
                 f"{self._delivered}: ask for fewer, or begin a new session after a rest",
             )
-        events = []
-        recent, recent_on, busy_until_ns = deque(self._recent), dict(self._recent_on), self._busy_until_ns
-        copied: set[int] = set()
+        events: list[Event] = []
+        # What was asked for so far goes into a history of its own: a request that fails must leave no trace.
+        asked, busy_until_ns = History(), self._history.busy_until_ns
         for stimulus in stimuli:
             self._check_one(stimulus)
             if not (isfinite(stimulus.time_s) and stimulus.time_s >= 0):
@@ -264,14 +253,9 @@ class Guard:
                     f"expected {limits.gap_us:g} us or more from the end of a stimulus to the start of the next, got "
                     f"{(start_ns - busy_until_ns) / 1000:g}: put them further apart",
                 )
-            event = _Event(start_ns, start_ns + round(stimulus.pulse.duration_us * 1000), stimulus.electrodes)
-            # Histories are copied before they are written to: a request that fails must leave no trace.
-            for electrode in event.electrodes:
-                if electrode not in copied:
-                    copied.add(electrode)
-                    recent_on[electrode] = deque(recent_on.get(electrode, ()))
-            self._remember(event, recent, recent_on)
-            self._check_rates(event, recent, recent_on)
+            event = Event(start_ns, start_ns + round(stimulus.pulse.duration_us * 1000), stimulus.electrodes)
+            self._check_pace(event, asked)
+            asked.add([event], start_ns)
             busy_until_ns = event.end_ns
             events.append(event)
         return events
@@ -348,38 +332,28 @@ class Guard:
                 f"({pulse}{is_rounded}): give the phases equal and opposite charge",
             )
 
-    def _check_rates(self, event: _Event, recent: deque[int], recent_on: dict[int, deque[int]]) -> None:
-        limits = self.limits
-        if len(recent) > limits.stimuli_per_s:
+    def _check_pace(self, event: Event, asked: History) -> None:
+        """The limits that hold for a stimulus after those delivered and those `asked` for before it."""
+        limits, start_ns = self.limits, event.start_ns
+        count = 1 + self._history.in_second_to(start_ns) + asked.in_second_to(start_ns)
+        if count > limits.stimuli_per_s:
             raise UnsafeStimulus(
                 "stimuli_per_s",
-                f"expected at most {limits.stimuli_per_s} stimuli in any second, got {len(recent)}: slow down",
+                f"expected at most {limits.stimuli_per_s} stimuli in any second, got {count}: slow down",
             )
         for electrode in event.electrodes:
-            history = recent_on[electrode]
-            if len(history) > 1 and history[-1] - history[-2] < round(limits.interval_us * 1000):
+            last_ns = asked.last_on(electrode)
+            last_ns = self._history.last_on(electrode) if last_ns is None else last_ns
+            if last_ns is not None and start_ns - last_ns < round(limits.interval_us * 1000):
                 raise UnsafeStimulus(
                     "interval_us",
                     f"expected {limits.interval_us:g} us or more from stimulus to stimulus on an electrode, got "
-                    f"{(history[-1] - history[-2]) / 1000:g} on electrode {electrode}: slow down",
+                    f"{(start_ns - last_ns) / 1000:g} on electrode {electrode}: slow down",
                 )
-            if len(recent_on[electrode]) > limits.stimuli_per_electrode_s:
+            count = 1 + self._history.in_second_to(start_ns, electrode) + asked.in_second_to(start_ns, electrode)
+            if count > limits.stimuli_per_electrode_s:
                 raise UnsafeStimulus(
                     "stimuli_per_electrode_s",
                     f"expected at most {limits.stimuli_per_electrode_s} stimuli on an electrode in any second, got "
-                    f"{len(recent_on[electrode])} on electrode {electrode}: slow down, or use more patterns",
+                    f"{count} on electrode {electrode}: slow down, or use more patterns",
                 )
-
-    @staticmethod
-    def _remember(event: _Event, recent: deque[int], recent_on: dict[int, deque[int]]) -> None:
-        """Add an event and drop what lies a second or more before it."""
-        for history in (recent, *(recent_on.setdefault(electrode, deque()) for electrode in event.electrodes)):
-            history.append(event.start_ns)
-            while history[0] <= event.start_ns - NS:
-                history.popleft()
-
-    def _forget(self) -> None:
-        """Drop electrodes whose last stimulus lies a second back, so that the histories stay small."""
-        if self._recent:
-            old = self._recent[-1] - NS
-            self._recent_on = {e: times for e, times in self._recent_on.items() if times[-1] > old}

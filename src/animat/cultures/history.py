@@ -1,0 +1,72 @@
+"""When a culture was stimulated, as far back as limits on pace look: it outlives the sessions."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from typing import NamedTuple
+
+NS = 1_000_000_000
+
+
+class Event(NamedTuple):
+    """A stimulus on the culture's clock."""
+
+    start_ns: int
+    end_ns: int
+    electrodes: tuple[int, ...]
+
+
+class History:
+    """The stimuli of the last second, and the last one on each electrode, in whole nanoseconds of the culture's clock.
+
+    Starts are in the order of time. A guard looks it up and adds what it admits; opening a culture anew goes on with
+    the same history, because a living culture does not forget what it was given when a program closes it.
+    """
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []
+        self._starts_on: dict[int, list[int]] = {}
+        self._seen_ns = 0
+        self.busy_until_ns = -NS
+        """When the last stimulus ends."""
+
+    def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
+        """Stimuli, on one electrode or on any, that began less than a second before a time no earlier than the last."""
+        starts = self._starts if electrode is None else self._starts_on.get(electrode, ())
+        return len(starts) - bisect_right(starts, time_ns - NS)
+
+    def last_on(self, electrode: int) -> int | None:
+        """When the last stimulus on an electrode began, however long ago."""
+        starts = self._starts_on.get(electrode)
+        return starts[-1] if starts else None
+
+    def add(self, events: Sequence[Event], now_ns: int) -> None:
+        """Remember stimuli in the order of time, and forget what is over a second old."""
+        self._seen_ns = now_ns
+        _forget(self._starts, now_ns)
+        for start_ns, end_ns, electrodes in events:
+            self._starts.append(start_ns)
+            for electrode in electrodes:
+                starts = self._starts_on.setdefault(electrode, [])
+                _forget(starts, now_ns)
+                starts.append(start_ns)
+            self.busy_until_ns = end_ns
+
+    def go_on(self, now_ns: int) -> None:
+        """Go on in a new session whose clock is at `now_ns`.
+
+        A clock that is behind where it was last seen began anew: no time is taken to have passed since. Stimuli that
+        were admitted for later than now were broken off; how many were delivered is not known, and all count as if they
+        had begun just now. Either way what was given may seem more recent than it was, never less.
+        """
+        behind_ns = max(0, self._seen_ns - now_ns)
+        self._seen_ns = now_ns
+        for starts in (self._starts, *self._starts_on.values()):
+            starts[:] = [min(start_ns - behind_ns, now_ns) for start_ns in starts]
+        self.busy_until_ns = min(self.busy_until_ns - behind_ns, now_ns)
+
+
+def _forget(starts: list[int], now_ns: int) -> None:
+    """Drop what began a second or more ago, but for the last: a limit on intervals may be longer than a second."""
+    del starts[: min(bisect_right(starts, now_ns - NS), len(starts) - 1)]
