@@ -152,13 +152,17 @@ def test_the_verdict_says_which_controls_are_beaten_and_by_how_much_others_are_n
     gap, _ = run(tmp_path, series, with_controls=False)
     policies, *each, random = gap.rows
 
-    def verdict(p: float, wins: float, lived: float) -> str:
-        rows = (replace(policies, lived=np.full(20, lived)), *each, replace(random, p=p, wins=wins))
+    def verdict(p: float, wins: float, lived: float, n: int = 20) -> str:
+        control = replace(random, p=p, wins=wins, lived=np.zeros(n))
+        rows = (replace(policies, lived=np.full(n, lived)), *each, control)
         return replace(gap, rows=rows).verdict()
 
     high = float(policies.predicted.max()) + 1
     assert verdict(0.001, 0.9, high) == "the policies live larger returns than each control (p < 0.01)"
     assert "do not live larger returns (p < 0.01) than: random (60 %)" in verdict(0.02, 0.6, high)
+    # Of four and four even the clearest difference has p = 0.03: that is not the same as none.
+    assert "4 episodes of the policies beside 4 of a control are too few to tell" in verdict(0.03, 1.0, high, n=4)
+    assert "each control" in verdict(0.001, 1.0, high, n=6)
     # Significantly worse is not beaten.
     assert "random (10 %)" in verdict(0.001, 0.1, high)
     assert "they live less than predicted" in verdict(0.001, 0.9, float(policies.predicted.min()) - 1)

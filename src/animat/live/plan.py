@@ -13,6 +13,7 @@ import numpy as np
 
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import LOG_FILE as SESSION_LOG
+from animat.closed_loop.session import RECORDING_FILE
 from animat.errors import InvalidArgument, Mismatch
 from animat.mapping import N_PERCENTILES
 from animat.neurons.conditions import Condition
@@ -114,7 +115,8 @@ def what_stands(folder: Path) -> str | None:
         can.append(f"`animat train --recordings {folder / RECORDINGS}` trains on what was recorded")
     if (folder / SESSION / SESSION_LOG).is_file():
         kept.append("a session")
-        can.append(f"`animat recover {folder / SESSION}` writes its recording")
+        if not (folder / SESSION / RECORDING_FILE).is_file():
+            can.append(f"`animat recover {folder / SESSION}` writes its recording")
     return f"a live run that {_ended(log)}, with {', '.join(kept)} ({'; '.join(can) or 'nothing of it can be used'})"
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
-from animat.evaluation.statistics import Interval
+from animat.evaluation.statistics import Interval, compare
 from animat.recordings.findings import Finding
 
 CONFIDENCE = 0.95
@@ -106,10 +106,16 @@ class RealityGap:
 
     def verdict(self) -> str:
         """Whether the policies beat the controls, by how much they do not, and what the gap may come from."""
-        names = self.not_beaten
+        names, policies = self.not_beaten, self.rows[0]
         if names is None:
             return "no control was lived to its end: nothing can be said of the policies beside them"
-        if not names:
+        fewest = min(len(row.lived) for row in self.rows if row.p is not None)
+        if not _can_tell(len(policies.lived), fewest):
+            said = (
+                f"{len(policies.lived)} episodes of the policies beside {fewest} of a control are too few to tell (p < "
+                f"{BEATEN_P:g}) whether they live larger returns"
+            )
+        elif not names:
             said = f"the policies live larger returns than each control (p < {BEATEN_P:g})"
         else:
             rows = {row.name: row for row in self.rows}
@@ -118,8 +124,7 @@ class RealityGap:
                 f"the policies do not live larger returns (p < {BEATEN_P:g}) than: {told}; in brackets, the pairs of "
                 "episodes in which theirs is larger"
             )
-        policies = self.rows[0]
-        if len(policies.lived) and policies.gap.high < 0:
+        if policies.gap.high < 0:
             said += "; they live less than predicted: a simulator has no memory and does not tire, a culture does both"
         return said
 
@@ -169,6 +174,11 @@ class RealityGap:
         if outline["unanswered_pulses"]:
             lines.append(f"  {told_unanswered(self.session)}")
         return "\n".join(lines)
+
+
+def _can_tell(policies: int, control: int) -> bool:
+    """Whether that many episodes could come to a small p at all: if every return of the one is above the other's."""
+    return compare(np.arange(control), control + np.arange(policies)).p_normal < BEATEN_P
 
 
 def _resampled_means(
