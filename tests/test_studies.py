@@ -52,6 +52,7 @@ from animat.studies.run import Ran, run_study
 from animat.studies.simulating import Fit, load_timeline
 from animat.studies.specification import Body, Compared, Simulators, Source, Study, StudyCondition
 from animat.studies.toml import read_study, study_to_toml
+from animat.studies.training import training_of
 from animat.training.policy import Policy
 from cultures import small_culture
 
@@ -361,7 +362,7 @@ def test_scores_lie_between_random_and_the_limit_as_they_say(finished: Path) -> 
     assert {"random", "silent", "shuffled", "made by hand", "constant 80 Hz"} <= names
 
 
-def test_policies_before_training_are_those_that_training_starts_from(finished: Path) -> None:
+def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
     trained, before = (
         Policy.load(finished / f"policies/navigation/{slug}/p0.safetensors")
         for slug in ("1-threshold", "before-training")
@@ -371,6 +372,12 @@ def test_policies_before_training_are_those_that_training_starts_from(finished: 
     assert not np.array_equal(before.weights[0], trained.weights[0])
     # All but undecided.
     assert before.probabilities(np.zeros(3, np.float32)) == pytest.approx(np.full(5, 0.2), abs=0.01)
+
+
+def test_no_two_conditions_start_from_the_same_networks() -> None:
+    study = paper_study()
+    pairs = [(body, condition) for body in study.robots for condition in study.conditions]
+    assert len({training_of(study, body, condition).seed for body, condition in pairs}) == len(pairs)
 
 
 def test_simulators_are_kept_whole(finished: Path) -> None:

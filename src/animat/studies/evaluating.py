@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -14,6 +13,7 @@ from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.neurons.timeline import SimulatorTimeline
+from animat.studies.draws import draw_seed
 from animat.studies.jobs import Report, Task
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, policies_folder, write_table
@@ -171,11 +171,6 @@ def is_usual(condition: StudyCondition) -> bool:
 def last_minute(timeline: SimulatorTimeline | None) -> float:
     """Of the recordings; 0 without any."""
     return 0.0 if timeline is None else float(timeline.start_min[-1])
-
-
-def draw_seed(*names: object) -> int:
-    """A seed of its own for every set of episodes, so that no two conditions share their luck."""
-    return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
 
 
 def _networks(study: Study, folder: Path, body: Body, condition: StudyCondition) -> Networks:

@@ -10,6 +10,7 @@ from typing import final
 
 from animat.mapping import mapping_named
 from animat.neurons.timeline import SimulatorTimeline
+from animat.studies.draws import draw_seed
 from animat.studies.jobs import Report, Task
 from animat.studies.places import TIMELINE, UNFINISHED, policies_folder
 from animat.studies.simulating import load_timeline
@@ -60,7 +61,8 @@ def training_of(study: Study, body: Body, condition: StudyCondition) -> Training
         mapping=mapping_named(condition.mapping) if through_neurons else None,
         policies=study.policies,
         iterations=body.trained_for,
-        seed=study.seed,
+        # Tests of ranks take the policies of two conditions for independent: none starts as another one does.
+        seed=draw_seed("training", study.seed, body.name, condition.slug),
         shadowing=condition.shadowing,
         duration_min=study.training_min,
         percentiles=condition.percentiles,
