@@ -91,3 +91,15 @@ def test_reading_the_command_line_imports_nothing_heavy() -> None:
 
 def test_loading_a_policy_needs_no_jax() -> None:
     assert "jax" not in modules_after("import animat.training.policy")
+
+
+def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
+    import animat
+
+    assert len(set(animat.__all__)) == len(animat.__all__)
+    for name in animat.__all__:
+        thing = getattr(animat, name)
+        assert getattr(thing, "__name__", name) == name
+    # The nouns of the story that a study is made of are not those of its specification.
+    assert animat.Condition.__module__ == "animat.neurons.conditions"
+    assert {"Study", "run_study", "read_study", "paper_study", "best_return"} <= set(animat.__all__)

@@ -13,6 +13,9 @@ from animat.gym import register_environments
 if TYPE_CHECKING:
     from animat.animat import Animat, WithoutNeurons
     from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
+    from animat.evaluation.optimum import Optimum, best_return, best_returns
+    from animat.evaluation.prospects import prospects
+    from animat.evaluation.statistics import compare
     from animat.evaluation.table import Evaluation, evaluate
     from animat.mapping import Linear, Mapping, Thresholds, mapping_named
     from animat.neurons.conditions import Condition, conditions_named
@@ -26,6 +29,10 @@ if TYPE_CHECKING:
     from animat.recordings.reading import read_recording, read_recordings
     from animat.recordings.recording import Channels, Recording, Stimuli
     from animat.robots import Cartpole, Navigation, Robot, robot_named
+    from animat.studies.paper import paper_study
+    from animat.studies.run import run_study
+    from animat.studies.specification import Study
+    from animat.studies.toml import read_study
     from animat.training.policy import Policy, load_policies
     from animat.training.sac import SAC
     from animat.training.specification import Training
@@ -50,6 +57,13 @@ _WHERE = {
     "training.trainer": ("train",),
     "training.policy": ("Policy", "load_policies"),
     "evaluation.table": ("Evaluation", "evaluate"),
+    "evaluation.optimum": ("Optimum", "best_return", "best_returns"),
+    "evaluation.prospects": ("prospects",),
+    "evaluation.statistics": ("compare",),
+    "studies.specification": ("Study",),
+    "studies.paper": ("paper_study",),
+    "studies.toml": ("read_study",),
+    "studies.run": ("run_study",),
     "errors": ("AnimatError", "InvalidArgument", "InvalidFile", "UnusableData", "Mismatch"),
 }
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
@@ -91,6 +105,15 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "load_policies",
     "Evaluation",
     "evaluate",
+    "Optimum",
+    "best_return",
+    "best_returns",
+    "prospects",
+    "compare",
+    "Study",
+    "paper_study",
+    "read_study",
+    "run_study",
     "AnimatError",
     "InvalidArgument",
     "InvalidFile",

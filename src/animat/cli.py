@@ -23,6 +23,7 @@ from animat.recordings.findings import Finding
 
 if TYPE_CHECKING:
     from animat.neurons.conditions import Conditions
+    from animat.neurons.responses import Responses
     from animat.neurons.timeline import SimulatorTimeline
     from animat.progress import Progress
 
@@ -143,6 +144,8 @@ class Inspect(Responding):
     """Which of several things in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     part: str | None = None
     """Which of several recordings in a MaxWell file, such as well000/rec0000"""
+    limit: Literal["cartpole", "navigation"] | None = None
+    """Also compute the best return that any controller could get with this robot, before any training"""
     out: Path | None = None
     """Folder for figures; default: none are drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
@@ -186,6 +189,9 @@ class Inspect(Responding):
             inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
+            if self.limit is not None:
+                progress.update(steps * number, total, f"{file.name}, best possible return")
+                inspected[-1]["limits"] = _limits(self.limit, inspection.responses)
             if self.out is not None:
                 progress.update(steps * number + 1, total, f"{file.name}, figures")
                 figures = [str(figure) for figure in draw_inspection(recording, inspection, self.out, self.format)]
@@ -203,6 +209,25 @@ class Inspect(Responding):
             return {"recordings": inspected}
         print(f"figures of the series: {', '.join(figures)}")
         return {"recordings": inspected, "figures": figures}
+
+
+def _limits(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
+    """What a culture could do with a robot, printed; None where that cannot be told."""
+    from animat.compilation import keep_compilations
+    from animat.evaluation.prospects import prospects
+    from animat.robots.registry import robot_named
+
+    keep_compilations()
+    try:
+        found = prospects(responses, robot_named(robot))
+    except UnusableData as error:
+        print(f"{robot}: no best possible return: {error}\n")
+        return None
+    for prospect in found:
+        print(prospect.to_text())
+        _say_findings(prospect.best.findings())
+    print()
+    return [prospect.to_dict() for prospect in found]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,83 @@
+"""What a culture could do at a task, before any training: the best possible return beside that of random stimuli."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from animat.animat import Animat
+from animat.evaluation.optimum import Optimum, best_returns
+from animat.evaluation.rollouts import Uniform, roll_out
+from animat.mapping import Mapping, Thresholds
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import fit_histogram
+from animat.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """What could be had through one mapping.
+
+    Attributes:
+        robot, mapping: their names.
+        random: mean return of random stimuli.
+        random_standard_error: of that.
+        best: the best possible return of any controller.
+    """
+
+    robot: str
+    mapping: str
+    random: float
+    random_standard_error: float
+    best: Optimum
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "robot": self.robot,
+            "mapping": self.mapping,
+            "random": self.random,
+            "random_standard_error": self.random_standard_error,
+            "best": self.best.to_dict(),
+        }
+
+    def to_text(self) -> str:
+        """In a line."""
+        random = f"random {self.random:.1f} ± {self.random_standard_error:.1f}"
+        return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}"
+
+
+def prospects(
+    responses: Responses,
+    robot: Robot[Any],
+    mappings: Sequence[Mapping] = (Thresholds(1), Thresholds(9)),
+    *,
+    resolution: float = 0.75,
+    episodes: int = 1000,
+    seed: int = 1,
+) -> tuple[Prospect, ...]:
+    """What the culture of one recording could do at a robot's task, through some mappings.
+
+    Args:
+        responses: of the recording; the simulator is the default one, a histogram of 20 bins.
+        robot: with its task.
+        mappings: from responses to commands.
+        resolution: of the limit's grid (`best_returns`); the default moves the cartpole's limits by 0.6 at most.
+        episodes: of random stimuli, and of the limit's controller.
+        seed: decides every random draw.
+
+    Raises:
+        UnusableData: if a condition has no non-burst response.
+    """
+    simulator = fit_histogram(responses)
+    cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
+    best = best_returns(cases, resolution=resolution, episodes=episodes, seed=seed)
+    found = []
+    for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
+        returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns
+        error = float(returns.std(ddof=1) / np.sqrt(returns.size))
+        found.append(Prospect(robot.name, mapping.name, float(returns.mean()), error, of_mapping))
+    return tuple(found)
