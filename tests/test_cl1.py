@@ -217,6 +217,39 @@ def test_a_hand_over_that_hangs_does_not_keep_a_stop_from_taking_back_what_is_qu
         assert neurons.queue == []
 
 
+def test_a_delivery_that_hung_hands_over_nothing_in_a_later_session(neurons: Neurons) -> None:
+    hanging, released, loop = threading.Event(), threading.Event(), neurons.loop
+
+    def hang(*given: int, **more: object) -> Iterator[object]:
+        for tick in loop(*given, **more):
+            if not hanging.is_set():
+                hanging.set()
+                released.wait(30)
+            yield tick
+
+    neurons.loop = hang  # type: ignore[method-assign]
+    failed: list[Exception] = []
+    culture = CL1Culture()
+
+    def deliver() -> None:
+        try:
+            culture.deliver([Stimulus(0.01, (1,), CL1_PULSE)], 0.1)
+        except DeviceFailed as error:
+            failed.append(error)
+
+    with culture:
+        thread = threading.Thread(target=deliver)
+        thread.start()
+        assert hanging.wait(30)
+    with culture:
+        released.set()
+        thread.join(30)
+        assert len(failed) == 1
+        assert neurons.queue == []
+        culture.advance(0.5)
+        assert neurons.pulses == []
+
+
 def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]
     with CL1Culture(record_to=tmp_path) as culture:
         culture.present([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)])

@@ -199,6 +199,38 @@ def test_whatever_goes_wrong_meanwhile_takes_the_power(rig: Rig) -> None:
         assert rig.delivered == []
 
 
+def test_a_delivery_that_hung_sends_nothing_in_a_later_session(rig: Rig) -> None:
+    hanging, released = threading.Event(), threading.Event()
+
+    class Hanging(Stream):
+        def wait(self, frame: int) -> None:
+            if threading.current_thread() is not threading.main_thread() and not hanging.is_set():
+                hanging.set()
+                released.wait(30)
+            super().wait(frame)
+
+    failed: list[Exception] = []
+    culture = MaxOneCulture(selection(), stream=Hanging(rig), settle=False)
+
+    def deliver() -> None:
+        try:
+            culture.deliver([Stimulus(0.5, (SITES[0],), BALANCED_PULSE)], 1.0)
+        except DeviceFailed as error:
+            failed.append(error)
+
+    with culture:
+        thread = threading.Thread(target=deliver)
+        thread.start()
+        assert hanging.wait(30)
+    with culture:
+        # Without a stop in between: the session alone is another.
+        released.set()
+        thread.join(30)
+        assert len(failed) == 1
+        assert rig.sent == []
+        assert rig.delivered == []
+
+
 def test_closing_leaves_no_unit_powered(rig: Rig) -> None:
     with culture_on(rig):
         assert sum(bool(unit["power"]) for unit in rig.units.values()) == 32

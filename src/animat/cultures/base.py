@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
+from inspect import getattr_static
 from types import TracebackType
 from typing import Any, ClassVar, Self, final
 
@@ -40,8 +41,9 @@ class Culture(abc.ABC):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        overridden = [name for name in _FINAL if name in vars(cls)]
-        if overridden and cls.__module__ != __name__:
+        # Wherever it comes from: what stands before Culture among the bases would be called in its place.
+        overridden = [name for name in _FINAL if getattr_static(cls, name) is not vars(Culture)[name]]
+        if overridden:
             raise TypeError(
                 f"{cls.__name__}.{overridden[0]}: final in Culture; implement the methods that begin with _"
             )

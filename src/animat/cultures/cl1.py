@@ -126,7 +126,7 @@ class CL1Culture(Culture):
         self._stream: Any = None
         self._delivery: Delivery | None = None
         self._begun = History()
-        self._is_halted = False
+        self._halted = threading.Event()
         self._lock = threading.RLock()
         self.spikes_not_on_electrodes = 0
         """Spikes that the device reported on ground or reference, which are no recording electrodes; left out."""
@@ -180,7 +180,8 @@ class CL1Culture(Culture):
 
     def _open(self) -> None:
         self._cl = _sdk()
-        self._is_halted = False
+        # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.
+        self._halted = threading.Event()
         self.spikes_not_on_electrodes = 0
         try:
             self._neurons = self._stack.enter_context(self._cl.open(take_control=True, wait_until_recordable=True))
@@ -218,7 +219,7 @@ class CL1Culture(Culture):
         assert self._delivery is not None
         try:
             start, stop, frame, channel, begun = self._delivery.run(
-                admitted.stimuli, duration_s, is_halted=lambda: self._is_halted
+                admitted.stimuli, duration_s, is_halted=self._halted.is_set
             )
         except BaseException as error:
             self._interrupt()
@@ -254,7 +255,7 @@ class CL1Culture(Culture):
 
     def _halt(self) -> None:
         # First of all: whoever is about to hand over a pulse looks at it with the lock held.
-        self._is_halted = True
+        self._halted.set()
         # A hand-over that is under way comes before; one that hangs must not keep what is queued from being taken back.
         is_held = self._lock.acquire(timeout=HAND_OVER_S)
         try:
@@ -264,6 +265,7 @@ class CL1Culture(Culture):
                 self._lock.release()
 
     def _close(self) -> None:
+        self._halted.set()
         try:
             self._interrupt()
         finally:

@@ -208,6 +208,8 @@ class CultureContract(abc.ABC):
         kind = type(self.make_culture())
         _expect(TypeError, lambda: type("Around", (kind,), {"deliver": lambda *_: None}))
         _expect(TypeError, lambda: type("Around", (kind,), {"limits": None}))
+        beside = type("Beside", (), {"deliver": lambda *_: None})
+        _expect(TypeError, lambda: type("Around", (beside, kind), {}))
 
 
 def _expect(kind: type[Exception], act: Callable[[], object]) -> Exception:

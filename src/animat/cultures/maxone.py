@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -105,7 +106,7 @@ class MaxOneCulture(Culture):
         self._lsb_mv = 0.0
         # The first frame, and the last one before it was closed.
         self._zero_frame, self._last_frame = 0, -1
-        self._is_halted = False
+        self._halted = threading.Event()
         self.spikes_not_recorded = 0
         """Spikes that the device reported on amplifiers that no recording electrode is routed to; left out."""
 
@@ -160,7 +161,8 @@ class MaxOneCulture(Culture):
 
     def _open(self) -> None:
         self._mx = mx = _vendor()
-        self._is_halted = False
+        # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.
+        self._halted = threading.Event()
         self.spikes_not_recorded = 0
         try:
             mx.initialize()
@@ -202,6 +204,7 @@ class MaxOneCulture(Culture):
         """Send sequences in time, and read the spikes meanwhile."""
         stream, sequences, pace = self._streaming(), self._sequences, self._pace
         assert sequences is not None and pace is not None
+        halted = self._halted
         groups = _groups(admitted.stimuli, self._sequence_s)
         made = [sequences.of(group) for group in groups]
         start, late = stream.frame(), 0
@@ -213,7 +216,7 @@ class MaxOneCulture(Culture):
             soonest = max(asked, stream.frame() + INITIAL_DELAY)
             soonest = round(pace.soonest(relative, soonest / FRAMES_PER_S) * FRAMES_PER_S)
             stream.wait(soonest - INITIAL_DELAY)
-            if self._is_halted:
+            if halted.is_set():
                 raise DeviceFailed(
                     f"MaxOne: stopped while delivering: {len(begun)} of {len(admitted.stimuli)} stimuli had been sent, "
                     "and the units have no power"
@@ -227,7 +230,7 @@ class MaxOneCulture(Culture):
             late += first - asked
             # Two sequences at once would drive the same converter.
             stream.wait(begun[-1] + round(group[-1].pulse.duration_us / SAMPLE_US))
-        if self._is_halted and admitted.stimuli:
+        if halted.is_set() and admitted.stimuli:
             raise DeviceFailed("MaxOne: stopped while delivering: the units have no power, so pulses may not have come")
         stop = max(start + int(np.ceil(duration_s * FRAMES_PER_S)) + late, stream.frame() if duration_s else start)
         stream.wait(stop)
@@ -250,12 +253,13 @@ class MaxOneCulture(Culture):
         stream.forget(until)
 
     def _halt(self) -> None:
-        self._is_halted = True
+        self._halted.set()
         mx = self._mx
         if mx is not None:
             mx.send(mx.Core().enable_stimulation_power(False))
 
     def _close(self) -> None:
+        self._halted.set()
         mx, wiring, stream = self._mx, self._wiring, self._stream
         try:
             if mx is not None:
