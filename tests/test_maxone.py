@@ -175,7 +175,7 @@ def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
     with culture:
         rig.on_send = None
         # Which of those admitted came is not known: all count as just delivered.
-        with pytest.raises(UnsafeStimulus, match="gap_us"):
+        with pytest.raises(UnsafeStimulus, match="overlap"):
             culture.deliver(stimuli[:1], 1.0)
         culture.rest(1.0)
         culture.deliver(stimuli[:1], 1.0)

@@ -62,9 +62,11 @@ class History:
         """
         behind_ns = max(0, self._seen_ns - now_ns)
         self._seen_ns = now_ns
+        lasts_ns = self.busy_until_ns - self._starts[-1] if self._starts else 0
         for starts in (self._starts, *self._starts_on.values()):
             starts[:] = [min(start_ns - behind_ns, now_ns) for start_ns in starts]
-        self.busy_until_ns = min(self.busy_until_ns - behind_ns, now_ns)
+        if self._starts:
+            self.busy_until_ns = self._starts[-1] + lasts_ns
 
 
 def _forget(starts: list[int], now_ns: int) -> None:
