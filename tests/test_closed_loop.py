@@ -342,6 +342,18 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
     assert lasted[1] > lasted[-1] + 10
 
 
+def test_what_the_device_left_out_is_told(tmp_path: Path) -> None:
+    class Losing(FakeCulture):
+        @property
+        def left_out(self) -> dict[str, int]:
+            return {"frames lost": 3 + self.deliveries, "spikes nowhere": 5}
+
+    with Losing() as culture:
+        session = run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
+    assert session.left_out == session.to_dict()["left_out"] == {"frames lost": 7}
+    assert read_recording(session.recording_file).provenance["left_out"] == "7 frames lost"
+
+
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
     who = InTurn({f"p{i}": OneCondition(i) for i in range(3)})
     contenders = [RANDOM, Contender("silent", "", who, "silent"), Contender("shuffled", "", who, "shuffled")]

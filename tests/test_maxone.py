@@ -160,6 +160,7 @@ def test_spikes_are_by_channel_and_those_of_no_electrode_are_counted(rig: Rig) -
         assert culture.channels.electrode[spikes.channel].tolist() == [RECORDED[31], RECORDED[32]]
         assert culture.channels.label[spikes.channel].tolist() == ["31", "32"]
         assert culture.spikes_not_recorded == 1
+        assert culture.left_out == {"spikes on amplifiers without an electrode": 1, "frames lost on the way": 0}
 
 
 def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:

@@ -24,7 +24,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import FORMAT, LOG_FILE, Session, expect_no_session, read_session
 from animat.closed_loop.tick import Ending
 from animat.closed_loop.timing import Clock, WallClock
-from animat.cultures.base import Culture
+from animat.cultures.base import Culture, more_left_out
 from animat.cultures.budget import Account
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress, Silent
@@ -101,6 +101,7 @@ class _Supervisor:
         self._ending: Ending | None = None
         self._noted = -1
         self._not_halted: str | None = None
+        self._left_out = culture.left_out
 
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
@@ -166,7 +167,9 @@ class _Supervisor:
             ending = replace(ending, sentence=sentence)
         try:
             self._write()
-            self._log.append(Record({"kind": "end", "by": ending.by, "sentence": ending.sentence}))
+            left_out = more_left_out(self._left_out, self._culture.left_out)
+            words = {"kind": "end", "by": ending.by, "sentence": ending.sentence, "left_out": left_out}
+            self._log.append(Record(words))
             self._log.sync()
         except OSError as error:
             left = len(self._driver.records)

@@ -94,6 +94,11 @@ class Session:
         }
         return tuple(words for words in found.values() if words["stimuli"] and words.get("is_admitted", True))
 
+    @cached_property
+    def left_out(self) -> dict[str, int]:
+        """What the culture's device reported and the session does not have, by what it is; known once it has ended."""
+        return next((r.words.get("left_out", {}) for r in self.log.records if r.words["kind"] == "end"), {})
+
     def recording(self) -> Recording:
         """The session as a recording: all that was seen, and every pulse as a stimulus of its presentation.
 
@@ -139,6 +144,7 @@ class Session:
                     "closed_loop": json.dumps(header["loop"]),
                     "closed_loop_ended": f"{self.ending.by}: {self.ending.sentence}",
                     "closed_loop_unwatched_s": f"{max(0.0, duration_s - watched_s):.6f}",
+                    **({"left_out": told_left_out(self)} if self.left_out else {}),
                     "closed_loop_unanswered_pulses": str(_pulses(self.unanswered)),
                 },
             )
@@ -158,6 +164,7 @@ class Session:
             "late_pulses": sum(ms > 0 for ms in late_ms),
             "latest_ms": max(late_ms, default=0.0),
             "unanswered_pulses": _pulses(self.unanswered),
+            "left_out": self.left_out,
             "lost_bytes": self.log.lost_bytes,
         }
 
@@ -222,6 +229,11 @@ def told_unanswered(session: Session) -> str:
         f"{_pulses(session.unanswered)} pulses were asked for and never answered: whether they came is not known; "
         f"{LOG_FILE} has their times and electrodes"
     )
+
+
+def told_left_out(session: Session) -> str:
+    """What the session does not have, in words."""
+    return ", ".join(f"{count} {what}" for what, count in session.left_out.items())
 
 
 def _pulses(asked: Sequence[dict[str, Any]]) -> int:

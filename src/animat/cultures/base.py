@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from inspect import getattr_static
 from types import TracebackType
 from typing import Any, ClassVar, Self, final
@@ -90,6 +90,11 @@ class Culture(abc.ABC):
     @abc.abstractmethod
     def provenance(self) -> dict[str, str]:
         """What a recording says about where it came from."""
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """What the device reported, or should have, and no recording has, counted since `open`, by what it is."""
+        return {}
 
     # What a backend does.
 
@@ -304,12 +309,15 @@ class Culture(abc.ABC):
         progress = progress or Silent()
         provenance = {**self.provenance, "protocol": protocol.to_json(), "protocol_seed": str(seed)}
         self._rehearse(schedule)
+        before = self.left_out
         start_min = self.now_s / 60
         observed = []
         for number, block in enumerate(schedule.blocks):
             self.rest(block.setup_s)
             observed.append(self.deliver(schedule.deliveries(block), block.duration_s))
             progress.update(number + 1, len(schedule.blocks))
+        if more := more_left_out(before, self.left_out):
+            provenance["left_out"] = ", ".join(f"{count} {what}" for what, count in more.items())
         return assembled(
             schedule,
             observed,
@@ -333,6 +341,12 @@ class Culture(abc.ABC):
         if self._guard is None:
             raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
         return self._guard
+
+
+def more_left_out(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
+    """What was left out between two times, where it was anything."""
+    more = {what: count - before.get(what, 0) for what, count in after.items()}
+    return {what: count for what, count in more.items() if count}
 
 
 _FINAL = tuple(

@@ -178,6 +178,11 @@ class CL1Culture(Culture):
             **named,
         }
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Spikes on ground and reference."""
+        return {"spikes on ground or reference": self.spikes_not_on_electrodes}
+
     def _open(self) -> None:
         self._cl = _sdk()
         # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.

@@ -159,6 +159,12 @@ class MaxOneCulture(Culture):
             "stimulus_times": "estimated: the newest frame when the server had taken the sequence, and its delay",
         }
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Spikes on amplifiers that read no electrode of the selection, and frames that were lost on the way here."""
+        lost = int(getattr(self._stream, "lost_frames", 0))
+        return {"spikes on amplifiers without an electrode": self.spikes_not_recorded, "frames lost on the way": lost}
+
     def _open(self) -> None:
         self._mx = mx = _vendor()
         # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.

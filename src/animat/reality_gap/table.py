@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import Session, told_unanswered
+from animat.closed_loop.session import Session, told_left_out, told_unanswered
 from animat.cultures.budget import Account
 from animat.evaluation.statistics import Interval, compare
 from animat.recordings.findings import Finding
@@ -173,6 +173,8 @@ class RealityGap:
         )
         if outline["unanswered_pulses"]:
             lines.append(f"  {told_unanswered(self.session)}")
+        if self.session.left_out:
+            lines.append(f"  left out: {told_left_out(self.session)}")
         return "\n".join(lines)
 
 
