@@ -266,6 +266,39 @@ def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
     assert 5.0 <= cleaned.longest_ms[0] <= 5.5
 
 
+@pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
+@pytest.mark.parametrize("step_uv", [0.195, 6.3, 12.6])
+def test_the_trough_of_a_spike_in_coarse_steps_is_no_saturation(amplitude: float, step_uv: float) -> None:
+    rng = np.random.default_rng(5)
+    pulses = np.arange(1000, 39_000, 1000)
+    voltage = rng.normal(0, 3, (40_000, 8))
+    late = rng.uniform(2.5, 9.0, (len(pulses), 8))
+    for pulse, of_pulse in zip(pulses, late, strict=True):
+        for channel, ms in enumerate(of_pulse):
+            at = pulse + round(ms * 20)
+            voltage[at - 20 : at + 41, channel] += amplitude * SPIKE_UV
+    traces = ArrayTraces(np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv)
+    found = find_spikes(traces, pulses / RATE_HZ, SCIPY)
+    assert "saturated-channels" not in {finding.name for finding in found.findings}
+    truth = [pulses + np.rint(late[:, channel] * 20).astype(np.int64) for channel in range(8)]
+    hit, missed, _ = agreement(found, truth)
+    assert missed <= 0.01 * hit
+
+
+@pytest.mark.parametrize("until_ms", [1.7, 2.4, 9.0])
+@pytest.mark.parametrize("dither", [0.0, 6.3])
+def test_how_long_an_amplifier_saturates_is_seen(until_ms: float, dither: float) -> None:
+    rng = np.random.default_rng(6)
+    trace = (6.3 * np.rint(rng.normal(0, 5, (3, 4000)) / 6.3)).astype(np.float32)
+    stop = 2000 + round(until_ms * 20)
+    trace[1, 2000:stop] = 3200 + dither * rng.integers(0, 2, stop - 2000)
+    cleaned = without_artefacts(trace, np.array([2000]), np.full(3, 5.0, np.float32), RATE_HZ, Detection())
+    assert cleaned.is_blank is not None
+    assert cleaned.is_blank[1, 1990:stop].all()
+    assert not cleaned.is_blank[1, stop + 6 :].any()
+    assert not cleaned.is_blank[[0, 2], 2030:].any()
+
+
 @pytest.mark.parametrize("tau_ms", [0.4, 1.0, 2.7, 6.0])
 @pytest.mark.parametrize("size_uv", [-3000.0, 150.0])
 def test_a_decay_is_taken_away_and_spikes_on_it_are_left(tau_ms: float, size_uv: float) -> None:

@@ -4,7 +4,8 @@ Around a stimulus, three things are done to each channel, in this order:
 
 1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse the trace is a straight line, and nothing is looked for.
 2. *Saturation*: a channel whose amplifier saturates, as those near a stimulated electrode do, is blanked on until it
-   comes out of it: at the rail if that is known, else while the trace does not move and is far from where it was.
+   comes out of it: at the rail if that is known, else while the trace does not move for 0.4 ms on end and is far from
+   where it was. A spike's trough in coarse steps stands still for a shorter time.
 3. *Recovery*: what decays afterwards is fitted by a exp(-t / tau) + b, tau from some 0.2 to 16 ms, and the
    exponential is taken away; what is far off the fit (spikes) hardly counts in it. Nothing is blanked.
 
@@ -28,7 +29,8 @@ FAR = 20.0
 """Noises from where the trace was, beyond which it may be saturated where it does not move."""
 UNSETTLED = 2.0
 """Noises off, on average over half a millisecond after blanking, beyond which recovery is fitted."""
-FLAT_SAMPLES = 3
+FLAT_MS, FLAT_SHARE = 0.4, 0.005
+"""How long a saturated amplifier stands still at least, and how far it moves at most, of its distance from rest."""
 SETTLE_MS = 0.25
 """After an amplifier came out of saturation, as its first samples lie on no exponential."""
 
@@ -85,8 +87,11 @@ def without_artefacts(
             _bridge(voltage_uv, is_blank, np.arange(len(voltage_uv)), start, np.full(len(voltage_uv), end))
             continue
         rest_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
-        tail = voltage_uv[:, end:stop] - rest_uv[:, None]
-        until = end + _saturated_until(tail, noise_uv, settings.saturation_uv)
+        # From the pulse on: what stands still at the blank's end did so before.
+        pulse = max(at, 0)
+        trace = voltage_uv[:, pulse:stop] - rest_uv[:, None]
+        flat = max(round(FLAT_MS * per_ms), 3)
+        until = np.maximum(pulse + _saturated_until(trace, noise_uv, settings.saturation_uv, flat), end)
         late = until > end
         until[late] = np.minimum(until[late] + round(SETTLE_MS * per_ms), stop)
         saturated[i] = np.count_nonzero(late)
@@ -97,23 +102,35 @@ def without_artefacts(
 
 
 def _saturated_until(
-    tail_uv: Float32[np.ndarray, "channels samples"],
+    trace_uv: Float32[np.ndarray, "channels samples"],
     noise_uv: Float32[np.ndarray, " channels"],
     saturation_uv: float | None,
+    flat: int,
 ) -> Int64[np.ndarray, " channels"]:
-    """How many samples of each channel's tail go by until its amplifier has come out of saturation."""
-    if saturation_uv is not None:
-        is_saturated = np.abs(tail_uv) >= saturation_uv
-    else:
-        far = np.abs(tail_uv) > FAR * np.maximum(noise_uv, 1e-6)[:, None]
-        still = np.zeros(tail_uv.shape, dtype=bool)
-        if tail_uv.shape[1] >= FLAT_SAMPLES:
-            same = tail_uv[:, 1:] == tail_uv[:, :-1]
-            run = same[:, 1:] & same[:, :-1]
-            still[:, 2:] |= run
-        is_saturated = far & still
-    last = tail_uv.shape[1] - np.argmax(is_saturated[:, ::-1], axis=1)
-    return np.where(is_saturated.any(axis=1), last, 0).astype(np.int64)
+    """How many samples of each channel's trace go by until its amplifier has come out of saturation.
+
+    Without a known rail, it is saturated in stretches of `flat` samples that are far from rest and in which it moves by
+    next to nothing.
+    """
+    until = np.zeros(len(trace_uv), np.int64)
+    size_uv = np.abs(trace_uv)
+    far_uv = FAR * np.maximum(noise_uv, 1e-6)
+    limit_uv = far_uv if saturation_uv is None else np.full_like(far_uv, saturation_uv)
+    rows = np.flatnonzero(size_uv.max(axis=1) >= limit_uv)
+    if not len(rows):
+        return until
+    is_saturated = size_uv[rows] >= limit_uv[rows, None]
+    if saturation_uv is None:
+        if trace_uv.shape[1] < flat:
+            return until
+        stretches = np.lib.stride_tricks.sliding_window_view(trace_uv[rows], flat, axis=1)
+        moves_uv = stretches.max(axis=2) - stretches.min(axis=2)
+        is_flat = (moves_uv <= FLAT_SHARE * size_uv[rows, flat - 1 :]) & is_saturated[:, flat - 1 :]
+        is_saturated = np.zeros_like(is_saturated)
+        is_saturated[:, flat - 1 :] = is_flat
+    last = is_saturated.shape[1] - np.argmax(is_saturated[:, ::-1], axis=1)
+    until[rows] = np.where(is_saturated.any(axis=1), last, 0)
+    return until
 
 
 def _bridge(
