@@ -75,6 +75,9 @@ def assembled(
         sampling_rate_hz: whose samples the spikes lie on.
         start_min: of the recording on the culture's clock.
         provenance: of the recording.
+
+    Returns:
+        The recording, its times on samples; it ends with the sample that the last block ends in.
     """
     starts_s = np.cumsum([0.0, *(block.duration_s for block in observed)])
     tables = [block.stimuli for block in schedule.blocks]
@@ -97,7 +100,8 @@ def assembled(
         ),
         sampling_rate_hz=sampling_rate_hz,
         start_s=0.0,
-        duration_s=float(starts_s[-1]),
+        # Blocks may end between two samples: what is moved to the next one is still within. Not for a rounding error.
+        duration_s=float(np.ceil(starts_s[-1] * sampling_rate_hz - 1e-6) / sampling_rate_hz),
         start_min=start_min,
         presentation=schedule.protocol.presentation,
         provenance=provenance,
