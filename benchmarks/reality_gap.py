@@ -11,6 +11,7 @@ the last recording left it. Everything is kept under `--out`, one folder each; w
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def main() -> None:
                     if not table.exists():
                         run = ["run", policies, "--recordings", recordings, "--episodes", str(options.episodes)]
                         run += ["--controls", "all" if options.controls else "random", "--thresholds", thresholds]
-                        run += ["--out", str(folder / robot / thresholds)]
+                        run += ["--out", str(free(folder / robot / thresholds))]
                         table.write_text(json.dumps(ran(run)) + "\n")
                     rows = json.loads(table.read_text())["rows"]
                     lines.append((seed, robot, f"{order}, {pulses}", thresholds, rows))
@@ -70,6 +71,12 @@ def told(seed: int, robot: str, presentation: str, thresholds: str, rows: list[d
         f"| {seed} | {robot} | {presentation} | {thresholds} | {policies['predicted']:.1f} | {policies['lived']:.1f} | "
         f"{between} | {random['lived']:.1f} | {policies['pulses_per_action']:.0f} |"
     )
+
+
+def free(folder: Path) -> Path:
+    """A folder that no session is in: one that was killed before its table was written keeps its own."""
+    names = (folder.with_name(f"{folder.name}{number or ''}") for number in itertools.count())
+    return next(name for name in names if not (name / "session.log").exists())
 
 
 def expect(arguments: list[str]) -> None:
