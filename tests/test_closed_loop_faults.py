@@ -520,6 +520,20 @@ def test_killed_during_a_long_presentation_the_log_has_what_was_asked(
     assert_read_alike(tmp_path, loop_of(pulses=4))
 
 
+def test_a_session_that_was_logged_before_stretches_were_is_read(tmp_path: Path) -> None:
+    with FakeCulture(fault=raising(RuntimeError("smoke")), at=8) as culture:
+        session = run(tmp_path / "new", culture)
+    log = LogWriter(tmp_path / "old" / LOG_FILE, session.log.header)
+    for words, times_s, channels in session.log.records:
+        kept = {name: value for name, value in words.items() if name not in ("stretch", "stimuli")}
+        seen = {"stimuli": words["stimuli"]} if words["kind"] == "seen" else {}
+        log.append(Record(kept | seen, times_s, channels))
+    log.close()
+    old = recover_session(tmp_path / "old")
+    assert old.ticks == session.ticks
+    assert old.to_dict() == session.to_dict() | {"unanswered_pulses": 0}
+
+
 def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / LOG_FILE, {"kind": "header"})
     header_ends = (tmp_path / LOG_FILE).stat().st_size

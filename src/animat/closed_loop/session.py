@@ -90,7 +90,8 @@ class Session:
         found = {
             r.words["stretch"]: r.words
             for r in self.log.records
-            if r.words["kind"] in ("asked", "event") and r.words["stretch"] not in answered
+            # Sessions that were logged before this was have events without.
+            if r.words["kind"] in ("asked", "event") and r.words.get("stretch") not in answered | {None}
         }
         return tuple(words for words in found.values() if words["stimuli"] and words.get("is_admitted", True))
 
