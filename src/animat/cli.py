@@ -17,6 +17,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcomman
 
 from animat.cli_convert import Convert
 from animat.cli_loop import Live, Recover, Run
+from animat.cli_record import Record
 from animat.cli_studies import Reproduce, StudyFile
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
 from animat.recordings.findings import Finding
@@ -73,65 +74,6 @@ class Fitting(Responding):
         timeline = fit_timeline(series, kind=self.simulator, bins=self.bins, range_hz=self.range_hz)
         _say_findings(timeline.findings)
         return timeline
-
-
-@dataclass(frozen=True)
-class Record:
-    """Record a culture: one NWB file a recording. Goes on where it stopped."""
-
-    culture: Literal["virtual", "made-up"] = "virtual"
-    """virtual: simulated neurons on a simulated array; made-up: responses of known distributions, no neurons"""
-    seed: int = 1
-    """Which culture"""
-    sessions: int = 15
-    """How many recordings"""
-    interval_min: float = 10.0
-    """Minutes from one recording to the next"""
-    order: Literal["blocked", "mixed"] = "blocked"
-    """blocked: all stimuli of a frequency together (the paper); mixed: shuffled, as a closed loop meets them"""
-    pulses: int = 1
-    """Pulses a presentation, the last one read; for a closed loop: mixed with 5"""
-    presentations: int = 100
-    """Presentations at each frequency"""
-    out: Path = Path("recordings")
-    """Folder for the files"""
-    json: bool = False
-    """End with a line of JSON"""
-
-    def run(self) -> dict[str, Any]:
-        """Record."""
-        from animat.progress import Bar
-
-        with Bar("recording") as progress:
-            files = self._made_up(progress) if self.culture == "made-up" else self._virtual(progress)
-        print(f"{len(files)} recordings in {self.out}")
-        return {"recordings": [str(file) for file in files]}
-
-    def _made_up(self, progress: Progress) -> list[Path]:
-        from animat.recordings.made_up import write_made_up_series
-
-        if (self.order, self.pulses, self.presentations) != ("blocked", 1, 100):
-            raise InvalidArgument(
-                "--order, --pulses, --presentations: made-up recordings are blocked, with one pulse and 100 "
-                "presentations; --culture virtual takes others"
-            )
-        return write_made_up_series(
-            self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
-        )
-
-    def _virtual(self, progress: Progress) -> list[Path]:
-        from animat.cultures.series import record_virtual_series
-        from animat.cultures.virtual import VirtualCulture
-        from animat.recordings.protocol import Protocol
-
-        return record_virtual_series(
-            lambda: VirtualCulture(self.seed, progress=progress),
-            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations),
-            self.out,
-            sessions=self.sessions,
-            interval_min=self.interval_min,
-            progress=progress,
-        )
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,9 @@ def record_virtual_series(
 
     Whatever interrupts it, at whatever moment, calling it again gives the very recordings that an undisturbed run
     gives, and the state after the last. Every file is complete or absent. After each recording the culture's state is
-    written (`culture.state`); a series goes on from it. What lies between the state and the recordings that are there is recorded again and
-    compared; where there is no state, that is all. The electrodes in use are written to `selection.json`.
+    written (`culture.state`); a series goes on from it. What lies between the state and the recordings that are there
+    is recorded again and compared; where there is no state, that is all. The electrodes in use are written to
+    `selection.json`.
 
     Args:
         make_culture: makes the culture, new and closed.
@@ -58,11 +59,7 @@ def record_virtual_series(
         Mismatch: if a file of the series is there but from another culture, protocol or version.
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
     """
-    if sessions < 1:
-        raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
-    if not 0 < interval_min < float("inf"):
-        raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
-    _check_interval(protocol, sessions, interval_min)
+    check_interval(protocol, sessions, interval_min)
     folder, progress = Path(folder), progress or Silent()
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
     there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
@@ -85,7 +82,7 @@ def record_virtual_series(
             culture.save_state(folder / STATE_FILE, sessions=0)
         for session in range(recorded, sessions):
             culture.rest(max(0.0, 60 * session * interval_min - culture.now_s))
-            part = _Part(progress, session, sessions, files[session].name)
+            part = PartOfSeries(progress, session, sessions, files[session].name)
             recording = culture.record(protocol, _seed(culture, session), part)
             if files[session].exists():
                 _expect_equal(files[session], recording)
@@ -134,7 +131,12 @@ def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int)
     return culture, 0
 
 
-def _check_interval(protocol: Protocol, sessions: int, interval_min: float) -> None:
+def check_interval(protocol: Protocol, sessions: int, interval_min: float) -> None:
+    """Raise unless there are sessions, and each is over when the next one is due."""
+    if sessions < 1:
+        raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
+    if not 0 < interval_min < float("inf"):
+        raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
     # How long a schedule takes does not depend on the electrodes: no culture need be opened to refuse.
     takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), seed=0).duration_s / 60
     if sessions > 1 and interval_min < takes_min:
@@ -173,7 +175,7 @@ def _short(words: str | None) -> str:
     return "nothing" if words is None else words if len(words) <= 60 else f"{words[:57]}..."
 
 
-class _Part:
+class PartOfSeries:
     """The progress of one session as a part of the series'."""
 
     def __init__(self, whole: Progress, session: int, sessions: int, note: str) -> None:

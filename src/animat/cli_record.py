@@ -1,0 +1,119 @@
+"""The command that records a culture, whichever it is, at intervals."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from animat.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from animat.progress import Progress
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record a culture: one NWB file a recording. Goes on where it stopped."""
+
+    culture: Literal["virtual", "made-up", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; made-up: responses of known distributions, no neurons; replay:
+    answers from recordings; cl1 and maxone: the devices"""
+    recordings: tuple[Path, ...] = ()
+    """For a replay: what it answers from"""
+    selection: Path | None = None
+    """For a maxone: the file of its electrodes"""
+    seed: int = 1
+    """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
+    sessions: int = 15
+    """How many recordings"""
+    interval_min: float = 10.0
+    """Minutes from one recording to the next"""
+    order: Literal["blocked", "mixed"] = "blocked"
+    """blocked: all stimuli of a frequency together (the paper); mixed: shuffled, as a closed loop meets them"""
+    pulses: int = 1
+    """Pulses a presentation, the last one read; for a closed loop: mixed with 5"""
+    presentations: int = 100
+    """Presentations at each frequency"""
+    out: Path = Path("recordings")
+    """Folder for the files"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Record."""
+        from animat.progress import Bar
+
+        if (self.culture == "replay") != bool(self.recordings):
+            raise InvalidArgument(
+                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
+                f"--culture {self.culture}"
+            )
+        if (self.culture == "maxone") != (self.selection is not None):
+            raise InvalidArgument(
+                f"--selection: expected a file of electrodes for a maxone and none for others, got {self.selection} "
+                f"for --culture {self.culture}"
+            )
+        with Bar("recording") as progress:
+            if self.culture == "made-up":
+                files = self._made_up(progress)
+            else:
+                files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
+        print(f"{len(files)} recordings in {self.out}")
+        return {"recordings": [str(file) for file in files]}
+
+    def _made_up(self, progress: Progress) -> list[Path]:
+        from animat.recordings.made_up import write_made_up_series
+
+        if (self.order, self.pulses, self.presentations) != ("blocked", 1, 100):
+            raise InvalidArgument(
+                "--order, --pulses, --presentations: made-up recordings are blocked, with one pulse and 100 "
+                "presentations; --culture virtual takes others"
+            )
+        return write_made_up_series(
+            self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
+        )
+
+    def _virtual(self, progress: Progress) -> list[Path]:
+        from animat.cultures.series import record_virtual_series
+        from animat.cultures.virtual import VirtualCulture
+        from animat.recordings.protocol import Protocol
+
+        return record_virtual_series(
+            lambda: VirtualCulture(self.seed, progress=progress),
+            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations),
+            self.out,
+            sessions=self.sessions,
+            interval_min=self.interval_min,
+            progress=progress,
+        )
+
+    def _living(self, progress: Progress) -> list[Path]:
+        from animat.cultures.kinds import culture_of, pulse_for
+        from animat.cultures.living_series import record_living_series
+        from animat.recordings.protocol import Protocol
+        from animat.recordings.reading import read_recordings
+
+        assert self.culture != "made-up"
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        with culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture:
+            protocol = Protocol(
+                order=self.order,
+                pulses=self.pulses,
+                presentations=self.presentations,
+                patterns=min(100, len(culture.patterns)),
+                pulse=pulse_for(self.culture),
+            )
+            series = record_living_series(
+                culture,
+                protocol,
+                self.out,
+                sessions=self.sessions,
+                interval_min=self.interval_min,
+                seed=self.seed,
+                progress=progress,
+            )
+        for minute in series.missed_min:
+            print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
+        return series.files

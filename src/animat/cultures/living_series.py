@@ -1,0 +1,107 @@
+"""A series of recordings of a culture that cannot be brought back: what is missed is missed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from animat.cultures.base import Culture
+from animat.cultures.series import PartOfSeries, check_interval, recording_name
+from animat.errors import Mismatch
+from animat.progress import Progress, Silent
+from animat.recordings.protocol import Protocol
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+
+
+class LivingSeries(NamedTuple):
+    """What a series has in the end.
+
+    Attributes:
+        files: the recordings, in the order of time.
+        missed_min: minutes of the series at which none was made: the next was due when the culture was there again.
+    """
+
+    files: list[Path]
+    missed_min: list[float]
+
+
+def record_living_series(
+    culture: Culture,
+    protocol: Protocol,
+    folder: str | os.PathLike[str],
+    *,
+    sessions: int = 15,
+    interval_min: float = 10.0,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> LivingSeries:
+    """Record any culture every `interval_min`, into files `recording_0000_min.nwb` and so on, by its contract alone.
+
+    The names count from the first recording; `start_min` within is on the culture's own clock. Every file is complete
+    or absent, and none is written over. Called again it goes on with what is due next, as long as the culture's clock
+    went on; a recording whose successor is due is missed. A virtual culture can do better: `record_virtual_series`.
+
+    Args:
+        culture: open; it stays so.
+        protocol: of every recording; the order of stimuli differs from one to the next.
+        folder: where the files go; made if it is missing.
+        sessions: number of recordings.
+        interval_min: minutes between the starts of two recordings.
+        seed: of the orders of stimuli; zero or more.
+        progress: told after each block.
+
+    Raises:
+        InvalidArgument: for no sessions, or an interval shorter than a recording.
+        Mismatch: if recordings are there that another culture or protocol made, or that lie ahead of its clock.
+        InvalidFile: if a file cannot be written, or one that is there is damaged.
+        UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
+    """
+    check_interval(protocol, sessions, interval_min)
+    folder, progress = Path(folder), progress or Silent()
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / recording_name(session * interval_min) for session in range(sessions)]
+    zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
+    missed_min = []
+    for session, file in enumerate(files):
+        due_s = zero_s + 60 * session * interval_min
+        if not file.exists():
+            if culture.now_s >= due_s + 60 * interval_min:
+                missed_min.append(session * interval_min)
+                continue
+            culture.rest(max(0.0, due_s - culture.now_s))
+            part = PartOfSeries(progress, session, sessions, file.name)
+            culture.record(protocol, seed * 10_000 + session, part).save(file)
+        progress.update(session + 1, sessions, file.name)
+    return LivingSeries([file for file in files if file.exists()], missed_min)
+
+
+def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interval_s: float) -> float:
+    """When the series began or begins, on the culture's clock."""
+    zero_s = None
+    for session, file in enumerate(files):
+        if not file.exists():
+            continue
+        there = read_recording(file)
+        _expect_of(file, there, culture, protocol)
+        if zero_s is None:
+            zero_s = 60 * there.start_min - session * interval_s
+        if culture.now_s < 60 * there.start_min + there.duration_s:
+            raise Mismatch(
+                f"{file}: expected a recording before the culture's clock, which is at {culture.now_s / 60:.2f} min, "
+                f"got one at {there.start_min:.2f} min: the clock began anew, or it is another culture: choose another "
+                "folder"
+            )
+    return culture.now_s if zero_s is None else zero_s
+
+
+def _expect_of(file: Path, there: Recording, culture: Culture, protocol: Protocol) -> None:
+    for name, words in (("source", culture.provenance["source"]), ("protocol", protocol.to_json())):
+        if there.provenance.get(name) != words:
+            raise Mismatch(
+                f"{file}: expected a recording of this culture by this protocol, got one with another {name}: choose "
+                "another folder"
+            )
+    if there.channels.label.tolist() != culture.channels.label.tolist():
+        raise Mismatch(f"{file}: expected a recording of this culture's channels, got others: choose another folder")

@@ -1,0 +1,155 @@
+"""A series of any culture through its contract. Oracles: the same calls by hand, and what a stand-in was given."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stand_in_cl
+import stand_in_maxlab
+from animat.cli import main
+from animat.cultures.base import Culture
+from animat.cultures.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.living_series import record_living_series
+from animat.cultures.maxone import MaxOneCulture
+from animat.cultures.replay import ReplayCulture
+from animat.errors import DeviceFailed, InvalidArgument, Mismatch
+from animat.recordings.array import MAXONE
+from animat.recordings.made_up import make_up_recording, write_made_up_series
+from animat.recordings.patterns import draw_patterns
+from animat.recordings.protocol import Protocol
+from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.selection import Selection
+from animat.recordings.stimulus import BALANCED_PULSE
+from fake_culture import FakeCulture
+
+SHORT = Protocol((20.0, 80.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
+
+
+def replay() -> ReplayCulture:
+    return ReplayCulture([make_up_recording(1, channels=32, start_min=30.0)], seed=3)
+
+
+def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
+    with replay() as culture:
+        series = record_living_series(culture, SHORT, tmp_path / "a", sessions=3, interval_min=2.0, seed=4)
+    assert [file.name for file in series.files] == [f"recording_{minute:04}_min.nwb" for minute in (0, 2, 4)]
+    assert series.missed_min == []
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [file.name for file in series.files]
+    with replay() as culture:
+        for session, recording in enumerate(read_recordings(tmp_path / "a")):
+            culture.rest(60 * (30.0 + 2.0 * session) - culture.now_s)
+            assert recording.equals(culture.record(SHORT, 40_000 + session))
+            assert recording.start_min == pytest.approx(30.0 + 2.0 * session)
+
+
+def test_what_is_due_next_is_recorded_and_what_was_missed_is_told(tmp_path: Path) -> None:
+    with FakeCulture() as culture:
+        first = record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
+        kept = [file.read_bytes() for file in first.files]
+        # Sessions 2 and 3 would have begun, and 3 be over, when the next is due.
+        culture.rest(150.0)
+        pulses = culture.pulses
+        series = record_living_series(culture, SHORT, tmp_path, sessions=6, interval_min=1.0)
+    assert series.missed_min == [2.0]
+    assert [file.name[10:14] for file in series.files] == ["0000", "0001", "0003", "0004", "0005"]
+    assert [file.read_bytes() for file in series.files[:2]] == kept
+    minutes = [read_recording(file).start_min - 0.2 for file in series.files]
+    assert minutes[3:] == pytest.approx([4.0, 5.0])
+    assert 3.0 <= minutes[2] < 4.0
+    assert culture.pulses == pulses + 3 * 10
+
+
+def test_a_culture_that_fails_leaves_what_was_recorded_before(tmp_path: Path) -> None:
+    def fail(*_: object) -> None:
+        raise DeviceFailed("the test says so")
+
+    # Two blocks a recording: the second recording's first.
+    with FakeCulture(fault=fail, at=2) as culture:  # type: ignore[arg-type]
+        with pytest.raises(DeviceFailed, match="the test says so"):
+            record_living_series(culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
+        assert [file.name for file in tmp_path.iterdir()] == ["recording_0000_min.nwb"]
+        series = record_living_series(culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
+        assert len(series.files) == 3
+
+
+def test_nothing_is_mixed_or_written_over(tmp_path: Path) -> None:
+    with replay() as culture:
+        record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+        with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* another protocol"):
+            record_living_series(culture, replace(SHORT, pulses=2), tmp_path, sessions=2, interval_min=2.0)
+    with replay() as culture, pytest.raises(Mismatch, match=r"clock, which is at 30\.00 min, got one at 30\.00 min"):
+        record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
+    with FakeCulture() as culture:
+        with pytest.raises(Mismatch, match="another source: choose another folder"):
+            record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
+        with pytest.raises(InvalidArgument, match="sessions: expected at least 1"):
+            record_living_series(culture, SHORT, tmp_path / "b", sessions=0)
+        with pytest.raises(InvalidArgument, match="interval_min: expected more than 0 minutes, got nan"):
+            record_living_series(culture, SHORT, tmp_path / "b", interval_min=float("nan"))
+        with pytest.raises(InvalidArgument, match="interval_min: expected at least the"):
+            record_living_series(culture, SHORT, tmp_path / "b", sessions=2, interval_min=0.01)
+    assert not (tmp_path / "b").exists()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def cl1(patch: pytest.MonkeyPatch) -> tuple[Culture, Callable[[], list[float]]]:
+    neurons = stand_in_cl.install(patch)
+    neurons.now = 1_000_000  # the device was started before
+    return CL1Culture(), lambda: sorted({frame / 25_000 for frame, *_ in neurons.pulses})
+
+
+def maxone(patch: pytest.MonkeyPatch) -> tuple[Culture, Callable[[], list[float]]]:
+    rig = stand_in_maxlab.install(patch)
+    sites = np.array([(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)])
+    selection = Selection(MAXONE, np.arange(13_000, 13_050), sites, draw_patterns(MAXONE, sites, seed=1))
+    culture = MaxOneCulture(selection, stream=stand_in_maxlab.Stream(rig), settle=False)
+    return culture, lambda: sorted({pulse.frame / 20_000 for pulse in rig.delivered})
+
+
+@pytest.mark.parametrize("make", [cl1, maxone])
+def test_devices_are_recorded_by_the_same_calls(
+    make: Callable[[pytest.MonkeyPatch], tuple[AbstractContextManager[Culture], Callable[[], list[float]]]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    device, pulses_s = make(monkeypatch)
+    protocol = replace(SHORT, pulse=CL1_PULSE if make is cl1 else BALANCED_PULSE)
+    with device as culture:
+        zero_s = culture.now_s
+        first = record_living_series(culture, protocol, tmp_path, sessions=2, interval_min=0.5)
+    with device as culture:
+        series = record_living_series(culture, protocol, tmp_path, sessions=3, interval_min=0.5)
+    assert series.files[:2] == first.files
+    assert [r.start_min - zero_s / 60 for r in read_recordings(tmp_path)] == pytest.approx([0, 0.5, 1.0], abs=0.01)
+    assert len(pulses_s()) == 3 * 10
+
+
+def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_made_up_series(1, tmp_path / "made-up", sessions=1)
+    command = [
+        "record",
+        "--culture",
+        "replay",
+        "--sessions",
+        "2",
+        "--presentations",
+        "2",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main([*command, "--recordings", str(tmp_path / "made-up"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert [Path(file).name for file in told["recordings"]] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
+    assert read_recording(told["recordings"][1]).start_min == pytest.approx(10.0)
+    for wrong in (command, ["record", "--selection", "x.json"], ["record", "--culture", "maxone"]):
+        assert main(wrong) != 0
+        error = capsys.readouterr().err.strip()
+        assert "\n" not in error
+        assert error.startswith("animat: --recordings" if wrong is command else "animat: --selection")
