@@ -11,6 +11,7 @@ import pytest
 
 from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.mapping import Linear, Thresholds
@@ -148,13 +149,14 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
             told.append((done, total, note))
 
     evaluation = evaluate(policies, timeline, at_min=14.0, episodes=20, progress=Noting())
-    assert told == [(i + 1, 7, row.name) for i, row in enumerate(evaluation.rows)]
+    assert told == [(i + 1, 8, row.name) for i, row in enumerate(evaluation.rows)]
     assert [row.name for row in evaluation.rows] == [
         "policies",
         "random",
         "constant 5 Hz",
         "constant 10 Hz",
         "constant 20 Hz",
+        "made by hand",
         "silent",
         "shuffled",
     ]
@@ -163,6 +165,17 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
     assert plain["policies"] == {"a": plain["rows"][0]["mean_returns"][0], "b": plain["rows"][0]["mean_returns"][1]}
     for row in evaluation.rows:
         assert row.name in evaluation.to_text()
+
+
+def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> None:
+    timeline = timeline_of()
+    evaluation = evaluate({"a": policy_of(timeline)}, timeline, at_min=14.0, episodes=50, seed=3)
+    (row,) = [row for row in evaluation.rows if row.name == "made by hand"]
+    environment, simulator = Animat(Cartpole(), Thresholds(1), 3), timeline.at(14.0)
+    rule = hand_made(environment, simulator)
+    np.testing.assert_array_equal(
+        row.episodes.returns, roll_out(environment, simulator, rule, 1, episodes=50, seed=3).returns
+    )
 
 
 def test_shuffling_makes_every_policy_a_random_one() -> None:
@@ -183,7 +196,7 @@ def test_without_neurons_there_is_nothing_to_silence() -> None:
         commands=(-1.0, 1.0),
     )
     evaluation = evaluate({"p0": policy}, None, episodes=4)
-    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1"]
+    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "made by hand"]
     assert isinstance(WithoutNeurons(Cartpole(), (-1.0, 1.0)).n_actions, int)
 
 

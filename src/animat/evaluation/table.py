@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
 from animat.animat import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
-from animat.neurons.simulator import NeuronSimulator, silenced
+from animat.evaluation.controls import Control, controls_of
+from animat.evaluation.rollouts import Episodes, networks_of, roll_out
+from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
@@ -120,9 +120,7 @@ def evaluate(
 ) -> Evaluation:
     """Run policies and the controls beside them on the simulator of one minute.
 
-    The controls: *random*, an action drawn at random; *constant*, one condition always, for each of them; *silent*,
-    the policies on a culture that always answers 0; *shuffled*, the policies with the delivered condition drawn anew
-    at each iteration, whatever they chose.
+    The controls are those of `animat.evaluation.controls`.
 
     Args:
         policies: by name, all of one robot, mapping and set of conditions.
@@ -168,22 +166,16 @@ def evaluate(
 
     networks = networks_of(list(policies.values()), greedy=greedy)
     n = len(policies)
-    acting: list[tuple[str, str, Environment[Any], NeuronSimulator | None, Actor, int]] = [
-        ("policies", "as trained", environment, simulator, networks, n),
-        ("random", "any action, equally likely", environment, simulator, Uniform(), 1),
+    acting = [
+        Control("policies", "as trained", environment, simulator, networks, n),
+        *controls_of(environment, simulator, _action_labels(first), networks, n),
     ]
-    for i, label in enumerate(_action_labels(first)):
-        constant = Constant(jnp.array([i]))
-        acting.append((f"constant {label}", "this one always", environment, simulator, constant, 1))
-    if isinstance(environment, Animat) and simulator is not None:
-        acting.append(("silent", "the culture always answers 0", environment, silenced(simulator), networks, n))
-        shuffled = replace(environment, delivery="shuffled")
-        acting.append(("shuffled", "the delivered condition is drawn anew", shuffled, simulator, networks, n))
     rows = []
-    for name, meaning, in_, on, actors, many in acting:
-        rows.append(Row(name, meaning, roll_out(in_, on, actors, many, episodes=episodes, seed=seed)))
+    for each in acting:
+        ran = roll_out(each.environment, each.simulator, each.actor, each.n_actors, episodes=episodes, seed=seed)
+        rows.append(Row(each.name, each.meaning, ran))
         if progress is not None:
-            progress.update(len(rows), len(acting), name)
+            progress.update(len(rows), len(acting), each.name)
     return Evaluation(
         body.name, None if first.mapping is None else first.mapping.name, minute, tuple(policies), tuple(rows), findings
     )

@@ -6,12 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
-import jax.numpy as jnp
-
-from animat.animat import Animat, Environment
-from animat.evaluation.hand_made import hand_made
-from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, networks_of, roll_out
-from animat.neurons.simulator import NeuronSimulator, silenced
+from animat.animat import Environment
+from animat.evaluation.controls import controls_of
+from animat.evaluation.rollouts import Actor, Episodes, Networks, Uniform, networks_of, roll_out
+from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.studies.draws import draw_seed
 from animat.studies.jobs import Report, Task
@@ -88,10 +86,11 @@ class Control(Task):
         minutes = study.limit_minutes(last_minute(timeline)) if condition.through_neurons else [last_minute(timeline)]
         for i, at_min in enumerate(minutes):
             report(i / len(minutes), f"at {at_min:g} min")
-            for control, actor, n, of in self._controls(setting, networks, at_min, study.policies):
-                seed = draw_seed(study.seed, robot, name, at_min, control)
-                ran = of.run(actor, n, at_min, study.episodes, seed)
-                rows += [(control, *row) for row in _rows(at_min, ran, [f"p{i}" if n > 1 else "" for i in range(n)])]
+            answering = setting.simulator(at_min)
+            for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
+                seed, n = draw_seed(study.seed, robot, name, at_min, each.name), each.n_actors
+                ran = roll_out(each.environment, each.simulator, each.actor, n, episodes=study.episodes, seed=seed)
+                rows += [(each.name, *row) for row in _rows(at_min, ran, [f"p{i}" if n > 1 else "" for i in range(n)])]
         files = [write_table(controls_file(folder, self.body, condition), ("control", *HEAD), rows)]
         if timeline is not None and condition.through_neurons:
             over_time = []
@@ -103,20 +102,6 @@ class Control(Task):
             files.append(write_table(path, ("at_min", "random"), over_time))
         return files
 
-    def _controls(
-        self, setting: Setting, networks: Networks | None, at_min: float, n: int
-    ) -> list[tuple[str, Actor, int, Setting]]:
-        environment, simulator = setting.environment, setting.simulator(at_min)
-        controls: list[tuple[str, Actor, int, Setting]] = [("random", Uniform(), 1, setting)]
-        for i in range(environment.n_actions or 0):
-            controls.append((f"constant {setting.action_labels[i]}", Constant(jnp.array([i])), 1, setting))
-        controls.append(("made by hand", hand_made(environment, simulator), 1, setting))
-        if networks is not None and isinstance(environment, Animat):
-            controls.append(("silent", networks, n, replace(setting, silent=True)))
-            shuffled = replace(environment, delivery="shuffled")
-            controls.append(("shuffled", networks, n, replace(setting, environment=shuffled)))
-        return controls
-
 
 @dataclass(frozen=True, eq=False)
 class Setting:
@@ -125,20 +110,15 @@ class Setting:
     Attributes:
         timeline: None without neurons.
         action_labels: of discrete actions.
-        silent: whether the culture always answers 0.
     """
 
     environment: Environment[Any]
     timeline: SimulatorTimeline | None
     action_labels: tuple[str, ...]
-    silent: bool = False
 
     def simulator(self, at_min: float) -> NeuronSimulator | None:
         """The neurons at a minute."""
-        if self.timeline is None:
-            return None
-        simulator = self.timeline.at(at_min)
-        return silenced(simulator) if self.silent else simulator
+        return None if self.timeline is None else self.timeline.at(at_min)
 
     def run(self, actor: Actor, n: int, at_min: float, episodes: int, seed: int) -> Episodes:
         """Episodes at a minute."""
