@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from dataclasses import dataclass
@@ -66,12 +67,19 @@ def _run(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, 
     for body in study.robots:
         for caveat in body.robot().caveats():
             print(f"warning: {caveat}", file=sys.stderr)
+    cores = len(os.sched_getaffinity(0))
+    if workers is not None and workers > cores:
+        print(f"warning: --workers: {workers} were asked for; there is one a core, {cores}", file=sys.stderr)
     began = time.monotonic()
     with Bar("study") as progress:
         ran = run_study(study, out, base=base, workers=workers, progress=progress)
     comparisons = read_table(table_file(ran.folder, "comparisons"))
     for row in comparisons:
-        paper = "" if row["paper_p"] is None else f"; paper p {row['paper_p']:.3g}, U {row['paper_u']:g}"
+        paper = (
+            ""
+            if row["paper_p"] is None
+            else f"; the paper's p {row['paper_p']:.3g}, which implies U {row['paper_u']:g}"
+        )
         print(
             f"{row['robot']:11} {row['comparison']:28} {row['mean_first']:8.1f} {row['mean_second']:8.1f}  "
             f"U {row['u']:<4g} p {row['p_normal']:<9.3g} {row['outcome']}{paper}"

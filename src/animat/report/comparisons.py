@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BLUE, GREY, LIMIT, ORANGE, new_figure, style_axes
+from animat.report.style import BLACK, BLUE, GREY, LIMIT, ORANGE, add_common_legend, new_figure, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,12 +24,14 @@ class Group:
         name: the condition.
         returns: each policy's mean return, shape (policies,).
         random, limit: of random actions, and the best possible; None where not known.
+        score: the normalised score of the policies' mean; None where not known.
     """
 
     name: str
     returns: Float64[np.ndarray, " policies"]
     random: float | None = None
     limit: float | None = None
+    score: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +82,16 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         whole.set_ylim(low, high + 0.2 * room)
         for axes, words in ((whole, pair.title), (close, "close up")):
             axes.set_xlim(-0.6, 1.6)
-            axes.set_xticks([0, 1], [group.name.replace(" ", "\n", 1) for group in (pair.first, pair.second)])
+            axes.set_xticks([0, 1], [_name(group) for group in (pair.first, pair.second)])
             style_axes(axes, words, "", "mean return of a policy")
-    handles, labels = rows[0, 0].get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    add_common_legend(figure, list(rows[0]), columns=2)
     return figure
+
+
+def _name(group: Group) -> str:
+    """The condition in two lines, and its score in a third."""
+    name = group.name if " " in group.name else f"{group.name} "
+    return name.replace(" ", "\n", 1) + ("" if group.score is None else f"\nscore {group.score:.2f}")
 
 
 def _draw_boxes(axes: Axes, group: Group, place: int, colour: str) -> None:
@@ -107,8 +113,6 @@ def _draw_boxes(axes: Axes, group: Group, place: int, colour: str) -> None:
 def _draw_references(axes: Axes, group: Group, place: int) -> None:
     ends = [place - 0.42, place + 0.42]
     if group.random is not None:
-        name = "random actions" if place == 0 else None
-        axes.plot(ends, [group.random] * 2, color=GREY, linewidth=1.3, linestyle=":", label=name)
+        axes.plot(ends, [group.random] * 2, color=GREY, linewidth=1.3, linestyle=":", label="random actions")
     if group.limit is not None:
-        name = "best possible return" if place == 0 else None
-        axes.plot(ends, [group.limit] * 2, color=LIMIT, linewidth=1.3, linestyle="--", label=name)
+        axes.plot(ends, [group.limit] * 2, color=LIMIT, linewidth=1.3, linestyle="--", label="best possible return")

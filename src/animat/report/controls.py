@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from animat.report.style import BLACK, BLUE, draw_levels, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, LIMIT, ORANGE, add_common_legend, grid_of_panels, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,16 +19,19 @@ class Controls:
     Attributes:
         title: the mapping and the minute.
         returns: name, mean return and its standard error (None: not known), the trained policies first.
-        limit: the best possible return; None where not known.
+        n_trained: how many of them are trained policies.
+        random, limit: of random actions, and the best possible; None where not known.
     """
 
     title: str
     returns: tuple[tuple[str, float, float | None], ...]
+    n_trained: int = 1
+    random: float | None = None
     limit: float | None = None
 
 
 def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
-    """A panel a mapping: mean returns with their standard errors, and the best possible return.
+    """A panel a mapping and recording: mean returns with their standard errors, random actions and the limit.
 
     Args:
         panels_of: on one robot.
@@ -38,11 +41,16 @@ def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)
     for axes, controls in zip(panels, panels_of, strict=True):
         for place, (_, mean, error) in enumerate(controls.returns):
-            colour = BLUE if place == 0 else BLACK
-            axes.errorbar([mean], [-place], xerr=[error or 0.0], fmt="o", markersize=4, color=colour, capsize=2)
+            colour, name = (BLUE, "trained") if place < controls.n_trained else (ORANGE, "control")
+            bar = [error or 0.0]
+            axes.errorbar([mean], [-place], xerr=bar, fmt="o", markersize=4, color=colour, capsize=2, label=name)
         axes.set_yticks([-i for i in range(len(controls.returns))], [name for name, _, _ in controls.returns])
         axes.set_ylim(-len(controls.returns) + 0.4, 0.6)
-        draw_levels(axes, None, controls.limit, upright=True)
+        if controls.limit is not None:
+            axes.axvline(controls.limit, color=LIMIT, linewidth=1.2, linestyle="--", label="best possible return")
+        if controls.random is not None:
+            axes.axvline(controls.random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
         style_axes(axes, controls.title, "mean return and its standard error", "")
         axes.grid(axis="y", linewidth=0.4, alpha=0.5)
+    add_common_legend(figure, panels, columns=4)
     return figure

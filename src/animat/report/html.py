@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import os
 import struct
 from collections.abc import Sequence
@@ -122,10 +123,12 @@ def write_page(
 
 
 def cell(value: Any) -> str:
-    """A cell as text: whole numbers as they are, others with three digits, a dash for None."""
-    if value is None:
+    """A cell as text: whole numbers as they are, others with three digits, a dash for None and what is no number."""
+    if value is None or value != value:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value)
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
     whole = value == int(value) and abs(value) < 1e6
     return (f"{int(value)}" if whole else f"{value:.3g}").replace("-", "−")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, draw_levels, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, LIMIT, add_common_legend, grid_of_panels, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,14 +25,15 @@ class LearningCurve:
         name: the condition.
         iterations: done at the end of each part of training, shape (parts,).
         returns: mean return of the episodes that ended in it, NaN where none did, shape (policies, parts).
-        random, limit: of random actions and the best possible, at the start of training; None where not known.
+        random, limit: of random actions and the best possible with the simulator in use in each part, NaN where not
+            known, shape (parts,); None where known of none.
     """
 
     name: str
     iterations: Float64[np.ndarray, " parts"]
     returns: Float64[np.ndarray, "policies parts"]
-    random: float | None = None
-    limit: float | None = None
+    random: Float64[np.ndarray, " parts"] | None = None
+    limit: Float64[np.ndarray, " parts"] | None = None
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
@@ -53,11 +54,19 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         mean, low, high = _mean_with_interval(curve.returns[:, some])
         axes.fill_between(x[some], low, high, color=BLUE, alpha=0.3, linewidth=0, label="95 % interval of the mean")
         axes.plot(x[some], mean, color=BLUE, linewidth=1.5, label="mean of the policies")
-        draw_levels(axes, curve.random, curve.limit)
+        for name, levels, colour, line in (
+            ("best possible return", curve.limit, LIMIT, "--"),
+            ("random actions", curve.random, GREY, ":"),
+        ):
+            if levels is not None:
+                # A part goes up to its end, the first one from 0.
+                steps = np.append(levels[:1], levels)
+                axes.step(
+                    np.append(0.0, x), steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name
+                )
         style_axes(axes, curve.name, "iterations (thousands)", "return")
         axes.set_xlim(0, None)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    add_common_legend(figure, panels, columns=4)
     return figure
 
 

@@ -9,10 +9,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BLUE, GREEN, GREY, LIMIT, ORANGE, PURPLE, SKY, new_figure, style_axes
+from animat.report.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    LIMIT,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    add_common_legend,
+    grid_of_panels,
+    style_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
+
+MOST = len(_COLOURS)
+"""Conditions that a panel has colours for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,44 +47,66 @@ class Course:
     returns: Float64[np.ndarray, "policies recordings"]
 
 
-def draw_over_time(
-    courses: Sequence[Course],
-    title: str,
-    *,
-    random: Float64[np.ndarray, " recordings"] | None = None,
-    limit: Float64[np.ndarray, " recordings"] | None = None,
-    trained_until_min: float | None = None,
-) -> Figure:
-    """Median over policies of each condition with the range of its quartiles, against the recording's minute.
+@dataclass(frozen=True, eq=False)
+class Courses:
+    """The conditions of one mapping, which share random actions and the best possible return.
+
+    Attributes:
+        title: the mapping.
+        courses: with the same minutes, at most `MOST`.
+        random: of random actions at the same minutes; None where not known.
+        limit: the best possible return on a rough grid at the same minutes; None where not known.
+        fine_limit: minutes and the best possible return on a fine grid at some of them.
+        left_out: conditions that there is no room for.
+    """
+
+    title: str
+    courses: tuple[Course, ...]
+    random: Float64[np.ndarray, " recordings"] | None = None
+    limit: Float64[np.ndarray, " recordings"] | None = None
+    fine_limit: tuple[tuple[float, float], ...] = ()
+    left_out: int = 0
+
+
+def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
+    """A panel a mapping: median over policies of each condition with its quartiles, against the recording's minute.
 
     Args:
-        courses: of one robot, with the same minutes; at most six.
-        title: of the figure.
-        random, limit: of random actions and the best possible, at the same minutes.
+        panels_of: of one robot.
+        title: of the whole figure.
         trained_until_min: end of training on the culture's clock, to be marked.
     """
-    figure = new_figure(7.5, 4.2)
-    axes = figure.subplots()
-    for course, colour in zip(courses, (BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK), strict=False):
-        low, middle, high = np.quantile(course.returns, [0.25, 0.5, 0.75], axis=0)
-        axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
-        axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
-    minutes = courses[0].minutes
-    if limit is not None:
-        axes.plot(minutes, limit, color=LIMIT, linestyle="--", linewidth=1.3, label="best possible return")
-    if random is not None:
-        axes.plot(minutes, random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
-    if trained_until_min is not None:
-        axes.axvline(trained_until_min, color=GREY, linewidth=0.8)
-        axes.annotate(
-            "end of training",
-            (trained_until_min, 0.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(3, 3),
-            textcoords="offset points",
-            fontsize=8,
-            color=GREY,
-        )
-    style_axes(axes, title, "recording that answers (min)", "return")
-    axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 3.4, title, share_x=True)
+    names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses))
+    for axes, of in zip(panels, panels_of, strict=True):
+        for course in of.courses:
+            colour = _COLOURS[names.index(course.name) % MOST]
+            low, middle, high = np.quantile(course.returns, [0.25, 0.5, 0.75], axis=0)
+            axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
+            axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
+        minutes = of.courses[0].minutes
+        if of.limit is not None:
+            name = "best possible return, rough grid"
+            axes.plot(minutes, of.limit, color=LIMIT, linestyle="--", linewidth=1.3, label=name)
+        if of.fine_limit:
+            name = "best possible return, fine grid"
+            axes.plot(
+                *zip(*of.fine_limit, strict=True), color=LIMIT, linestyle="", marker="D", markersize=4, label=name
+            )
+        if of.random is not None:
+            axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
+        if trained_until_min is not None:
+            axes.axvline(trained_until_min, color=GREY, linewidth=0.8)
+            axes.annotate(
+                "end of training",
+                (trained_until_min, 0.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(3, 3),
+                textcoords="offset points",
+                fontsize=8,
+                color=GREY,
+            )
+        more = f" ({of.left_out} more conditions in the tables)" if of.left_out else ""
+        style_axes(axes, f"{of.title}{more}", "recording that answers (min)", "return")
+    add_common_legend(figure, panels, columns=3)
     return figure

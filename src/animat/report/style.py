@@ -33,7 +33,7 @@ WINDOW = ORANGE
 NON_BURST = BLUE
 BURST = RED
 MEDIAN = RED
-LIMIT = GREEN
+LIMIT = BLACK
 
 # Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
@@ -61,6 +61,17 @@ def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 def add_legend(axes: Axes, **place: Any) -> None:
     """A legend without a frame; `place` as in `Axes.legend`."""
     axes.legend(fontsize=8, frameon=False, **place)
+
+
+def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -> None:
+    """One legend under a figure for all its panels: whatever has a name in any of them, each name once."""
+    entries: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if entries:
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
+        figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
 
 
 def condition_colours(units: Sequence[str]) -> list[str]:
@@ -116,12 +127,3 @@ def grid_of_panels(
         # A shared axis has its numbers at every panel all the same.
         axes.tick_params(labelbottom=True)
     return figure, list(panels[:n])
-
-
-def draw_levels(axes: Axes, random: float | None, limit: float | None, *, upright: bool = False) -> None:
-    """Lines across the axes at the return of random actions (dotted) and the best possible one (dashed)."""
-    line = axes.axvline if upright else axes.axhline
-    if limit is not None:
-        line(limit, color=LIMIT, linewidth=1.2, linestyle="--", label="best possible return")
-    if random is not None:
-        line(random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")

@@ -14,25 +14,28 @@ CULTURE: dict[str, tuple[str, str]] = {
     ),
     "bursts": (
         "bursts set apart",
-        "All responses x; x against the ratio of active channels; that ratio with Otsu's threshold; x against it with "
+        "All responses x, bursts among them; x against the ratio of active channels; that ratio with Otsu's "
+        "threshold; x against it with "
         "bursts marked. "
         "Bursts come regardless of the stimulus and are left out.",
     ),
     "responses": (
         "responses to each stimulus",
-        "What the neuron simulators draw from, in the first recording; the line is P50, the median of all together.",
+        "Non-burst responses in the first recording, which the neuron simulators are made of; the line is P50, their "
+        "median over all stimuli.",
     ),
     "first-and-last": (
         "responses, first and last",
-        "Filled: the first recording. Outline: the last. Lines: P50 of each.",
+        "Non-burst responses. Filled: the first recording. Outline: the last. Lines: P50 of each.",
     ),
     "over-time": (
         "one stimulus over time",
-        "Responses to the first stimulus, from recording to recording, with their medians.",
+        "Non-burst responses to the first stimulus, from recording to recording, with their medians.",
     ),
     "drift": (
         "drift",
-        "Percentiles of all responses, P(x ≥ P50) of each stimulus, and the share of bursts, at every recording.",
+        "Percentiles of the non-burst responses to all stimuli, P(x ≥ P50) of each stimulus, and the share of "
+        "bursts, at every recording.",
     ),
 }
 
@@ -40,25 +43,31 @@ ROBOT: dict[str, tuple[str, str]] = {
     "learning": (
         "learning curves",
         "Return of the episodes that ended in each part of training: every policy, their mean and its 95 % bootstrap "
-        "interval. "
-        "Lines: random actions and the best possible return at the first recording, of what is delivered as chosen.",
+        "interval; actions are drawn. Lines: random actions and the best possible return with the simulator in use, "
+        "which "
+        "steps on with it (from the second recording on: on a rough grid). A control has no such return: whatever it "
+        "chooses is as good as random.",
     ),
     "comparisons": (
         "comparisons",
         "Every point is a policy's mean return. Boxes: quartiles and median. * p < 0.05, ** p < 0.01, *** p < 0.001, "
-        "two-sided "
-        "Mann-Whitney U, normal approximation.",
+        "two-sided Mann-Whitney U, normal approximation, not corrected. Under each condition: (mean − random) / (best "
+        "possible − random).",
     ),
     "over-time": (
         "at every recording",
-        "The same policies on the simulator of each recording: median and quartiles over policies. What falls with "
-        "the limit is the culture's; "
-        "what falls faster is the policy's.",
+        "The same policies on the simulator of each recording: median and quartiles over policies, with the best "
+        "possible return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
+        "falls "
+        "faster is the policy's. At every recording that return is on a rough grid, which can lie some below the "
+        "fine one, "
+        "and is left out for the linear mapping.",
     ),
     "controls": (
         "controls",
-        "Mean returns at the last recording, with standard errors over policies (for a control of one actor: over "
-        "episodes).",
+        "Mean returns with standard errors over policies (for a control of one actor: over episodes), at the "
+        "recordings "
+        "of the comparisons.",
     ),
     "paths": (
         "episodes",

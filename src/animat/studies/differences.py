@@ -2,106 +2,180 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from animat.evaluation.statistics import p_of_u
+from animat.neurons.fidelity import LARGEST_LOSS
+from animat.robots.cartpole import Cartpole
+from animat.robots.navigation import Navigation
 from animat.studies.specification import Study
-from animat.studies.tabulating import LEVEL
+from animat.studies.tabulating import AIM, LEVEL
 
-NEAR = 0.95
-"""Normalised score from which a condition leaves no room above it."""
+_CULTURES = {
+    "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
+    "to the paper's results. How large its responses are and how they tire differ from the paper's.",
+    "made-up": "Here responses are made up: drawn from distributions that were written down, for trials.",
+    "files": "Here recordings at hand are used.",
+}
 
 
 def decisions(study: Study) -> tuple[tuple[str, str], ...]:
-    """What the paper leaves open or contradicts, and what was decided."""
-    simulators = study.simulators
-    upper = "the largest response of the first recording, rounded up to 10 Hz"
-    if simulators.range_hz is not None:
-        upper = f"{simulators.range_hz:g} Hz"
-    held = any(condition.percentiles == "first" for condition in study.conditions)
-    return (
-        (
-            "The culture",
-            "The paper's was alive. This one is simulated, grown from a seed, calibrated to published figures of "
-            "cortical cultures and not "
-            "to the paper's results. How large its responses are and how they tire differ from the paper's.",
-        ),
-        (
-            "Nine levels without zero",
-            "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
-            "eleven. Zero is left out: "
-            "−1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
-        ),
-        (
-            "Pole mass",
-            "The paper's table prints 0.55 kg; the open simulator whose other numbers it repeats has 0.055 kg, which "
-            "is used here "
-            "(0.55 can be chosen: pole_mass_kg).",
-        ),
-        (
-            "12 degrees",
-            "The paper prints that an episode ends when the pole passes 12 rad, nearly two turns; 12 degrees, the "
-            "simulator's, are used "
-            "(angle_limit_rad).",
-        ),
-        (
-            "20 iterations",
-            "The paper prints at most 20 iterations for an episode of navigation: 0.5 m of path to a goal that is "
-            "0.89 m away. 100 are used "
-            "(episode_limit); with 20 no policy can reach the goal.",
-        ),
-        (
-            "Histogram range",
-            f"The paper's {simulators.bins} bins reach from 0 to 120 Hz, chosen for its culture. Here they end at "
-            f"{upper}: where "
-            "responses are small, bins as wide as the paper's erase the differences between frequencies.",
-        ),
-        (
-            "Percentiles",
-            "The paper does not say which recording the thresholds are taken from. Here they come from the recording "
-            "whose simulator is in use, so "
-            + (
-                "they move, except in the conditions that hold the first recording's." if held else "they move with it."
-            ),
-        ),
-        (
-            "Drawing from a histogram",
-            "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into the "
-            "last bin, and is reported.",
-        ),
-        (
-            "Learning",
-            "The paper's hosted platform is retired; it chose networks and settings by itself and took up to 60 "
-            "minutes. Here it is discrete "
-            "soft actor-critic with one set of settings for all, and the progress of training stands for the minutes "
-            "of the culture's clock.",
-        ),
-        (
-            "Before training",
-            "The policies before training are the very networks that training starts from, drawn at random and all "
-            "but undecided.",
-        ),
-        (
+    """What the paper leaves open or contradicts, and what this study does about it."""
+    return (*_of_culture(study), *_of_robots(study), *_of_simulators(study), *_of_learning(study))
+
+
+def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
+    yield "The culture", f"The paper's was alive. {_CULTURES[study.culture.kind]}"
+    if study.culture.kind == "virtual":
+        yield (
             "Pulse",
             "As published the pulse's phases do not balance (100 against 80 mV ms). The virtual culture takes it as "
-            "it is; hardware would not.",
-        ),
+            "it is; "
+            "hardware would not.",
+        )
+
+
+def _of_robots(study: Study) -> Iterator[tuple[str, str]]:
+    robots = [body.robot() for body in study.robots]
+    if any(condition.mapping == "9-thresholds" for condition in study.conditions):
+        yield (
+            "Nine levels without zero",
+            "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
+            "eleven. Zero "
+            "is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
+        )
+    for cartpole in (robot for robot in robots if isinstance(robot, Cartpole)):
+        chosen = "the simulator's" if math.isclose(cartpole.pole_mass_kg, 0.055) else "chosen for this study"
+        yield (
+            "Pole mass",
+            "The paper's table prints 0.55 kg; the open simulator whose other numbers it repeats has 0.055 kg. Here "
+            "it is "
+            f"{cartpole.pole_mass_kg:g} kg, {chosen} (pole_mass_kg).",
+        )
+        limit_deg = math.degrees(cartpole.angle_limit_rad)
+        yield (
+            "12 degrees",
+            "The paper prints that an episode ends when the pole passes 12 rad, nearly two turns; the open simulator "
+            "has 12 "
+            f"degrees. Here it is {limit_deg:.3g} degrees (angle_limit_rad).",
+        )
+    for navigation in (robot for robot in robots if isinstance(robot, Navigation)):
+        most = navigation.episode_limit
+        yield (
+            "20 iterations",
+            "The paper prints at most 20 iterations for an episode of navigation: 0.5 m of path to a goal that is "
+            "0.89 m "
+            f"away. Here there are {most} (episode_limit)"
+            + (
+                "; with 20 no policy can reach the goal." if most > 20 else ", with which no policy can reach the goal."
+            ),
+        )
+        yield (
+            "Walls",
+            "The paper does not say what a wall does. Here the robot stays inside: one that runs into a wall slides "
+            "along "
+            "it, and is not punished for it.",
+        )
+
+
+def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
+    simulators = study.simulators
+    papers = "The paper's 20 bins reach from 0 to 120 Hz, chosen for its culture. "
+    if simulators.kind == "empirical":
+        yield "Histogram", papers + "Here there are none: one of the measured responses is drawn."
+    else:
+        if simulators.range_hz is None:
+            here = (
+                f"Here the edges of the {simulators.bins} bins are percentiles of each recording's own responses, all "
+                "conditions together: where responses are small, or become smaller, equally wide bins erase the "
+                "differences "
+                "between conditions."
+            )
+        else:
+            here = (
+                f"Here {simulators.bins} bins of equal width reach to {simulators.range_hz:g} Hz. Controllability of "
+                f"every "
+                "recording shows how often responses pass the median in the data and in the simulator: what parts "
+                "the two "
+                "is taken by binning."
+            )
+        yield "Histogram range", papers + here
+        yield (
+            "Drawing from a histogram",
+            "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into "
+            "the last "
+            "bin, and is reported.",
+        )
+    held = any(condition.percentiles == "first" for condition in study.conditions)
+    yield (
+        "Percentiles",
+        "The paper does not say which recording the thresholds are taken from. Here they come from the recording whose "
+        "simulator is in use, so "
+        + ("they move, except in the conditions that hold the first recording's." if held else "they move with it."),
     )
 
 
-def came_out_otherwise(rows: list[dict[str, Any]]) -> tuple[tuple[str, str], ...]:
-    """For each comparison that differs from the paper: what came out, and what the best possible return says to it."""
+def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
+    yield (
+        "Learning",
+        "The paper's hosted platform is retired; it chose networks and settings by itself and took up to 60 minutes. "
+        "Here "
+        "it is discrete soft actor-critic with one set of settings for all, and the progress of training stands for "
+        f"{study.training_min:g} minutes of the culture's clock. The critics, which only training has, see how much "
+        f"of the "
+        "episode is left, so that a time limit ends the return they learn; policies do not.",
+    )
+    if study.actions == "most probable":
+        yield (
+            "Most probable actions",
+            "The paper does not say whether policies draw their actions when they are evaluated. Here they take the "
+            "most "
+            "probable one.",
+        )
+    else:
+        yield (
+            "Drawn actions",
+            "The paper does not say whether policies draw their actions when they are evaluated. Here they do.",
+        )
+    if any(not condition.trained for condition in study.conditions):
+        yield (
+            "Before training",
+            "The policies before training are networks as training starts from them, drawn at random: all actions are "
+            "nearly equally probable. "
+            + (
+                "Taking the most probable one makes a fixed rule of each, which can do worse than random actions."
+                if study.actions == "most probable"
+                else "They act as good as at random."
+            ),
+        )
+
+
+def came_out_otherwise(
+    rows: list[dict[str, Any]], lost: Mapping[float, float] | None = None
+) -> tuple[tuple[str, str], ...]:
+    """For each comparison that differs from the paper or cannot tell: what came out, and what its limit says to it.
+
+    Args:
+        rows: of the table of comparisons.
+        lost: how far binning moved P(x >= P50) of any condition, by the recording's minute.
+    """
     told = []
     for row in rows:
-        if row["as_in_paper"] != "no":
+        if row["as_in_paper"] not in ("no", "cannot tell"):
             continue
         words = (
-            f"The paper found {row['second']} better than {row['first']} (U = {row['paper_u']:g}, p = "
-            f"{row['paper_p']:.3g}). "
-            f"Here: {row['outcome']} (U = {row['u']:g}, p = {row['p_normal']:.3g}; mean returns "
-            f"{row['mean_first']:.1f} and "
-            f"{row['mean_second']:.1f}). {explain(row)}"
+            f"The paper found {row['second']} better than {row['first']} (p = {row['paper_p']:.3g}, which implies U = "
+            f"{row['paper_u']:g}). Here: {row['outcome']} (U = {row['u']:g}, p = {row['p_normal']:.3g}; mean returns "
+            f"{row['mean_first']:.1f} and {row['mean_second']:.1f}). {explain(row)}"
         )
+        loss = (lost or {}).get(row["at_min"], 0.0)
+        if loss > LARGEST_LOSS:
+            words += (
+                f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and limit are those of the "
+                "simulator, and not all that the culture would allow."
+            )
         told.append((f"{row['comparison']}, {row['robot']}", words))
     return tuple(told)
 
@@ -113,19 +187,38 @@ def explain(row: dict[str, Any]) -> str:
     if smallest >= LEVEL:
         return f"With {n} policies a side p cannot fall below {smallest:.2g}, however they differ: take more policies."
     first, second, random = row["limit_first"], row["limit_second"], row["random_second"]
-    if first is None or second is None or random is None:
+    if second is None or random is None:
         return "There is no limit to compare with."
-    if second <= random:
+    error_second = row["limit_error_second"] or 0.0
+    if second - random <= error_second:
         return (
-            f"The best possible return, {second:.1f}, is not above that of random actions: there is nothing to learn."
+            f"The best possible return for {row['second']}, {second:.1f}, is not above that of random actions: "
+            "there is nothing to learn."
         )
-    limits = f"The best possible return is {first:.1f} for {row['first']} and {second:.1f} for {row['second']}"
-    if second <= first and first != second:
-        return f"{limits}: with these responses the order of the limits is itself the other way round."
-    score_first, score_second = row["score_first"], row["score_second"]
-    if score_first is not None and score_first >= NEAR:
-        return f"{limits}, and {row['first']} comes to {score_first:.2f} of the way from random to it: no room is left."
-    if score_second is not None and score_second >= NEAR:
-        return f"{limits}; {row['second']} is at its limit (score {score_second:.2f}), so more cannot be had from it."
-    scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (score_first, score_second))
-    return f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, so it does not explain this."
+    limits = f"The best possible return is {second:.1f} for {row['second']}"
+    if first is None:
+        # A control has no limit of its own: whatever it chooses, another condition is delivered.
+        limits += f"; {row['first']} cannot do better than random actions, {random:.1f}"
+    else:
+        limits = f"The best possible return is {first:.1f} for {row['first']} and {second:.1f} for {row['second']}"
+        error = (row["limit_error_first"] or 0.0) + error_second
+        if first - second > error:
+            return f"{limits}: with these responses the order of the limits is itself the other way round."
+        if abs(first - second) <= error:
+            limits += ", which is the same within their errors"
+    # How much more than the first condition the second could have, as a part of all there is to learn.
+    room = (second - row["mean_first"]) / (second - random)
+    if room <= 1 - AIM:
+        return (
+            f"{limits}, and {row['first']} comes within {max(room, 0.0):.2f} of the way from random to it: no "
+            f"room is left."
+        )
+    score = row["score_second"]
+    if score is not None and score >= AIM:
+        return f"{limits}; {row['second']} is at its limit (score {score:.2f}), so more cannot be had from it."
+    scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row["score_first"], score))
+    return (
+        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, "
+        f"{second - row['mean_first']:.1f} above "
+        f"{row['first']}, so it does not explain this."
+    )

@@ -37,7 +37,8 @@ class Evaluate(Task):
         networks = _networks(study, folder, self.body, self.condition)
         robot, slug, n = self.body.name, self.condition.slug, study.policies
         rows: list[tuple[Any, ...]] = []
-        for at_min, episodes in study.minutes_of(self.condition, last_minute(timeline)).items():
+        minutes = study.minutes_of(self.condition, first_minute(timeline), last_minute(timeline))
+        for at_min, episodes in minutes.items():
             seed = draw_seed(study.seed, robot, slug, at_min)
             rows += _rows(at_min, setting.run(networks, n, at_min, episodes, seed), [f"p{i}" for i in range(n)])
         files = [write_table(episodes_file(folder, self.body, self.condition), HEAD, rows)]
@@ -83,7 +84,8 @@ class Control(Task):
         name = f"controls-{condition.mapping}" + ("-held" if condition.percentiles == "first" else "")
         networks = _networks(study, folder, self.body, self.plain) if is_usual(self.plain) else None
         rows: list[tuple[Any, ...]] = []
-        minutes = study.limit_minutes(last_minute(timeline)) if condition.through_neurons else [last_minute(timeline)]
+        first, last = first_minute(timeline), last_minute(timeline)
+        minutes = study.limit_minutes(first, last) if condition.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             report(i / len(minutes), f"at {at_min:g} min")
             answering = setting.simulator(at_min)
@@ -146,6 +148,11 @@ def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | 
 def is_usual(condition: StudyCondition) -> bool:
     """Whether its policies are trained, and get what they choose."""
     return condition.trained and condition.delivery == "chosen" and condition.through_neurons
+
+
+def first_minute(timeline: SimulatorTimeline | None) -> float:
+    """Of the recordings; 0 without any."""
+    return 0.0 if timeline is None else float(timeline.start_min[0])
 
 
 def last_minute(timeline: SimulatorTimeline | None) -> float:

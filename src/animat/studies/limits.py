@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import final
 
 from animat.evaluation.optimum import Case, Optimum, best_returns
-from animat.studies.evaluating import as_recorded, last_minute, setting_of
+from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
 from animat.studies.jobs import Report, Task
 from animat.studies.places import limits_file, write_table
 from animat.studies.specification import Body, Study, StudyCondition
@@ -37,14 +37,19 @@ def kinds_of(study: Study) -> list[StudyCondition]:
     return list(kinds.values())
 
 
+def rough_kinds(study: Study) -> list[StudyCondition]:
+    """Of `kinds_of`, those whose limit is computed at every recording: the linear mapping's would take long."""
+    return [kind for kind in kinds_of(study) if kind.through_neurons and kind.mapping != "linear"]
+
+
 @final
 @dataclass(frozen=True)
 class Limit(Task):
     """The best possible return on a robot for every mapping of the study.
 
     Attributes:
-        over_time: at every recording, for the first mapping with neurons only, on a rough grid; if not, at the minutes
-            of the comparisons.
+        over_time: at every recording, on a rough grid and without running the controller; if not, at the minutes that
+            anything is evaluated at.
     """
 
     body: Body
@@ -52,51 +57,43 @@ class Limit(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         study, timeline = as_recorded(study, folder)
-        last = last_minute(timeline)
-        kinds, minutes = kinds_of(study), study.limit_minutes(last)
+        first, last = first_minute(timeline), last_minute(timeline)
+        kinds, minutes = kinds_of(study), study.limit_minutes(first, last)
         resolution, episodes = self.body.limit_resolution or study.limit_resolution, study.limit_episodes
         if self.over_time and timeline is not None:
-            kinds = [kind for kind in kinds if kind.through_neurons][:1]
-            minutes, resolution, episodes = timeline.start_min.tolist(), min(ROUGH, resolution), 2
+            kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
+            resolution, episodes = min(ROUGH, resolution), 0
         asked = [(kind, at) for kind in kinds for at in (minutes if kind.through_neurons else [last])]
         cases: list[Case] = []
         for kind, at in asked:
             setting = setting_of(study, self.body, kind, timeline)
             cases.append((setting.environment, setting.simulator(at)))
-        told = _Told(report)
+        # Cases side by side all have as many actions as the one with the most, and as many commands as all together: a
+        # continuous one has many, and over time there are many cases.
+        alike: dict[object, list[int]] = {}
+        for i, (environment, _) in enumerate(cases):
+            alike.setdefault(asked[i][0] if self.over_time else environment.n_actions is None, []).append(i)
+        told = _Told(report, len(cases))
         found: dict[int, Optimum] = {}
-        # Cases side by side all have as many actions as the one with the most, and a continuous one has many.
-        for continuous in (False, True):
-            same = [i for i, (environment, _) in enumerate(cases) if (environment.n_actions is None) == continuous]
-            if same:
-                best = best_returns(
-                    [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=told
-                )
-                found |= dict(zip(same, best, strict=True))
-        rows = [
-            (
-                kind.mapping,
-                kind.percentiles,
-                at,
-                best.value,
-                best.grid_error,
-                best.monte_carlo,
-                best.standard_error,
-                best.without_clock,
-                best.without_clock_standard_error,
-                best.nodes,
+        for same in alike.values():
+            best = best_returns(
+                [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=told
             )
-            for i, (kind, at) in enumerate(asked)
-            for best in (found[i],)
-        ]
+            found |= dict(zip(same, best, strict=True))
+            told.before += len(same)
+        rows = []
+        for i, (kind, at) in enumerate(asked):
+            best_of = found[i].to_dict()
+            best_of["best_return"] = best_of["value"]
+            rows.append((kind.mapping, kind.percentiles, at, *(best_of[name] for name in HEAD[3:])))
         return [
             write_table(limits_file(folder, self.body.name, "over-time" if self.over_time else "limits"), HEAD, rows)
         ]
 
 
 class _Told:
-    def __init__(self, report: Report) -> None:
-        self._report = report
+    def __init__(self, report: Report, n_cases: int) -> None:
+        self._report, self._n_cases, self.before = report, n_cases, 0
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self._report(done / total, note)
+        self._report((self.before + done) / self._n_cases, note)

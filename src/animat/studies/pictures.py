@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from animat.neurons.psth import post_stimulus_histogram, spontaneous_rate
+from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.reading import list_recordings, read_recording
 from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
@@ -20,13 +21,13 @@ from animat.report.drift import draw_drift
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.first_and_last import draw_first_and_last
 from animat.report.learning_curves import LearningCurve, draw_learning_curves
-from animat.report.over_time import Course, draw_over_time
+from animat.report.over_time import MOST, Course, Courses, draw_over_time
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, save_figure
-from animat.studies.evaluating import as_recorded, last_minute
+from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
 from animat.studies.places import (
@@ -39,12 +40,10 @@ from animat.studies.places import (
 )
 from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
-from animat.studies.tabulating import References, performances
+from animat.studies.tabulating import TRAINED, References, named_mapping, performances
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_MOST_COURSES = 6
 
 
 @final
@@ -88,7 +87,7 @@ class RobotPictures(Task):
         last = last_minute(timeline)
         known = References(study, folder, self.body)
         figures: dict[str, Figure] = {}
-        curves = _curves(study, folder, self.body, known, last)
+        curves = _curves(study, folder, self.body, known, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
         if study.comparisons:
@@ -96,9 +95,9 @@ class RobotPictures(Task):
                 _pairs(study, folder, self.body, known, last), f"{name}: comparisons"
             )
         if timeline is not None and len(timeline) > 1:
-            figures["over-time"] = _draw_course(study, folder, self.body, float(timeline.start_min[0]))
+            figures["over-time"] = _draw_course(study, folder, self.body, known, timeline)
         report(0.2, "controls")
-        figures["controls"] = draw_controls(_controls(study, folder, self.body, known, last), f"{name}: controls")
+        figures["controls"] = draw_controls(_controls(folder, self.body), f"{name}: controls")
         paths = {condition.name: _paths(folder, self.body, condition) for condition in study.conditions}
         figures["paths"] = draw_paths(
             robot, {c: [path for path, _ in each] for c, each in paths.items()}, f"{name}: one episode of each policy"
@@ -116,7 +115,9 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], report: Report) 
     return files
 
 
-def _curves(study: Study, folder: Path, body: Body, known: References, last: float) -> list[LearningCurve]:
+def _curves(
+    study: Study, folder: Path, body: Body, known: References, timeline: SimulatorTimeline | None
+) -> list[LearningCurve]:
     returns: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
     iterations: dict[str, list[float]] = {}
     for row in read_table(table_file(folder, "learning-curves")):
@@ -125,21 +126,57 @@ def _curves(study: Study, folder: Path, body: Body, known: References, last: flo
             returns[row["condition"]][row["policy"]].append(np.nan if mean is None else mean)
             if row["policy"] == "p0":
                 iterations.setdefault(row["condition"], []).append(row["iterations"])
-    start = study.limit_minutes(last)[0]
+    rough = _over_time(study, folder, body)
     curves = []
     for condition in study.conditions:
         if condition.name in returns:
-            limit = known.limit(condition, start)
+            parts = len(iterations[condition.name])
+            minutes = _minutes_in_training(study, condition, timeline, parts)
+            random, limit = [], []
+            for at_min in minutes:
+                row = known.limit(condition, at_min) or {}
+                near = rough.get((condition.mapping, condition.percentiles, at_min), (None, None))
+                random.append(near[0] if condition.through_neurons else known.random(condition, at_min))
+                exact = row.get("best_return")
+                limit.append(near[1] if exact is None and condition.delivery == "chosen" else exact)
             curves.append(
                 LearningCurve(
                     condition.name,
                     np.array(iterations[condition.name]),
                     np.array(list(returns[condition.name].values()), np.float64),
-                    known.random(condition, start),
-                    None if limit is None else limit["best_return"],
+                    np.array(random, np.float64),
+                    np.array(limit, np.float64),
                 )
             )
     return curves
+
+
+def _minutes_in_training(
+    study: Study, condition: StudyCondition, timeline: SimulatorTimeline | None, parts: int
+) -> list[float]:
+    """The recording that answers in each part of a training."""
+    if timeline is None or not condition.through_neurons:
+        return [last_minute(timeline)] * parts
+    start = first_minute(timeline)
+    share = 1 / parts if condition.shadowing else 0.0
+    rows = [timeline.row_at(start + study.training_min * share * part) for part in range(parts)]
+    return [float(timeline.start_min[row]) for row in rows]
+
+
+def _over_time(study: Study, folder: Path, body: Body) -> dict[tuple[str, str, float], tuple[float, float | None]]:
+    """Random actions and the limit on a rough grid (None where it was not computed) at every recording."""
+    if not study.needs_neurons:
+        return {}
+    limits = {
+        (row["mapping"], row["percentiles"], row["at_min"]): row["best_return"]
+        for row in read_table(limits_file(folder, body.name, "over-time"))
+    }
+    found: dict[tuple[str, str, float], tuple[float, float | None]] = {}
+    for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
+        for row in read_table(controls_file(folder, body, kind, "over-time")):
+            key = (kind.mapping, kind.percentiles, row["at_min"])
+            found[key] = (row["random"], limits.get(key))
+    return found
 
 
 def _pairs(study: Study, folder: Path, body: Body, known: References, last: float) -> list[Pair]:
@@ -149,7 +186,7 @@ def _pairs(study: Study, folder: Path, body: Body, known: References, last: floa
     pairs = []
     for compared in study.comparisons:
         at_min = last if compared.at_min is None else compared.at_min
-        groups = []
+        groups: list[Group] = []
         for condition in (study.condition(compared.first), study.condition(compared.second)):
             limit = known.limit(condition, at_min)
             groups.append(
@@ -158,6 +195,7 @@ def _pairs(study: Study, folder: Path, body: Body, known: References, last: floa
                     performances(folder, body, condition, at_min, compared.episodes),
                     known.random(condition, at_min),
                     None if limit is None else limit["best_return"],
+                    rows[compared.name]["score_first" if not groups else "score_second"],
                 )
             )
         row = rows[compared.name]
@@ -165,46 +203,51 @@ def _pairs(study: Study, folder: Path, body: Body, known: References, last: floa
     return pairs
 
 
-def _draw_course(study: Study, folder: Path, body: Body, start_min: float) -> Figure:
-    courses = []
-    for condition in [c for c in study.conditions if c.through_neurons][:_MOST_COURSES]:
-        of_policy: dict[str, list[float]] = defaultdict(list)
-        minutes: list[float] = []
-        for row in read_table(episodes_file(folder, body, condition, "over-time")):
-            of_policy[row["actor"]].append(row["mean_return"])
-            if row["actor"] == "p0":
-                minutes.append(row["at_min"])
-        courses.append(Course(condition.name, np.array(minutes), np.array(list(of_policy.values()))))
-    kind = next(kind for kind in kinds_of(study) if kind.through_neurons)
-    random = [row["random"] for row in read_table(controls_file(folder, body, kind, "over-time"))]
-    limit = [row["best_return"] for row in read_table(limits_file(folder, body.name, "over-time"))]
-    return draw_over_time(
-        courses,
-        f"{body.name}: at every recording (best possible return and random: {kind.mapping})",
-        random=np.array(random),
-        limit=np.array(limit),
-        trained_until_min=start_min + study.training_min,
-    )
-
-
-def _controls(study: Study, folder: Path, body: Body, known: References, last: float) -> list[Controls]:
-    rows = [row for row in read_table(table_file(folder, "controls")) if row["robot"] == body.name]
+def _draw_course(study: Study, folder: Path, body: Body, known: References, timeline: SimulatorTimeline) -> Figure:
+    rough = _over_time(study, folder, body)
+    every_min = [float(at_min) for at_min in timeline.start_min]
     panels = []
-    for kind in kinds_of(study):
-        same = [row for row in rows if (row["mapping"], row["percentiles"]) == (kind.mapping, kind.percentiles)]
-        returns: list[tuple[str, float, float | None]] = []
-        for condition in study.conditions:
-            if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles) and condition.trained:
-                means = performances(folder, body, condition, last)
-                error = float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else None
-                returns.append((f"trained: {condition.name}", float(means.mean()), error))
-        returns += [
-            (row["control"], row["mean_return"], row["standard_error"]) for row in same if row["at_min"] == last
-        ]
-        limit = known.limit(kind, last)
-        at = f", recording at {last:g} min" if kind.through_neurons else ""
-        mapping = kind.mapping if kind.through_neurons else "without neurons"
-        panels.append(Controls(f"{mapping}{at}", tuple(returns), None if limit is None else limit["best_return"]))
+    for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
+        same = [c for c in study.conditions if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
+        courses = []
+        for condition in same[:MOST]:
+            of_policy: dict[str, list[float]] = defaultdict(list)
+            for row in read_table(episodes_file(folder, body, condition, "over-time")):
+                of_policy[row["actor"]].append(row["mean_return"])
+            courses.append(Course(condition.name, np.array(every_min), np.array(list(of_policy.values()))))
+        at = [rough[kind.mapping, kind.percentiles, at_min] for at_min in every_min]
+        fine = [(at_min, row["best_return"]) for at_min in every_min for row in (known.limit(kind, at_min),) if row]
+        panels.append(
+            Courses(
+                named_mapping(kind.mapping, kind.percentiles),
+                tuple(courses),
+                np.array([random for random, _ in at]),
+                None if at[0][1] is None else np.array([limit for _, limit in at], np.float64),
+                tuple(fine),
+                max(0, len(same) - MOST),
+            )
+        )
+    until_min = every_min[0] + study.training_min
+    return draw_over_time(panels, f"{body.name}: at every recording", trained_until_min=until_min)
+
+
+def _controls(folder: Path, body: Body) -> list[Controls]:
+    of_panel: dict[tuple[str, str, float], list[dict[str, Any]]] = defaultdict(list)
+    for row in read_table(table_file(folder, "controls")):
+        if row["robot"] == body.name:
+            of_panel[row["mapping"], row["percentiles"], row["at_min"]].append(row)
+    panels = []
+    for (mapping, percentiles, at_min), rows in of_panel.items():
+        at = "" if mapping == "none" else f", recording at {at_min:g} min"
+        panels.append(
+            Controls(
+                f"{named_mapping(mapping, percentiles)}{at}",
+                tuple((row["control"], row["mean_return"], row["standard_error"]) for row in rows),
+                sum(row["control"].startswith(TRAINED) for row in rows),
+                rows[0]["random"],
+                rows[0]["limit"],
+            )
+        )
     return panels
 
 

@@ -223,6 +223,11 @@ class StudyCondition:
         """Whether there are neurons in it."""
         return self.mapping != "none"
 
+    @property
+    def learns_one_recording(self) -> bool:
+        """Whether its policies learn what they choose to do with the first recording, and with no other."""
+        return self.trained and self.through_neurons and not self.shadowing and self.delivery == "chosen"
+
 
 @dataclass(frozen=True)
 class Compared:
@@ -321,14 +326,19 @@ class Study:
         """The condition of this name."""
         return next(condition for condition in self.conditions if condition.name == name)
 
-    def minutes_of(self, condition: StudyCondition, last_min: float) -> dict[float, int]:
-        """Minutes that a condition is evaluated at for comparisons, and in how many episodes; the last at least."""
+    def minutes_of(self, condition: StudyCondition, first_min: float, last_min: float) -> dict[float, int]:
+        """Minutes that a condition is evaluated at, and in how many episodes: of its comparisons, and the last.
+
+        If it is trained on the first recording alone, also that one: how well did it learn what it was taught?
+        """
         minutes: dict[float, int] = {}
         for compared in self.comparisons:
             if condition.name in (compared.first, compared.second):
                 at = last_min if compared.at_min is None else compared.at_min
                 minutes[at] = max(minutes.get(at, 0), compared.episodes)
         minutes.setdefault(last_min, self.episodes)
+        if condition.learns_one_recording:
+            minutes[first_min] = max(minutes.get(first_min, 0), self.episodes)
         return minutes
 
     def at_recordings(self, start_min: Sequence[float]) -> Study:
@@ -357,13 +367,9 @@ class Study:
             )
         return min(start_min, key=lambda start: (abs(start - at), start))
 
-    def limit_minutes(self, last_min: float) -> list[float]:
+    def limit_minutes(self, first_min: float, last_min: float) -> list[float]:
         """Minutes at which anything is evaluated, rising."""
-        return sorted({at for condition in self.conditions for at in self.minutes_of(condition, last_min)})
-
-    def mappings(self) -> list[str]:
-        """The mappings of all conditions, each once; none among them where there is a baseline."""
-        return list(dict.fromkeys(condition.mapping for condition in self.conditions))
+        return sorted({at for condition in self.conditions for at in self.minutes_of(condition, first_min, last_min)})
 
     @property
     def needs_neurons(self) -> bool:

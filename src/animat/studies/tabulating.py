@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
-from animat.evaluation.statistics import compare, holm, interquartile_mean, normalised_score, p_of_u
-from animat.studies.evaluating import as_recorded, last_minute
+from animat.evaluation.optimum import bracket_findings
+from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
+from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
 from animat.studies.paper import PRINTED
@@ -30,7 +31,10 @@ from animat.studies.specification import Body, Study, StudyCondition
 from animat.training.policy import Policy
 
 LEVEL = 0.01
-"""The p below which the issue of a comparison counts as found."""
+"""The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
+
+AIM = 0.97
+"""Normalised score from which a condition counts as being as good as its limit allows."""
 
 SCORES = (
     "robot",
@@ -47,8 +51,11 @@ SCORES = (
     "random",
     "limit",
     "limit_grid_error",
+    "limit_run",
+    "limit_run_standard_error",
     "limit_without_clock",
     "normalised_score",
+    "score_without_clock",
 )
 COMPARISONS = (
     "comparison",
@@ -65,6 +72,8 @@ COMPARISONS = (
     "random_second",
     "limit_first",
     "limit_second",
+    "limit_error_first",
+    "limit_error_second",
     "u",
     "p_normal",
     "p_exact",
@@ -77,7 +86,22 @@ COMPARISONS = (
     "paper_p",
     "as_in_paper",
 )
-CONTROLS = ("robot", "mapping", "percentiles", "at_min", "control", "actors", "mean_return", "standard_error")
+TRAINED = "trained: "
+"""In front of a condition's name among the controls."""
+
+CONTROLS = (
+    "robot",
+    "mapping",
+    "percentiles",
+    "at_min",
+    "control",
+    "actors",
+    "mean_return",
+    "standard_error",
+    "random",
+    "limit",
+    "normalised_score",
+)
 CURVES = ("robot", "condition", "policy", "iterations", "episodes", "mean_return")
 
 
@@ -88,16 +112,16 @@ class Tabulate(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         study, timeline = as_recorded(study, folder)
-        last = last_minute(timeline)
+        first, last = first_minute(timeline), last_minute(timeline)
         files: list[Path] = []
 
         def table(name: str, head: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
             files.append(write(table_file(folder, name), list(head), [list(row) for row in rows]))
 
         references = {body.name: References(study, folder, body) for body in study.robots}
-        table("scores", SCORES, _scores(study, folder, last, references))
+        table("scores", SCORES, _scores(study, folder, first, last, references))
         table("comparisons", COMPARISONS, _comparisons(study, folder, last, references))
-        controls = [row for body in study.robots for row in _controls(study, folder, body)]
+        controls = [row for body in study.robots for row in _controls(study, folder, body, references[body.name])]
         table("controls", CONTROLS, controls)
         table("learning-curves", CURVES, _curves(study, folder))
         limits = [(body.name, row) for body in study.robots for row in read_table(limits_file(folder, body.name))]
@@ -112,8 +136,12 @@ class Tabulate(Task):
                 )
             )
             table("controllability", ("at_min", "condition", "above_median_in_data", "above_median_in_simulator"), rows)
-            found = [(finding.severity, finding.name, finding.sentence) for finding in timeline.findings]
-            table("findings", ("severity", "name", "sentence"), found)
+        noticed = [] if timeline is None else list(timeline.findings)
+        for robot, row in limits:
+            of = (row[name] for name in ("best_return", "grid_error", "monte_carlo", "standard_error"))
+            where = f"{robot}, {named_mapping(row['mapping'], row['percentiles'])}, at {row['at_min']:g} min"
+            noticed += [replace(told, sentence=f"{where}: {told.sentence}") for told in bracket_findings(*of)]
+        table("findings", ("severity", "name", "sentence"), ((n.severity, n.name, n.sentence) for n in noticed))
         return files
 
 
@@ -139,16 +167,20 @@ class References:
         return self._of(self._random, condition, at_min)  # type: ignore[no-any-return]
 
     def limit(self, condition: StudyCondition, at_min: float) -> dict[str, Any] | None:
-        """The best possible return and how well it is known, of what is delivered as chosen."""
+        """The best possible return and how well it is known; None for a control, which can do nothing."""
+        if condition.delivery == "shuffled":
+            return None
         return self._of(self._limits, condition, at_min)  # type: ignore[no-any-return]
 
-    def score(self, condition: StudyCondition, at_min: float, mean: float) -> float | None:
-        """The normalised score; None where nothing can be learned."""
+    def score(
+        self, condition: StudyCondition, at_min: float, mean: float, against: str = "best_return"
+    ) -> float | None:
+        """The normalised score, against the limit or another column of its table; None where nothing can be learned."""
         random, limit = self.random(condition, at_min), self.limit(condition, at_min)
-        if random is None or limit is None:
+        if random is None or limit is None or limit[against] is None:
             return None
         try:
-            return normalised_score(mean, random, limit["best_return"])
+            return normalised_score(mean, random, limit[against])
         except InvalidArgument:
             return None
 
@@ -172,11 +204,19 @@ def performances(
     return np.array([np.mean(of_policy[:episodes]) for of_policy in returns.values()])
 
 
-def _scores(study: Study, folder: Path, last: float, references: dict[str, References]) -> Iterable[tuple[Any, ...]]:
+def named_mapping(mapping: str, percentiles: str) -> str:
+    """A mapping in words, with whether its percentiles are held."""
+    held = ", percentiles held" if percentiles == "first" else ""
+    return "without neurons" if mapping == "none" else f"{mapping}{held}"
+
+
+def _scores(
+    study: Study, folder: Path, first: float, last: float, references: dict[str, References]
+) -> Iterable[tuple[Any, ...]]:
     for body in study.robots:
         known = references[body.name]
         for condition in study.conditions:
-            for at_min, episodes in sorted(study.minutes_of(condition, last).items()):
+            for at_min, episodes in sorted(study.minutes_of(condition, first, last).items()):
                 means = performances(folder, body, condition, at_min)
                 middle = interquartile_mean(means)
                 limit = known.limit(condition, at_min) or {}
@@ -195,9 +235,41 @@ def _scores(study: Study, folder: Path, last: float, references: dict[str, Refer
                     known.random(condition, at_min),
                     limit.get("best_return"),
                     limit.get("grid_error"),
+                    limit.get("monte_carlo"),
+                    limit.get("standard_error"),
                     limit.get("without_clock"),
                     known.score(condition, at_min, float(means.mean())),
+                    known.score(condition, at_min, float(means.mean()), "without_clock"),
                 )
+
+
+FIRST, SECOND, NONE, TOO_FEW = (
+    "first better",
+    "second better",
+    f"none found (p ≥ {LEVEL:g})",
+    "too few policies to tell",
+)
+
+AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
+"""Of each outcome, whether it is the paper's, in which the second condition was always the better."""
+
+
+def outcome_of(told: Comparison) -> str:
+    """In words: which condition is better, that neither was found to be, or that it could not have been found."""
+    if told.p_normal < LEVEL:
+        return SECOND if told.effect.value > 0 else FIRST
+    # With four policies a side even U = 0 has p = 0.03: nothing could be found, which says nothing of a difference.
+    return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
+
+
+def _limit_error(limit: dict[str, Any]) -> float | None:
+    """How far the best possible return may lie from its value: by the grid, or down to the controller's return."""
+    if not limit:
+        return None
+    names = ("best_return", "grid_error", "monte_carlo", "standard_error")
+    parted = bracket_findings(*(limit[name] for name in names))
+    error: float = max([limit["grid_error"], *(abs(each.value or 0.0) for each in parted)])
+    return error
 
 
 def _comparisons(study: Study, folder: Path, last: float, references: dict[str, References]) -> list[tuple[Any, ...]]:
@@ -213,10 +285,7 @@ def _comparisons(study: Study, folder: Path, last: float, references: dict[str, 
     for compared, body, first, second, at_min, a, b, told in made:
         known = references[body.name]
         printed = PRINTED.get((compared.name, body.name)) if study.paper else None
-        found = told.p_normal < LEVEL
-        # With four policies a side even U = 0 has p = 0.03: nothing could be found, which is not "no difference".
-        could = p_of_u(0.0, len(a), len(b)) < LEVEL
-        better = "second" if told.u_first < len(a) * len(b) / 2 else "first"
+        outcome = outcome_of(told)
         limits = [known.limit(condition, at_min) or {} for condition in (first, second)]
         rows.append(
             (
@@ -234,6 +303,8 @@ def _comparisons(study: Study, folder: Path, last: float, references: dict[str, 
                 known.random(second, at_min),
                 limits[0].get("best_return"),
                 limits[1].get("best_return"),
+                _limit_error(limits[0]),
+                _limit_error(limits[1]),
                 told.u,
                 told.p_normal,
                 told.p_exact,
@@ -241,26 +312,40 @@ def _comparisons(study: Study, folder: Path, last: float, references: dict[str, 
                 told.effect.value,
                 told.effect.low,
                 told.effect.high,
-                f"{better} better" if found else "no difference" if could else "too few policies to tell",
+                outcome,
                 None if printed is None else printed.u,
                 None if printed is None else printed.p,
-                None if printed is None else "yes" if found and better == "second" else "no",
+                None if printed is None else AS_IN_PAPER[outcome],
             )
         )
     return rows
 
 
-def _controls(study: Study, folder: Path, body: Body) -> Iterable[tuple[Any, ...]]:
+def _controls(study: Study, folder: Path, body: Body, known: References) -> Iterable[tuple[Any, ...]]:
     for kind in kinds_of(study):
         returns: dict[tuple[float, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
         for row in read_table(controls_file(folder, body, kind)):
             returns[row["at_min"], row["control"]][row["actor"] or ""].append(row["return"])
-        for (at_min, control), actors in returns.items():
-            means = np.array([np.mean(of_actor) for of_actor in actors.values()])
-            # Over actors, as each is one sample; a control of one actor has its episodes for samples.
-            samples = means if len(means) > 1 else np.array(next(iter(actors.values())))
-            error = float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
-            yield body.name, kind.mapping, kind.percentiles, at_min, control, len(means), float(means.mean()), error
+        for at_min in sorted({minute for minute, _ in returns}):
+            rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
+            for condition in study.conditions:
+                if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles):
+                    means = performances(folder, body, condition, at_min)
+                    if condition.trained and len(means):
+                        rows.append((f"{TRAINED}{condition.name}", len(means), means))
+            for (minute, control), actors in returns.items():
+                if minute == at_min:
+                    means = np.array([np.mean(of_actor) for of_actor in actors.values()])
+                    # Over actors, as each is one sample; a control of one actor has its episodes for samples.
+                    rows.append(
+                        (control, len(means), means if len(means) > 1 else np.array(next(iter(actors.values()))))
+                    )
+            limit = known.limit(kind, at_min) or {}
+            for name, actors_, samples in rows:
+                mean = float(samples.mean())
+                error = float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
+                references = (known.random(kind, at_min), limit.get("best_return"), known.score(kind, at_min, mean))
+                yield body.name, kind.mapping, kind.percentiles, at_min, name, actors_, mean, error, *references
 
 
 def _curves(study: Study, folder: Path) -> Iterable[tuple[Any, ...]]:

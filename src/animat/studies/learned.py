@@ -1,0 +1,87 @@
+"""Learning as good as the limit allows: how conditions that are trained on one recording do on that very one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from animat.report.html import Table, cell
+from animat.studies.specification import Study
+from animat.studies.tabulating import AIM
+
+
+def learned_of(study: Study, scores: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of the table of scores, the rows of conditions on the one recording that they were trained on, the first."""
+    learned = {condition.name for condition in study.conditions if condition.learns_one_recording}
+    first: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in scores:
+        if row["condition"] in learned:
+            known = first.setdefault((row["robot"], row["condition"]), row)
+            if row["at_min"] < known["at_min"]:
+                first[row["robot"], row["condition"]] = row
+    return list(first.values())
+
+
+def as_good_as_the_limit_allows(rows: list[dict[str, Any]]) -> Table:
+    """Scores beside `AIM`, with what is known of the difference."""
+    head = (
+        "robot",
+        "condition",
+        "mapping",
+        "at (min)",
+        "mean ± s.e.",
+        "limit",
+        "run",
+        "without clock",
+        "score",
+        "of without clock",
+        "what is known",
+    )
+    cells = []
+    for row in rows:
+        error = None
+        if row["standard_deviation"] is not None:
+            error = row["standard_deviation"] / math.sqrt(row["policies"])
+        cells.append(
+            (
+                row["robot"],
+                row["condition"],
+                row["mapping"],
+                row["at_min"],
+                f"{cell(row['mean_return'])}\u00a0±\u00a0{cell(error)}",
+                row["limit"],
+                row["limit_run"],
+                row["limit_without_clock"],
+                row["normalised_score"],
+                row["score_without_clock"],
+                known_of(row),
+            )
+        )
+    return Table(
+        f"As good as the limit allows: scores on the simulator trained on, beside {AIM:g}",
+        head,
+        tuple(cells),
+        note="Run: the return that the limit's controller was seen to get. Without clock: what the same controller "
+        "gets if it "
+        "does not know the time left, as policies do not; a better one may exist, not above the limit. Of without "
+        "clock: the "
+        "score with this in place of the limit.",
+        beside="tables/scores.csv",
+        marked=tuple(i for i, row in enumerate(rows) if (row["normalised_score"] or 0.0) < AIM),
+    )
+
+
+def known_of(row: dict[str, Any]) -> str:
+    """What is known of a score: that it is reached, or what stands between it and the limit."""
+    score, without_clock = row["normalised_score"], row["score_without_clock"]
+    if score is None:
+        return "nothing to learn: the limit is not above random actions"
+    if score >= AIM:
+        return "reached"
+    run, random = row["limit_run"], row["random"]
+    if run is not None and (row["mean_return"] - random) >= AIM * (run - random):
+        return f"short of the limit, not of what its controller was seen to get ({run:.1f})"
+    if without_clock is not None and without_clock >= AIM:
+        return "short by the clock: reached against the same controller without knowing the time left"
+    short = AIM - score
+    return f"short by {short:.2f}, which neither the clock nor the grid explains"

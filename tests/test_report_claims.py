@@ -1,0 +1,259 @@
+"""What the report says of its numbers: outcomes, limits, scores, decisions, and what is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.evaluation.statistics import compare
+from animat.report.comparisons import Group, Pair, draw_comparisons
+from animat.report.controls import Controls, draw_controls
+from animat.report.learning_curves import LearningCurve, draw_learning_curves
+from animat.report.over_time import Course, Courses, draw_over_time
+from animat.studies.differences import came_out_otherwise, decisions, explain
+from animat.studies.learned import known_of, learned_of
+from animat.studies.limits import kinds_of, rough_kinds
+from animat.studies.paper import paper_study
+from animat.studies.places import limits_file, table_file, write_table
+from animat.studies.publishing import _as_in_paper, _culture
+from animat.studies.specification import Body, Simulators, Source, Study, StudyCondition
+from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
+
+ROW: dict[str, Any] = {
+    "comparison": "c", "robot": "cartpole", "at_min": 140.0, "n": 10, "first": "a", "second": "b",
+    "mean_first": 5.0, "mean_second": 16.0, "limit_first": 90.0, "limit_second": 80.0, "limit_error_first": 0.5,
+    "limit_error_second": 0.5, "random_second": -80.0, "score_first": 0.5, "score_second": 0.6, "u": 50.0,
+    "p_normal": 0.5, "outcome": NONE, "paper_u": 0.0, "paper_p": 1.83e-4, "as_in_paper": "no",
+}  # fmt: skip
+
+
+# --- outcomes -------------------------------------------------------------------------------------------------------
+
+
+def test_the_second_is_better_where_its_returns_are_larger() -> None:
+    low, high = np.arange(10.0), np.arange(10.0) + 100
+    assert outcome_of(compare(low, high)) == SECOND
+    assert outcome_of(compare(high, low)) == FIRST
+    assert outcome_of(compare(low, low + 0.5)) == NONE
+    assert AS_IN_PAPER[SECOND] == "yes" and AS_IN_PAPER[FIRST] == AS_IN_PAPER[NONE] == "no"
+
+
+def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
+    """Four that are all better have p = 0.03."""
+    assert outcome_of(compare(np.arange(4.0), np.arange(4.0) + 100)) == TOO_FEW
+    assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
+    words = _as_in_paper([ROW | {"as_in_paper": each} for each in ("yes", "cannot tell", "cannot tell")])
+    assert words.startswith("1 of 3 comparisons") and "Of 2 it cannot be told" in words
+    assert "otherwise" not in words
+
+
+def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
+    assert "no difference" not in NONE and "0.01" in NONE
+
+
+# --- what a limit says ----------------------------------------------------------------------------------------------
+
+
+def test_a_comparison_knows_what_its_limit_says() -> None:
+    assert "other way round" in explain(ROW)
+    assert "take more policies" in explain(ROW | {"n": 4})
+    assert "nothing to learn" in explain(ROW | {"limit_second": -79.8})
+    assert "no limit" in explain(ROW | {"limit_second": None})
+    assert "leaves room" in explain(ROW | {"limit_second": 100.0})
+
+
+def test_there_is_room_as_long_as_the_second_limit_is_far_above_the_first_condition() -> None:
+    """The first is near its own limit of 60; the second could have 100, and has a third of the way."""
+    row = ROW | {
+        "limit_first": 60.0,
+        "limit_second": 100.0,
+        "mean_first": 56.0,
+        "score_first": 0.97,
+        "score_second": 0.3,
+    }
+    assert "no room" not in explain(row)
+    assert "leaves room, 44.0 above a" in explain(row)
+    assert "no room is left" in explain(row | {"mean_first": 96.0})
+    assert "at its limit" in explain(row | {"score_second": 0.98})
+    assert "at its limit" not in explain(row | {"score_second": 0.96})
+
+
+def test_limits_are_in_order_only_where_they_lie_apart_by_more_than_their_errors() -> None:
+    close = ROW | {"limit_first": 119.95, "limit_second": 119.94, "limit_error_first": 0.4, "limit_error_second": 2.2}
+    assert "other way round" not in explain(close)
+    assert "same within their errors" in explain(close)
+    assert "other way round" in explain(close | {"limit_first": 122.6})
+
+
+def test_a_control_is_given_no_limit() -> None:
+    words = explain(ROW | {"limit_first": None, "limit_error_first": None})
+    assert "a cannot do better than random actions" in words and "for a" not in words
+
+
+def test_what_binning_takes_is_said_where_it_takes_something() -> None:
+    ((_, words),) = came_out_otherwise([ROW], {0.0: 0.5, 140.0: 0.02})
+    assert "binning" not in words and "none found" in words
+    ((_, words),) = came_out_otherwise([ROW], {140.0: 0.21})
+    assert "binning moves P(x ≥ P50) by up to 0.21" in words
+    assert came_out_otherwise([ROW | {"as_in_paper": "yes"}, ROW | {"as_in_paper": None}]) == ()
+
+
+# --- decisions are the study's ---------------------------------------------------------------------------------------
+
+
+def test_decisions_of_the_papers_study_are_those_of_its_own() -> None:
+    told = dict(decisions(paper_study()))
+    assert {"Nine levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
+            "Most probable actions", "Walls", "Before training"} <= set(told)  # fmt: skip
+    assert "0.055 kg, the simulator's" in told["Pole mass"]
+    assert "12 degrees (angle" in told["12 degrees"]
+    assert "there are 100" in told["20 iterations"]
+    assert "percentiles of each recording" in told["Histogram range"]
+    assert "simulated" in told["The culture"]
+
+
+def test_decisions_follow_a_changed_study() -> None:
+    changed = replace(
+        paper_study(),
+        robots=(
+            Body("cartpole", parameters={"pole_mass_kg": 0.55, "angle_limit_rad": 0.4}),
+            Body("navigation", parameters={"episode_limit": 20}),
+        ),
+        culture=Source("files", files=("mine",)),
+        simulators=Simulators(bins=40, range_hz=60.0),
+        conditions=paper_study().conditions[:2],
+        comparisons=(),
+        actions="drawn",
+    )
+    told = dict(decisions(changed))
+    assert "0.55 kg, chosen for this study" in told["Pole mass"]
+    assert "22.9 degrees" in told["12 degrees"]
+    assert "there are 20 " in told["20 iterations"] and "no policy can reach" in told["20 iterations"]
+    assert "recordings at hand" in told["The culture"] and "Pulse" not in told
+    assert (
+        "40 bins of equal width reach to 60 Hz" in told["Histogram range"] and "paper's 20" in told["Histogram range"]
+    )
+    assert "Nine levels without zero" not in told and "Most probable actions" not in told
+    drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
+    assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
+    alone = dict(decisions(replace(changed, robots=(Body("navigation"),))))
+    assert "Pole mass" not in alone
+
+
+# --- learning as good as the limit allows -----------------------------------------------------------------------------
+
+
+def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
+    study = paper_study()
+    assert study.minutes_of(study.condition("without shadowing"), 0.0, 140.0) == {140.0: 100, 0.0: 100}
+    assert study.minutes_of(study.condition("9 thresholds"), 0.0, 140.0) == {140.0: 100}
+    assert study.minutes_of(study.condition("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
+    assert study.limit_minutes(0.0, 140.0) == [0.0, 140.0]
+    control = StudyCondition("c", shadowing=False, delivery="shuffled")
+    assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
+
+
+LEARNED: dict[str, Any] = {
+    "robot": "cartpole", "condition": "without shadowing", "mapping": "1-threshold", "at_min": 0.0, "mean_return": 96.0,
+    "random": -80.0, "limit_run": 105.0, "normalised_score": 0.88, "score_without_clock": 0.9,
+}  # fmt: skip
+
+
+def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
+    rows = [LEARNED | {"at_min": 140.0}, LEARNED, LEARNED | {"condition": "1 threshold"}]
+    assert learned_of(paper_study(), rows) == [LEARNED]
+
+
+def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
+    assert known_of(LEARNED | {"normalised_score": 0.98}) == "reached"
+    assert known_of(LEARNED | {"normalised_score": None}).startswith("nothing to learn")
+    assert "short by 0.09, which neither" in known_of(LEARNED)
+    assert "short by the clock" in known_of(LEARNED | {"score_without_clock": 0.99})
+    assert "its controller was seen to get" in known_of(LEARNED | {"limit_run": 100.0})
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------------
+
+
+def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path: Path) -> None:
+    study = Study(robots=(Body("cartpole"),), conditions=(StudyCondition("linear", mapping="linear"),
+                                                         StudyCondition("1 threshold")))  # fmt: skip
+    shares = [(0.0, f"{i} Hz", 0.5, 0.5) for i in range(13)] + [(10.0, f"{i} Hz", 0.5, 0.5) for i in range(13)]
+    shares[13], shares[25] = (10.0, "0 Hz", 0.13, 0.28), (10.0, "12 Hz", 0.9, 0.88)
+    head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
+    write_table(table_file(tmp_path, "controllability"), head, shares)
+    limits = [
+        (m, "moving", at, value) for m, value in (("9-thresholds", 99.0), ("1-threshold", 42.0)) for at in (0.0, 10.0)
+    ]
+    write_table(
+        limits_file(tmp_path, "cartpole", "over-time"), ("mapping", "percentiles", "at_min", "best_return"), limits
+    )
+    (table,) = _culture(study, tmp_path).tables
+    assert table.head[-3:] == ("difference, data", "difference, simulator", "limit, cartpole")
+    assert table.marked == (1,)
+    assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"
+    # Over all conditions, also those that there is no column for.
+    assert table.rows[1][-3:] == pytest.approx((0.77, 0.6, 42.0))
+    assert len(table.head) == 1 + 12 + 3
+    assert "1 more conditions are in the file" in table.note
+
+
+def test_every_mapping_has_limits_of_its_own_over_time() -> None:
+    study = paper_study()
+    assert [kind.mapping for kind in kinds_of(study)] == ["1-threshold", "9-thresholds", "linear", "none"]
+    assert [kind.mapping for kind in rough_kinds(study)] == ["1-threshold", "9-thresholds"]
+
+
+def test_every_line_of_a_figure_is_in_its_legend() -> None:
+    means = np.array([1.0, 2.0, 3.0])
+    groups = Group("control", means), Group("1 threshold", means + 5, 0.0, 9.0, 0.75)
+    figure = draw_comparisons([Pair("at 0 min", *groups, 0.1, 0.0)], "cartpole")
+    assert legend(figure) == {"random actions", "best possible return"}
+    labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
+    assert labels == ["control\n", "1\nthreshold\nscore 0.75"]
+    controls = Controls(
+        "1-threshold", (("trained: a", 5.0, 0.1), ("trained: b", 4.0, 0.1), ("silent", 1.0, None)), 2, 0.0, 9.0
+    )
+    assert legend(draw_controls([controls], "cartpole")) == {
+        "trained", "control", "random actions", "best possible return",
+    }  # fmt: skip
+
+
+def test_the_limit_steps_with_the_simulator_in_use() -> None:
+    limit = np.array([1.0, 1.0, 7.0])
+    curve = LearningCurve("a", np.array([1000.0, 2000.0, 3000.0]), np.zeros((2, 3)), None, limit)
+    figure = draw_learning_curves([curve], "cartpole")
+    (line,) = [line for line in figure.axes[0].lines if line.get_label() == "best possible return"]
+    assert line.get_drawstyle() == "steps-pre"
+    assert np.asarray(line.get_xdata()).tolist() == [0, 1, 2, 3]
+    assert np.asarray(line.get_ydata()).tolist() == [1, 1, 1, 7]
+
+
+def test_limits_over_time_are_said_to_be_rough_and_no_condition_is_lost_unsaid() -> None:
+    minutes = np.array([0.0, 10.0])
+    courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(6))
+    panels = [
+        Courses("1-threshold", courses, np.zeros(2), np.ones(2), ((0.0, 1.1),), 2),
+        Courses("linear", (Course("linear", minutes, np.zeros((2, 2))),), np.zeros(2)),
+    ]
+    figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
+    said = legend(figure)
+    assert {
+        "best possible return, rough grid",
+        "best possible return, fine grid",
+        "random actions",
+        "linear",
+        "c5",
+    } <= said
+    assert "2 more conditions" in figure.axes[0].get_title(loc="left")
+    colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
+    (dashed,) = [line for line in figure.axes[0].lines if "rough" in str(line.get_label())]
+    assert len(colours) == 6 and dashed.get_color() not in colours
+
+
+def legend(figure: Any) -> set[str]:
+    return {text.get_text() for legend in figure.legends for text in legend.get_texts()}
