@@ -9,19 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from animat.errors import InvalidArgument
 from animat.evaluation.statistics import compare
 from animat.report.comparisons import Group, Pair, draw_comparisons
 from animat.report.controls import Controls, draw_controls
 from animat.report.learning_curves import LearningCurve, draw_learning_curves
 from animat.report.over_time import Course, Courses, draw_over_time
+from animat.robots import Cartpole
 from animat.studies.differences import came_out_otherwise, decisions, explain
 from animat.studies.learned import known_of, learned_of
 from animat.studies.limits import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import limits_file, table_file, write_table
-from animat.studies.publishing import _as_in_paper, _culture
+from animat.studies.plan import plan_study
+from animat.studies.publishing import _as_in_paper
+from animat.studies.shown import controllability_shown
 from animat.studies.specification import Body, Simulators, Source, Study, StudyCondition
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
+from animat.studies.toml import read_study, study_to_toml
+from animat.studies.training import training_of
 
 ROW: dict[str, Any] = {
     "comparison": "c", "robot": "cartpole", "at_min": 140.0, "n": 10, "first": "a", "second": "b",
@@ -144,6 +150,32 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "Pole mass" not in alone
 
 
+# --- robots of one kind -----------------------------------------------------------------------------------------------
+
+
+def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
+    """The pole mass as printed beside the simulator's, in one study."""
+    printed = Body("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
+    study = Study(robots=(Body("cartpole"), printed))
+    assert printed.robot() == Cartpole(pole_mass_kg=0.55)
+    assert printed.trained_for == Cartpole().paper_iterations
+    (tmp_path / "study.toml").write_text(study_to_toml(study))
+    assert read_study(tmp_path / "study.toml") == study
+    names = [job.name for job in plan_study(study, tmp_path)]
+    assert len(set(names)) == len(names) and "train/as printed/1-threshold/p0" in names
+    assert training_of(study, printed, StudyCondition("a", mapping="none")).commands == (-1.0, 1.0)
+    told = [words for name, words in decisions(study) if name == "Pole mass"]
+    assert len(told) == 2 and "0.55 kg, chosen" in told[1]
+    with pytest.raises(InvalidArgument, match="expected each name once"):
+        Study(robots=(Body("cartpole"), Body("cartpole", parameters={"pole_mass_kg": 0.55})))
+    with pytest.raises(InvalidArgument, match=r"robots\.name"):
+        Body("a/b", kind="cartpole")
+    with pytest.raises(InvalidArgument, match="culture"):
+        Body("culture", kind="cartpole")
+    with pytest.raises(InvalidArgument, match="cartpole, navigation"):
+        Body("as printed")
+
+
 # --- learning as good as the limit allows -----------------------------------------------------------------------------
 
 
@@ -192,7 +224,7 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
     write_table(
         limits_file(tmp_path, "cartpole", "over-time"), ("mapping", "percentiles", "at_min", "best_return"), limits
     )
-    (table,) = _culture(study, tmp_path).tables
+    table = controllability_shown(study, tmp_path)
     assert table.head[-3:] == ("difference, data", "difference, simulator", "limit, cartpole")
     assert table.marked == (1,)
     assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"

@@ -38,7 +38,7 @@ def extract_series(
             if finding.severity == "refuse" and finding.name not in despite:
                 raise UnusableData(
                     f"the recording at {recording.start_min:g} min: {finding.sentence} (to go on in spite of it: "
-                    f"--despite {finding.name})"
+                    f"--despite {finding.name}, or in a study simulators.despite)"
                 )
         series.append(responses)
     return series

@@ -159,7 +159,10 @@ class Body:
     """A robot of the study.
 
     Attributes:
-        name: `cartpole` or `navigation`.
+        name: what it is called in tables and folders; of those of animat's own name, `cartpole` or `navigation`, no
+            more need be said.
+        kind: `cartpole` or `navigation`, where the name says something else, such as of two cartpoles with different
+            parameters.
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
         limit_resolution: of its best possible return, in place of the study's.
@@ -169,8 +172,15 @@ class Body:
     iterations: int | None = None
     limit_resolution: float | None = None
     parameters: dict[str, float] = field(default_factory=dict)
+    kind: str = ""
 
     def __post_init__(self) -> None:
+        if self.kind:
+            _check_name("robots.name", self.name)
+            if self.name == "culture":
+                raise InvalidArgument(
+                    "robots.name: expected another name than the culture's figures have, got 'culture'"
+                )
         if self.iterations is not None and self.iterations < 1:
             raise InvalidArgument(f"robots.iterations: expected at least 1, got {self.iterations}")
         if self.limit_resolution is not None:
@@ -179,7 +189,7 @@ class Body:
 
     def robot(self) -> Robot[Any]:
         """The robot itself."""
-        return robot_named(self.name, **self.parameters)
+        return robot_named(self.kind or self.name, **self.parameters)
 
     @property
     def trained_for(self) -> int:

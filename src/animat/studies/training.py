@@ -38,7 +38,7 @@ class TrainGroup(Task):
         out = policies_folder(folder, self.body, self.condition)
         provenance = {key: value for key, value in manifest.items() if key != "sources"}
         group = Group(training, self.members, timeline, manifest["fingerprint"], provenance)
-        checkpoint = folder / UNFINISHED / f"{self.body.name}-{self.condition.slug}-p{self.members[0]}.npz"
+        checkpoint = folder / UNFINISHED / self.body.name / self.condition.slug / f"p{self.members[0]}.npz"
 
         def told(done: int, mean_return: float) -> None:
             report(done / CHUNKS, "" if math.isnan(mean_return) else f"return {mean_return:.1f}")
@@ -68,7 +68,7 @@ def training_of(study: Study, body: Body, condition: StudyCondition) -> Training
         percentiles=condition.percentiles,
         delivery=condition.delivery,
         # The paper's baselines: pushes to either side; any turn.
-        commands=(-1.0, 1.0) if not through_neurons and body.name == "cartpole" else None,
+        commands=(-1.0, 1.0) if not through_neurons and body.robot().name == "cartpole" else None,
         algorithm=SAC(**study.algorithm),  # type: ignore[arg-type]
     )
 

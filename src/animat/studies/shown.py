@@ -1,0 +1,240 @@
+"""The tables of the report, from those of the study: which columns and rows are shown, and what is said of them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from animat.evaluation.optimum import bracket_findings
+from animat.neurons.fidelity import LARGEST_LOSS
+from animat.report.html import Table, cell
+from animat.studies.limits import rough_kinds
+from animat.studies.places import limits_file, read_table, table_file
+from animat.studies.specification import Study
+from animat.studies.tabulating import named_mapping
+
+Columns: TypeAlias = list[tuple[str, "str | Callable[[dict[str, Any]], Any]"]]
+"""Of a table that is shown: their names, and the key or a function of a row that gives the cell."""
+
+_MOST_LABELS = 12
+
+_SCORE_NOTE = (
+    "Limit: the best possible return of any controller with the same neurons, mapping and robot, by dynamic "
+    "programming. Score: (mean − random) / (limit − random); 0 is as good as random actions, 1 the limit, which "
+    "chance can "
+    "pass. A control, whose delivery is drawn at random, has no limit: whatever it chooses is as good as random."
+)
+
+
+def comparisons_shown(rows: list[dict[str, Any]]) -> Table:
+    """Tests and outcomes, beside the paper's p where it printed one."""
+    printed = any(row["paper_p"] is not None for row in rows)
+    columns: Columns = [
+        ("comparison", "comparison"),
+        ("robot", "robot"),
+        ("at (min)", "at_min"),
+        ("n", "n"),
+        ("U", "u"),
+        ("p", "p_normal"),
+        ("p exact", "p_exact"),
+        ("p corrected", "p_holm"),
+        ("effect", _interval("effect", "effect_low_95", "effect_high_95")),
+        ("outcome", "outcome"),
+    ]
+    if printed:
+        columns += [("the paper's p (U it implies)", _printed), ("as in the paper", "as_in_paper")]
+    return Table(
+        "Comparisons",
+        *_columns(rows, columns),
+        note="The paper prints p and no U; U is the one that gives this p. Highlighted: not as in the paper."
+        if printed
+        else "",
+        beside="tables/comparisons.csv",
+        marked=tuple(i for i, row in enumerate(rows) if row["as_in_paper"] == "no"),
+    )
+
+
+def returns_shown(rows: list[dict[str, Any]]) -> Table:
+    """The same comparisons as mean returns, limits and scores."""
+    return Table(
+        "The same comparisons as returns",
+        *_columns(
+            rows,
+            [
+                ("first", "first"),
+                ("second", "second"),
+                ("robot", "robot"),
+                ("mean first", "mean_first"),
+                ("mean second", "mean_second"),
+                ("random", "random_second"),
+                ("limit first", _pair("limit_first", "limit_error_first")),
+                ("limit second", _pair("limit_second", "limit_error_second")),
+                ("score first", "score_first"),
+                ("score second", "score_second"),
+            ],
+        ),
+        note=_SCORE_NOTE + " ±: how far it may lie from there, by the grid, or down to its controller's return.",
+        beside="tables/comparisons.csv",
+    )
+
+
+def scores_shown(rows: list[dict[str, Any]]) -> Table:
+    """Every condition at every minute it was evaluated at."""
+    return Table(
+        "Every condition",
+        *_columns(
+            rows,
+            [
+                ("robot", "robot"),
+                ("condition", "condition"),
+                ("at (min)", "at_min"),
+                ("policies", "policies"),
+                ("episodes", "episodes"),
+                ("mean", "mean_return"),
+                ("s.d.", "standard_deviation"),
+                ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
+                ("random", "random"),
+                ("limit", "limit"),
+                ("score", "normalised_score"),
+            ],
+        ),
+        note=_SCORE_NOTE,
+        beside="tables/scores.csv",
+    )
+
+
+def limits_shown(limits: list[dict[str, Any]]) -> Table:
+    """The best possible returns as brackets."""
+    return Table(
+        "Best possible returns",
+        *_columns(
+            limits,
+            [
+                ("robot", "robot"),
+                ("mapping", lambda row: named_mapping(row["mapping"], row["percentiles"])),
+                ("at (min)", "at_min"),
+                ("limit ± grid", _pair("best_return", "grid_error")),
+                ("its controller, run", _pair("monte_carlo", "standard_error")),
+                ("without clock", _pair("without_clock", "without_clock_standard_error")),
+                ("nodes", "nodes"),
+            ],
+        ),
+        note="± grid: how far the value moved from a grid with 3/4 of the steps. Run: the mean return of the "
+        "controller that "
+        "takes the best actions, on the robot itself, ± its standard error: a return that can be had. The best "
+        "possible "
+        "return lies between the two; scores keep to the value, the upper end. Highlighted: they part by more than 3 "
+        "standard "
+        "errors and the grid's error. Without clock: the same controller if it does not know the time left, as "
+        "policies do "
+        "not. On a rough grid at every recording: limits/.",
+        beside="tables/limits.csv",
+        marked=tuple(i for i, row in enumerate(limits) if _parted(row)),
+    )
+
+
+def controllability_shown(study: Study, folder: Path) -> Table:
+    """How often each condition passes the median in every recording, in the data and in the simulator."""
+    in_data: dict[float, dict[str, float]] = defaultdict(dict)
+    in_simulator: dict[float, dict[str, float]] = defaultdict(dict)
+    for row in read_table(table_file(folder, "controllability")):
+        in_data[row["at_min"]][row["condition"]] = row["above_median_in_data"]
+        in_simulator[row["at_min"]][row["condition"]] = row["above_median_in_simulator"]
+    kinds = rough_kinds(study)[:1]
+    limits = {
+        body.name: {
+            row["at_min"]: row["best_return"]
+            for row in read_table(limits_file(folder, body.name, "over-time"))
+            if (row["mapping"], row["percentiles"]) == (kinds[0].mapping, kinds[0].percentiles)
+        }
+        for body in study.robots
+        if kinds
+    }
+    every = list(next(iter(in_data.values())))
+    labels = every[:_MOST_LABELS]
+    lost = {at_min: max(abs(of[x] - in_simulator[at_min][x]) for x in every) for at_min, of in in_data.items()}
+    rows = []
+    for at_min, of in in_data.items():
+        drawn = in_simulator[at_min]
+        shares = (
+            f"{of[x]:.2f}\u00a0→\u00a0{drawn[x]:.2f}" if abs(of[x] - drawn[x]) > LARGEST_LOSS else of[x] for x in labels
+        )
+        apart = (max(each.values()) - min(each.values()) for each in (of, drawn))
+        rows.append((at_min, *shares, *apart, *(by_minute.get(at_min) for by_minute in limits.values())))
+    note = (
+        "P(x ≥ P50) of each condition: how often it answers above the median of all. A controller can only work with "
+        "the "
+        "difference between them, and of that with what the simulator keeps of the responses. Highlighted, with an "
+        "arrow: "
+        f"binning moves a share by more than {LARGEST_LOSS:g}, and what the simulator, limits and policies have is "
+        f"not what "
+        "the culture would give."
+    )
+    if kinds:
+        mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)
+        note += f" Limit: the best possible return with {mapping} on a rough grid."
+    if len(every) > len(labels):
+        note += f" {len(every) - len(labels)} more conditions are in the file; the differences are over all."
+    return Table(
+        "Controllability of every recording",
+        ("at (min)", *labels, "difference, data", "difference, simulator", *(f"limit, {robot}" for robot in limits)),
+        tuple(rows),
+        note=note,
+        beside="tables/controllability.csv",
+        marked=tuple(i for i, loss in enumerate(lost.values()) if loss > LARGEST_LOSS),
+    )
+
+
+def controls_shown(study: Study, folder: Path) -> Table:
+    """Trained policies and the controls of their mapping, at every recording that anything is evaluated at."""
+    rows = read_table(table_file(folder, "controls"))
+    return Table(
+        "Controls",
+        *_columns(
+            rows,
+            [
+                ("robot", "robot"),
+                ("mapping", lambda row: named_mapping(row["mapping"], row["percentiles"])),
+                ("at (min)", lambda row: None if row["mapping"] == "none" else row["at_min"]),
+                ("control", "control"),
+                ("actors", "actors"),
+                ("mean return", _pair("mean_return", "standard_error")),
+                ("random", "random"),
+                ("limit", "limit"),
+                ("score", "normalised_score"),
+            ],
+        ),
+        note="Trained policies stand beside their controls. ±: standard error over actors, of one actor over its "
+        "episodes."
+        + (
+            " Without neurons, where any command can be chosen, none is held constant."
+            if any(row["mapping"] == "none" for row in rows)
+            and "navigation" in {body.robot().name for body in study.robots}
+            else ""
+        ),
+        beside="tables/controls.csv",
+    )
+
+
+def _columns(rows: Sequence[dict[str, Any]], columns: Columns) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
+    """Head and cells of a table: a column is a name and the key, or a function of the row."""
+    cells = tuple(tuple(key(row) if callable(key) else row[key] for _, key in columns) for row in rows)
+    return tuple(name for name, _ in columns), cells
+
+
+def _pair(value: str, error: str) -> Callable[[dict[str, Any]], str | None]:
+    return lambda row: None if row[value] is None else f"{cell(row[value])}\u00a0±\u00a0{cell(row[error])}"
+
+
+def _interval(value: str, low: str, high: str) -> Callable[[dict[str, Any]], str]:
+    return lambda row: f"{cell(row[value])} [{cell(row[low])}, {cell(row[high])}]".replace(" ", "\u00a0")
+
+
+def _printed(row: dict[str, Any]) -> str | None:
+    return None if row["paper_p"] is None else f"{cell(row['paper_p'])}\u00a0({cell(row['paper_u'])})"
+
+
+def _parted(row: dict[str, Any]) -> bool:
+    return bool(bracket_findings(row["best_return"], row["grid_error"], row["monte_carlo"], row["standard_error"]))
