@@ -308,6 +308,9 @@ def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     study = Study(culture=Source("files", files=("made",)), robots=(Body("navigation", iterations=100),))
     with pytest.raises(AnimatError, match="fit: halted"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
+    written = tmp_path / "study" / "study.toml"
+    assert read_study(written) == study
+    assert written.read_text().startswith("# files: as seen from where the specification lay.")
     make_up_recording(2, start_min=0.0, patterns=5, channels=16).save(sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
@@ -360,21 +363,37 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
     assert (float(told["paper_p"]), told["as_in_paper"]) == (PRINTED[told["comparison"], "navigation"].p, "cannot tell")
 
 
-def test_scores_lie_between_random_and_the_limit_as_they_say(finished: Path) -> None:
-    controls = rows(finished / "tables/controls.csv")
-    for row in rows(finished / "tables/scores.csv"):
+def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -> None:
+    """From the episodes and the limits themselves, not from other columns of the table."""
+    folder_of = {"none": "none", "1-threshold": "1-threshold", "9-thresholds": "9-thresholds-held"}
+    limits = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "limits/navigation-limits.csv")}
+
+    def returns_of(path: str, at_min: float) -> np.ndarray:
+        """Of policies, or of random stimuli among controls; all have as many episodes."""
+        return np.array(
+            [
+                float(row["return"])
+                for row in rows(finished / path)
+                if row.get("control", "random") == "random" and float(row["at_min"]) == at_min
+            ]
+        )
+
+    scores = rows(finished / "tables/scores.csv")
+    assert {row["mapping"] for row in scores} == set(folder_of)
+    for row in scores:
+        mapping, at_min = row["mapping"], float(row["at_min"])
+        random_ = returns_of(f"controls/navigation/{folder_of[mapping]}/episodes.csv", at_min).mean()
+        policies = returns_of(f"episodes/navigation/{row['condition'].replace(' ', '-')}/episodes.csv", at_min)
         if row["condition"] in CONTROLS:
             # Whatever it chooses is as good as random: it has no limit of its own.
             assert (row["limit"], row["normalised_score"]) == ("", "")
             continue
-        mean, random_, limit = (float(row[name]) for name in ("mean_return", "random", "limit"))
-        assert float(row["normalised_score"]) == pytest.approx((mean - random_) / (limit - random_))
-        (same,) = [
-            c
-            for c in controls
-            if (c["mapping"], c["control"]) == (row["mapping"], "random") and c["at_min"] == row["at_min"]
-        ]
-        assert random_ == pytest.approx(float(same["mean_return"]))
+        limit = limits[mapping, at_min]
+        best = float(limit["best_return"])
+        assert float(row["normalised_score"]) == pytest.approx((policies.mean() - random_) / (best - random_))
+        error = policies.std(ddof=1) / np.sqrt(len(policies))
+        assert policies.mean() < best + float(limit["grid_error"]) + 4 * error
+    controls = rows(finished / "tables/controls.csv")
     names = {row["control"] for row in controls if row["mapping"] == "1-threshold"}
     assert {"random", "silent", "shuffled", "made by hand", "constant 80 Hz"} <= names
 
@@ -624,6 +643,9 @@ def test_a_missing_file_is_told_in_one_line(tmp_path: Path, capsys: pytest.Captu
     assert capsys.readouterr().err.endswith("none.toml: no such file\n")
     with pytest.raises(InvalidArgument, match="workers"):
         run_study(read_study(TINY), tmp_path / "out", workers=0)
+    with pytest.raises(InvalidArgument, match="workers: expected none beside an executor"):
+        run_study(read_study(TINY), tmp_path / "out", workers=2, executor=Halts())
+    assert not (tmp_path / "out").exists()
 
 
 # --- jobs -----------------------------------------------------------------------------------------------------------

@@ -47,7 +47,6 @@ class Optimum:
         without_clock_standard_error: of `without_clock`.
         episodes: that both were measured in; 0 where the controller was not run.
         nodes: of the grid.
-        horizon_observed: that `value` knows the time left; policies do not.
     """
 
     value: float
@@ -58,7 +57,6 @@ class Optimum:
     without_clock_standard_error: float
     episodes: int
     nodes: int
-    horizon_observed: bool = True
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data; None where the controller was not run."""

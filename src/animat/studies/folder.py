@@ -25,6 +25,7 @@ MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
 _LOCK = ".lock"
 _PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "matplotlib", "jinja2")
+_ABOUT_FILES = "# files: as seen from where the specification lay. To run it from here: files = ['recordings']\n"
 
 
 def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
@@ -119,7 +120,7 @@ def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]
         if not _is_ours(folder, manifest):
             for path, words in (
                 (folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True) + "\n"),
-                (folder / SPECIFICATION, study_to_toml(study)),
+                (folder / SPECIFICATION, _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)),
             ):
                 with written_whole(path) as beside:
                     beside.write_text(words)

@@ -59,11 +59,13 @@ def run_study(
     Raises:
         Mismatch: if the folder is another study's, its recordings have changed, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer workers than one.
+        InvalidArgument: for fewer workers than one, or any beside an executor.
         AnimatError: if a job failed; its message names the job.
     """
     if workers is not None and workers < 1:
         raise InvalidArgument(f"workers: expected at least 1, got {workers}")
+    if workers is not None and executor is not None:
+        raise InvalidArgument(f"workers: expected none beside an executor, which has its own, got {workers}")
     folder, base = Path(folder).absolute(), Path(base).absolute()
     manifest = describe_study(study, sums_of(source_files(study, base), base))
     with held(folder, study, manifest):
