@@ -28,7 +28,7 @@ from scipy.stats import mannwhitneyu
 from animat.animat import Animat
 from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
 from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
@@ -622,6 +622,17 @@ def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
     assert told.sentence == "before and after was asked for at 29 min and is made on the recording at 30 min"
     with pytest.raises(InvalidArgument, match="at_min"):
         Fit().run(replace(study, comparisons=(replace(moved, at_min=99.0),)), tmp_path / "study", lambda s, w: None)
+
+
+def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> None:
+    write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
+    one = Study(culture=Source("files", files=("made",)), simulators=Simulators(conditions="all"))
+    Record(tmp_path).run(one, tmp_path / "study", lambda share, words: None)
+    with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more .* got one \(all\)"):
+        Fit().run(one, tmp_path / "study", lambda share, words: None)
+    knowing = replace(one, simulators=Simulators(conditions="all", despite=("one-condition",)))
+    kept, _ = Fit().run(knowing, tmp_path / "study", lambda share, words: None)
+    assert len(load_timeline(kept).conditions) == 1
 
 
 def test_no_two_conditions_or_controls_share_a_file(tmp_path: Path) -> None:

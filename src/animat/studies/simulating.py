@@ -11,7 +11,7 @@ from typing import Any, final
 import jax.numpy as jnp
 import numpy as np
 
-from animat.errors import AnimatError, InvalidFile
+from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.responses import Responses
@@ -38,6 +38,12 @@ class Fit(Task):
         series = read_series(study, folder)
         settings = study.simulators
         timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+        if len(timeline.conditions) < 2 and "one-condition" not in settings.despite:
+            raise UnusableData(
+                "simulators.conditions: expected two or more for an agent to choose from, got one "
+                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                '(to go on in spite of it: simulators.despite = ["one-condition"])'
+            )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)
         rows = (
