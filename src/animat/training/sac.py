@@ -67,7 +67,7 @@ class SAC:
     follow: float = 0.005
     reward_scale: float = 0.1
     averaging: int = 8
-    first_alpha: float = 0.1
+    first_alpha: float = 0.3
     entropy_share: float = 0.1
     entropy_nats: float = -1.0
 
