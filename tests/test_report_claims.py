@@ -55,6 +55,7 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     words = _as_in_paper([ROW | {"as_in_paper": each} for each in ("yes", "cannot tell", "cannot tell")])
     assert words.startswith("1 of 3 comparisons") and "Of 2 it cannot be told" in words
     assert "otherwise" not in words
+    assert "cannot be told" in _as_in_paper([ROW | {"as_in_paper": "cannot tell"}] * 2)
 
 
 def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
@@ -201,11 +202,13 @@ def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
 
 
 def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
-    assert known_of(LEARNED | {"normalised_score": 0.98}) == "reached"
-    assert known_of(LEARNED | {"normalised_score": None}).startswith("nothing to learn")
-    assert "short by 0.09, which neither" in known_of(LEARNED)
-    assert "short by the clock" in known_of(LEARNED | {"score_without_clock": 0.99})
-    assert "its controller was seen to get" in known_of(LEARNED | {"limit_run": 100.0})
+    body = Body("cartpole")
+    assert known_of(LEARNED | {"normalised_score": 0.98}, body) == "reached"
+    assert known_of(LEARNED | {"normalised_score": None}, body).startswith("nothing to learn")
+    assert known_of(LEARNED, body).endswith("short by 0.09, which neither the clock nor the grid explains")
+    assert "short by the clock" in known_of(LEARNED | {"score_without_clock": 0.99}, body)
+    assert "its controller was seen to get" in known_of(LEARNED | {"limit_run": 100.0}, body)
+    assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, Body("cartpole", iterations=60_000))
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------

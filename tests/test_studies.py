@@ -532,7 +532,10 @@ def test_the_paper_is_kept_to() -> None:
     }
 
 
-COMPARED = "[[comparisons]]\nname = 'a'\nfirst = '1 threshold'\nsecond = '1 threshold'\nat_min = {}"
+COMPARED = (
+    "[[conditions]]\nname = '1 threshold'\n[[conditions]]\nname = 'b'\n"
+    "[[comparisons]]\nname = 'a'\nfirst = '1 threshold'\nsecond = 'b'\nat_min = {}"
+)
 
 
 @pytest.mark.parametrize(
@@ -554,6 +557,7 @@ COMPARED = "[[comparisons]]\nname = 'a'\nfirst = '1 threshold'\nsecond = '1 thre
         ("[[conditions]]\nname = 'a'\nmapping = '2'", "conditions.mapping: expected one of"),
         ("[[conditions]]\nname = 'a'\ndelivery = 'none'", "conditions.delivery: expected one of chosen, shuffled"),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the conditions"),
+        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another condition"),
         ("[culture]\nkind = 'alive'", "culture.kind: expected one of virtual, made-up, files"),
         ("[culture]\nkind = 'files'", "culture.files: expected some"),
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
@@ -597,10 +601,13 @@ def test_choices_are_checked_from_python_too() -> None:
             make()
 
 
+PAIR = (StudyCondition("1 threshold"), StudyCondition("control", delivery="shuffled"))
+
+
 def test_comparisons_are_made_at_the_nearest_recording() -> None:
     def at(minutes: list[float | None], start_min: list[float]) -> list[float | None]:
-        compared = tuple(Compared(f"c{i}", "1 threshold", "1 threshold", at) for i, at in enumerate(minutes))
-        study = Study(culture=Source("files", files=("a.nwb",)), comparisons=compared)
+        compared = tuple(Compared(f"c{i}", "1 threshold", "control", at) for i, at in enumerate(minutes))
+        study = Study(culture=Source("files", files=("a.nwb",)), conditions=PAIR, comparisons=compared)
         return [each.at_min for each in study.at_recordings(start_min).comparisons]
 
     start_min = [0.0, 10.02, 60.0]
@@ -614,8 +621,12 @@ def test_comparisons_are_made_at_the_nearest_recording() -> None:
 
 def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
     write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
-    moved = Compared("before and after", "1 threshold", "1 threshold", at_min=29.0)
-    study = Study(culture=Source("files", files=("made",)), comparisons=(moved, replace(moved, name="b", at_min=30.0)))
+    moved = Compared("before and after", "1 threshold", "control", at_min=29.0)
+    study = Study(
+        culture=Source("files", files=("made",)),
+        conditions=PAIR,
+        comparisons=(moved, replace(moved, name="b", at_min=30.0)),
+    )
     Record(tmp_path).run(study, tmp_path / "study", lambda share, words: None)
     kept, _ = Fit().run(study, tmp_path / "study", lambda share, words: None)
     (told,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]

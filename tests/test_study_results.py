@@ -107,8 +107,8 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     study = Study(
         culture=Source("made-up", sessions=2, interval_min=140.0, presentations=20, channels=32),
         robots=(Body("navigation", parameters={"episode_limit": 60}),),
-        conditions=(condition,),
-        comparisons=(Compared("with itself", "control", "control", at_min=0.0, episodes=7),),
+        conditions=(condition, StudyCondition("other")),
+        comparisons=(Compared("with another", "control", "other", at_min=0.0, episodes=7),),
         policies=2,
         episodes=7,
         episodes_over_time=3,

@@ -51,6 +51,7 @@ def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
         if controls.random is not None:
             axes.axvline(controls.random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
         style_axes(axes, controls.title, "mean return and its standard error", "")
+        axes.locator_params(axis="x", nbins=5)
         axes.grid(axis="y", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=4)
     return figure

@@ -99,7 +99,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
             axes.axvline(trained_until_min, color=GREY, linewidth=0.8)
             axes.annotate(
                 "end of training",
-                (trained_until_min, 0.0),
+                (trained_until_min, 0.35),
                 xycoords=("data", "axes fraction"),
                 xytext=(3, 3),
                 textcoords="offset points",

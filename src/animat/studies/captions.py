@@ -15,9 +15,7 @@ CULTURE: dict[str, tuple[str, str]] = {
     "bursts": (
         "bursts set apart",
         "All responses x, bursts among them; x against the ratio of active channels; that ratio with Otsu's "
-        "threshold; x against it with "
-        "bursts marked. "
-        "Bursts come regardless of the stimulus and are left out.",
+        "threshold; x against it with bursts marked. Bursts come regardless of the stimulus and are left out.",
     ),
     "responses": (
         "responses to each stimulus",
@@ -44,9 +42,8 @@ ROBOT: dict[str, tuple[str, str]] = {
         "learning curves",
         "Return of the episodes that ended in each part of training: every policy, their mean and its 95 % bootstrap "
         "interval; actions are drawn. Lines: random actions and the best possible return with the simulator in use, "
-        "which "
-        "steps on with it (from the second recording on: on a rough grid). A control has no such return: whatever it "
-        "chooses is as good as random.",
+        "which steps on with it (from the second recording on: on a rough grid). A control has no such return: "
+        "whatever it chooses is as good as random.",
     ),
     "comparisons": (
         "comparisons",
@@ -58,16 +55,13 @@ ROBOT: dict[str, tuple[str, str]] = {
         "at every recording",
         "The same policies on the simulator of each recording: median and quartiles over policies, with the best "
         "possible return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
-        "falls "
-        "faster is the policy's. At every recording that return is on a rough grid, which can lie some below the "
-        "fine one, "
-        "and is left out for the linear mapping.",
+        "falls faster is the policy's. At every recording that return is on a rough grid, which can lie some below "
+        "the fine one, and is left out for the linear mapping.",
     ),
     "controls": (
         "controls",
         "Mean returns with standard errors over policies (for a control of one actor: over episodes), at the "
-        "recordings "
-        "of the comparisons.",
+        "recordings of the comparisons.",
     ),
     "paths": (
         "episodes",

@@ -32,8 +32,7 @@ def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
         yield (
             "Pulse",
             "As published the pulse's phases do not balance (100 against 80 mV ms). The virtual culture takes it as "
-            "it is; "
-            "hardware would not.",
+            "it is; hardware would not.",
         )
 
 
@@ -43,31 +42,27 @@ def _of_robots(study: Study) -> Iterator[tuple[str, str]]:
         yield (
             "Nine levels without zero",
             "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
-            "eleven. Zero "
-            "is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
+            "eleven. Zero is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
         )
     for cartpole in (robot for robot in robots if isinstance(robot, Cartpole)):
         chosen = "the simulator's" if math.isclose(cartpole.pole_mass_kg, 0.055) else "chosen for this study"
         yield (
             "Pole mass",
             "The paper's table prints 0.55 kg; the open simulator whose other numbers it repeats has 0.055 kg. Here "
-            "it is "
-            f"{cartpole.pole_mass_kg:g} kg, {chosen} (pole_mass_kg).",
+            f"it is {cartpole.pole_mass_kg:g} kg, {chosen} (pole_mass_kg).",
         )
         limit_deg = math.degrees(cartpole.angle_limit_rad)
         yield (
             "12 degrees",
             "The paper prints that an episode ends when the pole passes 12 rad, nearly two turns; the open simulator "
-            "has 12 "
-            f"degrees. Here it is {limit_deg:.3g} degrees (angle_limit_rad).",
+            f"has 12 degrees. Here it is {limit_deg:.3g} degrees (angle_limit_rad).",
         )
     for navigation in (robot for robot in robots if isinstance(robot, Navigation)):
         most = navigation.episode_limit
         yield (
             "20 iterations",
             "The paper prints at most 20 iterations for an episode of navigation: 0.5 m of path to a goal that is "
-            "0.89 m "
-            f"away. Here there are {most} (episode_limit)"
+            f"0.89 m away. Here there are {most} (episode_limit)"
             + (
                 "; with 20 no policy can reach the goal." if most > 20 else ", with which no policy can reach the goal."
             ),
@@ -75,8 +70,7 @@ def _of_robots(study: Study) -> Iterator[tuple[str, str]]:
         yield (
             "Walls",
             "The paper does not say what a wall does. Here the robot stays inside: one that runs into a wall slides "
-            "along "
-            "it, and is not punished for it.",
+            "along it, and is not punished for it.",
         )
 
 
@@ -90,23 +84,19 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
             here = (
                 f"Here the edges of the {simulators.bins} bins are percentiles of each recording's own responses, all "
                 "conditions together: where responses are small, or become smaller, equally wide bins erase the "
-                "differences "
-                "between conditions."
+                "differences between conditions."
             )
         else:
             here = (
                 f"Here {simulators.bins} bins of equal width reach to {simulators.range_hz:g} Hz. Controllability of "
-                f"every "
-                "recording shows how often responses pass the median in the data and in the simulator: what parts "
-                "the two "
-                "is taken by binning."
+                "every recording shows how often responses pass the median in the data and in the simulator: what "
+                "parts the two is taken by binning."
             )
         yield "Histogram range", papers + here
         yield (
             "Drawing from a histogram",
             "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into "
-            "the last "
-            "bin, and is reported.",
+            "the last bin, and is reported.",
         )
     held = any(condition.percentiles == "first" for condition in study.conditions)
     yield (
@@ -121,18 +111,15 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
     yield (
         "Learning",
         "The paper's hosted platform is retired; it chose networks and settings by itself and took up to 60 minutes. "
-        "Here "
-        "it is discrete soft actor-critic with one set of settings for all, and the progress of training stands for "
-        f"{study.training_min:g} minutes of the culture's clock. The critics, which only training has, see how much "
-        f"of the "
-        "episode is left, so that a time limit ends the return they learn; policies do not.",
+        "Here it is discrete soft actor-critic with one set of settings for all, and the progress of training stands "
+        f"for {study.training_min:g} minutes of the culture's clock. The critics, which only training has, see how "
+        "much of the episode is left, so that a time limit ends the return they learn; policies do not.",
     )
     if study.actions == "most probable":
         yield (
             "Most probable actions",
             "The paper does not say whether policies draw their actions when they are evaluated. Here they take the "
-            "most "
-            "probable one.",
+            "most probable one.",
         )
     else:
         yield (
@@ -218,7 +205,6 @@ def explain(row: dict[str, Any]) -> str:
         return f"{limits}; {row['second']} is at its limit (score {score:.2f}), so more cannot be had from it."
     scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row["score_first"], score))
     return (
-        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, "
-        f"{second - row['mean_first']:.1f} above "
-        f"{row['first']}, so it does not explain this."
+        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, {second - row['mean_first']:.1f} "
+        f"above {row['first']}, so it does not explain this."
     )

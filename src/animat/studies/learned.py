@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from animat.report.html import Table, cell
-from animat.studies.specification import Study
+from animat.studies.specification import Body, Study
 from animat.studies.tabulating import AIM
 
 
@@ -22,8 +22,9 @@ def learned_of(study: Study, scores: list[dict[str, Any]]) -> list[dict[str, Any
     return list(first.values())
 
 
-def as_good_as_the_limit_allows(rows: list[dict[str, Any]]) -> Table:
+def as_good_as_the_limit_allows(study: Study, rows: list[dict[str, Any]]) -> Table:
     """Scores beside `AIM`, with what is known of the difference."""
+    bodies = {body.name: body for body in study.robots}
     head = (
         "robot",
         "condition",
@@ -54,7 +55,7 @@ def as_good_as_the_limit_allows(rows: list[dict[str, Any]]) -> Table:
                 row["limit_without_clock"],
                 row["normalised_score"],
                 row["score_without_clock"],
-                known_of(row),
+                known_of(row, bodies[row["robot"]]),
             )
         )
     return Table(
@@ -62,16 +63,14 @@ def as_good_as_the_limit_allows(rows: list[dict[str, Any]]) -> Table:
         head,
         tuple(cells),
         note="Run: the return that the limit's controller was seen to get. Without clock: what the same controller "
-        "gets if it "
-        "does not know the time left, as policies do not; a better one may exist, not above the limit. Of without "
-        "clock: the "
-        "score with this in place of the limit.",
+        "gets if it does not know the time left, as policies do not; a better one may exist, not above the limit. Of "
+        "without clock: the score with this in place of the limit.",
         beside="tables/scores.csv",
         marked=tuple(i for i, row in enumerate(rows) if (row["normalised_score"] or 0.0) < AIM),
     )
 
 
-def known_of(row: dict[str, Any]) -> str:
+def known_of(row: dict[str, Any], body: Body) -> str:
     """What is known of a score: that it is reached, or what stands between it and the limit."""
     score, without_clock = row["normalised_score"], row["score_without_clock"]
     if score is None:
@@ -83,5 +82,8 @@ def known_of(row: dict[str, Any]) -> str:
         return f"short of the limit, not of what its controller was seen to get ({run:.1f})"
     if without_clock is not None and without_clock >= AIM:
         return "short by the clock: reached against the same controller without knowing the time left"
-    short = AIM - score
-    return f"short by {short:.2f}, which neither the clock nor the grid explains"
+    known = f"short by {AIM - score:.2f}, which neither the clock nor the grid explains"
+    usual = body.robot().paper_iterations
+    if body.trained_for < usual:
+        known += f"; trained for {body.trained_for:,} iterations, not {usual:,}"
+    return known

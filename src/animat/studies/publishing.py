@@ -48,8 +48,7 @@ class Publish(Task):
         colophon = [
             f"Made with {versions}.",
             f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study on the same "
-            f"versions and machine is the same "
-            "files, bit for bit.",
+            "versions and machine is the same files, bit for bit.",
             f"Study {manifest['fingerprint']}",
         ]
         return [write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
@@ -84,12 +83,9 @@ def _short(study: Study, folder: Path) -> Section:
         "A policy's performance is its mean return over the episodes. Policies are compared by the two-sided "
         "Mann-Whitney U test: p by the normal approximation with continuity correction, as in the paper, and "
         "exactly; p corrected is Holm's for the number of comparisons. The outcome, and stars in figures, go by the "
-        "first "
-        f"of the three: the better one of two conditions counts as found at p < {LEVEL:g}; that none was found does "
-        f"not "
-        "say that there is no difference. The effect is the rank-biserial correlation, +1 where every policy of the "
-        "second "
-        "condition is better, with Newcombe's 95 % interval."
+        f"first of the three: the better one of two conditions counts as found at p < {LEVEL:g}; that none was found "
+        "does not say that there is no difference. The effect is the rank-biserial correlation, +1 where every "
+        "policy of the second condition is better, with Newcombe's 95 % interval."
     )
     return Section(
         "Results in short", tuple(paragraphs), tables=(comparisons_shown(rows), returns_shown(rows)) if rows else ()
@@ -99,6 +95,8 @@ def _short(study: Study, folder: Path) -> Section:
 def _as_in_paper(rows: list[dict[str, Any]]) -> str:
     """How many of the paper's comparisons came out as there; what cannot be told is neither yes nor no."""
     told = Counter(row["as_in_paper"] for row in rows)
+    if told["cannot tell"] == len(rows):
+        return f"Whether the {len(rows)} comparisons come out as in the paper cannot be told, with as few policies."
     words = f"{told['yes']} of {len(rows)} comparisons came out as in the paper: the same one better, at p < {LEVEL:g}."
     if told["cannot tell"]:
         words += f" Of {told['cannot tell']} it cannot be told, with as few policies."
@@ -117,12 +115,10 @@ def _scores(study: Study, folder: Path) -> Section:
     if learned:
         paragraphs.append(
             f"As good as the limit allows: a score of {AIM:g} on the very simulator that policies were trained on is "
-            f"what "
-            "learning should come to. Conditions whose simulators are refreshed during training are not asked this, "
-            "as they "
-            "are trained on several."
+            "what learning should come to. Conditions whose simulators are refreshed during training are not asked "
+            "this, as they are trained on several."
         )
-        tables.insert(0, as_good_as_the_limit_allows(learned))
+        tables.insert(0, as_good_as_the_limit_allows(study, learned))
     return Section("Scores", tuple(paragraphs), tables=tuple(tables))
 
 
@@ -175,8 +171,8 @@ def _done(study: Study) -> Section:
     else:
         recorded = (
             f"{culture.sessions} recordings, one every {culture.interval_min:g} min, of the {culture.kind} culture of "
-            f"seed {culture.seed}; stimuli "
-            f"{culture.order}, {culture.pulses} pulse(s) a presentation, {culture.presentations} presentations of each."
+            f"seed {culture.seed}; stimuli {culture.order}, {culture.pulses} pulse(s) a presentation, "
+            f"{culture.presentations} presentations of each."
         )
     points = [
         ("Recordings", recorded),
@@ -190,8 +186,7 @@ def _done(study: Study) -> Section:
         (
             "Training",
             f"{study.policies} policies of each condition on each robot, each from random numbers of its own; "
-            f"training stands for "
-            f"{study.training_min:g} min of the culture's clock.",
+            f"training stands for {study.training_min:g} min of the culture's clock.",
         ),
     ]
     points.append(("Evaluation", _ACTIONS[study.actions]))
@@ -226,9 +221,8 @@ def _differences(study: Study, folder: Path) -> Section:
     otherwise = came_out_otherwise(rows, lost)
     paragraphs = [
         "Sawada, Wake, Sasabuchi, Takamatsu, Takahashi, Ikeuchi: Design strategies for controlling neuron-connected "
-        "robots "
-        "using reinforcement learning (2022). First what came out otherwise, then what was decided where the paper is "
-        "silent or contradicts itself."
+        "robots using reinforcement learning (2022). First what came out otherwise, then what was decided where the "
+        "paper is silent or contradicts itself."
     ]
     if rows and not otherwise:
         paragraphs.append("Every comparison came out as in the paper.")
@@ -242,8 +236,7 @@ def _noticed(folder: Path) -> Section:
     shown = tuple((row["name"], row["sentence"]) for row in grave)
     said = (
         f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the limits; all "
-        f"are in "
-        "tables/findings.csv."
+        "are in tables/findings.csv."
     )
     table: tuple[Any, ...] = (
         (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()

@@ -23,8 +23,8 @@ _MOST_LABELS = 12
 _SCORE_NOTE = (
     "Limit: the best possible return of any controller with the same neurons, mapping and robot, by dynamic "
     "programming. Score: (mean − random) / (limit − random); 0 is as good as random actions, 1 the limit, which "
-    "chance can "
-    "pass. A control, whose delivery is drawn at random, has no limit: whatever it chooses is as good as random."
+    "chance can pass. A control, whose delivery is drawn at random, has no limit: whatever it chooses is as good as "
+    "random."
 )
 
 
@@ -122,14 +122,10 @@ def limits_shown(limits: list[dict[str, Any]]) -> Table:
             ],
         ),
         note="± grid: how far the value moved from a grid with 3/4 of the steps. Run: the mean return of the "
-        "controller that "
-        "takes the best actions, on the robot itself, ± its standard error: a return that can be had. The best "
-        "possible "
-        "return lies between the two; scores keep to the value, the upper end. Highlighted: they part by more than 3 "
-        "standard "
-        "errors and the grid's error. Without clock: the same controller if it does not know the time left, as "
-        "policies do "
-        "not. On a rough grid at every recording: limits/.",
+        "controller that takes the best actions, on the robot itself, ± its standard error: a return that can be "
+        "had. The best possible return lies between the two; scores keep to the value, the upper end. Highlighted: "
+        "they part by more than 3 standard errors and the grid's error. Without clock: the same controller if it "
+        "does not know the time left, as policies do not. On a rough grid at every recording: limits/.",
         beside="tables/limits.csv",
         marked=tuple(i for i, row in enumerate(limits) if _parted(row)),
     )
@@ -165,12 +161,9 @@ def controllability_shown(study: Study, folder: Path) -> Table:
         rows.append((at_min, *shares, *apart, *(by_minute.get(at_min) for by_minute in limits.values())))
     note = (
         "P(x ≥ P50) of each condition: how often it answers above the median of all. A controller can only work with "
-        "the "
-        "difference between them, and of that with what the simulator keeps of the responses. Highlighted, with an "
-        "arrow: "
-        f"binning moves a share by more than {LARGEST_LOSS:g}, and what the simulator, limits and policies have is "
-        f"not what "
-        "the culture would give."
+        "the difference between them, and of that with what the simulator keeps of the responses. Highlighted, with "
+        f"an arrow: binning moves a share by more than {LARGEST_LOSS:g}, and what the simulator, limits and policies "
+        "have is not what the culture would give."
     )
     if kinds:
         mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)

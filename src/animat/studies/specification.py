@@ -258,6 +258,11 @@ class Compared:
 
     def __post_init__(self) -> None:
         _check_name("comparisons.name", self.name)
+        if self.first == self.second:
+            raise InvalidArgument(
+                f"comparisons.second: expected another condition than the first, got {self.second!r} twice in "
+                f"{self.name!r}"
+            )
         if self.episodes < 1:
             raise InvalidArgument(f"comparisons.episodes: expected at least 1, got {self.episodes}")
         if self.at_min is not None and not math.isfinite(self.at_min):
