@@ -220,6 +220,7 @@ def test_without_running_the_controller_only_the_value_is_known() -> None:
 def test_a_value_that_its_controller_does_not_get_is_told() -> None:
     """3 standard errors and the grid's error apart is chance and grid; more is a bracket, or a grid too rough."""
     assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
+    assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # nothing is drawn: the two are alike as they are printed
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
     assert "between the two" in above.sentence and above.value == pytest.approx(2.1)
     (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)

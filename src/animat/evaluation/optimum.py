@@ -28,6 +28,9 @@ Case = tuple[Environment[Any], NeuronSimulator | None]
 COARSER = 0.75
 """Steps along each axis of the grid that the value is compared with, as a part of those of the grid in use."""
 
+_ALIKE = 0.01
+"""Returns nearer than this are alike: without any chance in an environment the standard error is 0."""
+
 _TABLES_AT_ONCE_MIB = 400
 
 
@@ -85,7 +88,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
         value, grid_error, monte_carlo, standard_error: as in `Optimum`.
     """
     apart = value - monte_carlo
-    if not abs(apart) > 3 * standard_error + grid_error:
+    if not abs(apart) > max(_ALIKE, 3 * standard_error + grid_error):
         return ()  # Neither has NaN, where the controller was not run, anything to tell.
     told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± "
     if apart > 0:
