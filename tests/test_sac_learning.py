@@ -17,11 +17,13 @@ from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.cartpole import Cartpole
+from animat.robots.navigation import Navigation
 from animat.training.sac import (
     SAC,
     Batch,
     Finished,
     Learner,
+    Network,
     Trained,
     begin,
     continuous_losses,
@@ -196,6 +198,25 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     mistake = np.abs(command - np.asarray(wanted)[:, 0])
     # Acting at random misses by 0.7 on average; what is left is the entropy that the policy is told to keep.
     assert mistake.mean() < 0.15
+
+
+def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
+    """Where gradients are all but 0, steps of their noise put units out: two of three with Adam's usual epsilon."""
+    simulator = made_up_simulator()
+    environment = Animat(Navigation(), mapping_named("1-threshold"), simulator.n_conditions)
+    settings = SAC(replay=16_384)
+    keys = jax.random.split(jax.random.key(1), 8)
+    learners = jax.jit(jax.vmap(partial(begin, environment, settings)))(keys)
+    run = jax.jit(jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)))
+    learners, _ = run(learners, simulator, jnp.int32(0), jnp.int32(400))
+
+    def alive(actor: Network, replay: jax.Array) -> jax.Array:
+        hidden = replay[:8_000, : environment.n_observations]
+        for layer in actor[:-1]:
+            hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
+        return jnp.mean(jnp.any(hidden > 0, axis=0))
+
+    assert float(jnp.mean(jax.vmap(alive)(learners.trained.actor, learners.replay))) > 0.5
 
 
 # --- side by side, piece by piece -----------------------------------------------------------------------------------
