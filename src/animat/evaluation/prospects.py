@@ -65,7 +65,7 @@ def prospects(
         responses: of the recording; the simulator is the default one, a histogram of 20 bins.
         robot: with its task.
         mappings: from responses to commands.
-        resolution: of the limit's grid (`best_returns`); the default moves the cartpole's limits by 0.6 at most.
+        resolution: of the limit's grid (`best_returns`); the default moves the cartpole's limits by 0.8 at most.
         episodes: of random stimuli, and of the limit's controller.
         seed: decides every random draw.
 
