@@ -1,4 +1,4 @@
-"""Training at the paper's length against what is possible on made-up responses of known distributions.
+"""Training at the paper's length against what is possible: on made-up responses, and on recordings of virtual cultures.
 
 Five conditions answer with gamma distributions of shape 6 and means 30, 36, 42, 48, 54 Hz, in 20 bins over 0-120 Hz.
 By dynamic programming (`animat.evaluation.optimum`) no controller of the cartpole has a mean return above 18.5 with one
@@ -14,13 +14,18 @@ import jax
 import numpy as np
 import pytest
 
+from animat.cli import main as animat
+from animat.evaluation.optimum import best_return
+from animat.evaluation.rollouts import Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.mapping import mapping_named
 from animat.neurons.conditions import Condition
 from animat.neurons.made_up import made_up_simulator
-from animat.neurons.timeline import SimulatorTimeline
+from animat.neurons.series import extract_series
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.protocol import Presentation
-from animat.robots import Cartpole
+from animat.recordings.reading import read_recordings
+from animat.robots import Cartpole, Navigation
 from animat.training.specification import Training
 from animat.training.trainer import train
 
@@ -53,3 +58,38 @@ def test_policies_come_close_to_what_is_possible(
     assert trained.mean() >= at_least
     assert trained.mean() <= at_most + 3 * error
     assert rows["random"].mean_returns[0] == pytest.approx(random, abs=2)
+
+
+CULTURES = (1, 2, 3)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[int, SimulatorTimeline]:
+    """Each virtual culture's simulator at 0 min."""
+    timelines = {}
+    for seed in CULTURES:
+        folder = tmp_path_factory.mktemp(f"culture{seed}")
+        assert animat(["record", "--seed", str(seed), "--sessions", "1", "--out", str(folder)]) == 0
+        timelines[seed] = fit_timeline(extract_series(read_recordings(folder)))
+    return timelines
+
+
+@pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
+@pytest.mark.parametrize("robot", [Cartpole(), Navigation()], ids=["cartpole", "navigation"])
+def test_policies_are_as_good_as_the_limit_allows(
+    robot: Cartpole | Navigation, mapping: str, recorded: dict[int, SimulatorTimeline], tmp_path: Path
+) -> None:
+    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (limit - random)."""
+    scores = []
+    for seed, timeline in recorded.items():
+        length = robot.paper_iterations
+        training = Training(robot, mapping_named(mapping), policies=4, iterations=length, shadowing=False)
+        policies = train(training, timeline, tmp_path / str(seed))
+        simulator = timeline.at(0.0)
+        environment = training.environment(simulator.n_conditions)
+        actors = networks_of(list(policies.values()), greedy=True)
+        trained = roll_out(environment, simulator, actors, 4, episodes=2_000, seed=5).returns.mean()
+        random = roll_out(environment, simulator, Uniform(), 1, episodes=20_000, seed=3).returns.mean()
+        limit = best_return(environment, simulator, episodes=0).value
+        scores.append((trained - random) / (limit - random))
+    assert np.mean(scores) >= 0.97, scores

@@ -229,6 +229,20 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     )
 
 
+@pytest.mark.parametrize(("rest_min", "warned"), [(20.0, False), (45.0, True)])
+def test_a_recording_much_older_than_the_culture_is_said_to_be(
+    tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
+) -> None:
+    with FakeCulture() as culture:
+        culture.rest(rest_min * 60)
+        calibration = Calibration.of_series(series)
+        gap = run_policies(
+            {"p0": policy_of(0, series)}, culture, calibration, tmp_path, episodes=1, with_controls=False
+        )
+    found = [finding for finding in gap.findings if finding.name == "old-calibration"]
+    assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
+
+
 def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     one, other = policy_of(0, series), policy_of(0, series, presentation=Presentation("mixed", 5))

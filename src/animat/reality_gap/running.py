@@ -42,6 +42,9 @@ from animat.training.policy import Policy
 PREDICTED_EPISODES = 200
 """Of each policy and control on the simulator."""
 
+OLD_MIN = 30.0
+"""Age of a recording from which on a warning says that the culture may be another by now."""
+
 
 def run_policies(
     policies: Mapping[str, Policy],
@@ -99,6 +102,13 @@ def run_policies(
             f"{first.presentation or 'unknown'}"
         )
         findings += (Finding("other-calibration", "warning", sentence),)
+    age_min = culture.now_s / 60 - calibration.start_min
+    if age_min > OLD_MIN:
+        sentence = (
+            f"percentiles and prediction are of {calibration.start_min:.0f} min, and the culture is at "
+            f"{culture.now_s / 60:.0f} min: cultures drift; take a later recording (--at-min), or train on later ones"
+        )
+        findings += (Finding("old-calibration", "warning", sentence, age_min),)
     account = account or Account()
 
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
