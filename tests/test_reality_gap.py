@@ -236,6 +236,7 @@ def test_a_recording_much_older_than_the_culture_is_said_to_be(
     with FakeCulture() as culture:
         culture.rest(rest_min * 60)
         calibration = Calibration.of_series(series)
+        age_min = culture.now_s / 60 - calibration.start_min
         gap = run_policies(
             {"p0": policy_of(0, series)}, culture, calibration, tmp_path, episodes=1, with_controls=False
         )
