@@ -25,7 +25,7 @@ class Detection:
         recovery_ms: how long after a stimulus its artefact is followed.
         chunk_s: traces read at a time; with 1,024 channels at 20 kHz 0.5 s take some 200 MB a core.
         engine: what filters and finds: `"spikeinterface"`, `"scipy"`, or `"auto"`, SpikeInterface where it is
-            installed. Everything else is the same for both; scipy takes a third of the time.
+            installed. Everything else is the same for both; scipy takes a third to a half of the time.
 
     Raises:
         InvalidArgument: naming the setting, what was expected and what came.
