@@ -47,7 +47,7 @@ class SAC:
         discount: gamma.
         follow: share of the critics that the target critics take over at each update (tau).
         reward_scale: rewards are multiplied by it inside the learner only.
-        averaging: the deployed actor is an average over about the last 1 / averaging of its training so far.
+        averaging: the deployed actor is an average over about the last 1 / (averaging + 1) of its training so far.
         first_alpha: weight of the entropy bonus at the start.
         entropy_share: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
         entropy_nats: the entropy that a continuous action keeps.
@@ -66,7 +66,7 @@ class SAC:
     discount: float = 0.99
     follow: float = 0.005
     reward_scale: float = 0.1
-    averaging: int = 8
+    averaging: int = 3
     first_alpha: float = 0.1
     entropy_share: float = 0.1
     entropy_nats: float = -1.0
