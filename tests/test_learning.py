@@ -52,7 +52,8 @@ def test_policies_come_close_to_what_is_possible(
 ) -> None:
     training = Training(Cartpole(), mapping_named(mapping), policies=10, iterations=800_000, shadowing=False)
     policies = train(training, made_up_timeline(), tmp_path)
-    rows = {row.name: row for row in evaluate(policies, made_up_timeline(), episodes=1_000).rows}
+    # Returns of episodes spread by 90: in 1,000 episodes of ten policies their mean is known to 0.9 only, here to 0.3.
+    rows = {row.name: row for row in evaluate(policies, made_up_timeline(), episodes=10_000).rows}
     trained = rows["policies"].mean_returns
     error = rows["policies"].episodes.returns.std() / np.sqrt(rows["policies"].episodes.returns.size)
     assert trained.mean() >= at_least
