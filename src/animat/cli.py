@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, subcommand
@@ -322,7 +322,7 @@ Command = (
     | Annotated[Recover, subcommand("recover")]
 )
 
-COMMANDS = ("record", "inspect", "convert", "train", "evaluate", "reproduce", "study", "run", "live", "recover")
+COMMANDS = tuple(command.__metadata__[0].name for command in get_args(Command))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
