@@ -421,6 +421,7 @@ class TestCommand:
         other.save(folder / "policies" / "q0.safetensors")
         assert main(["run", str(folder / "policies"), *given]) == 1
         assert "q0: expected the same conditions as p0" in capsys.readouterr().err
+        assert not (folder / "new").exists()
 
     def test_other_mistakes_are_one_line_too(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--state", "nowhere.state") == 1

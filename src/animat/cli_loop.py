@@ -123,13 +123,14 @@ class Run(Stimulating):
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
         Loop.of_policy(first, np.zeros(N_PERCENTILES), **settings)
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
-        expect_no_session(self.out)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
         calibration = None
         if recordings:
             calibration = self._calibration(recordings, first, self.at_min)
             check_conditions(first, calibration)
+        # Last, as it makes the folder.
+        expect_no_session(self.out)
         with (
             polite_kill_as_ctrl_c(),
             Bar("closed loop") as progress,
