@@ -1,20 +1,18 @@
 """The virtual tissue's equations written down in Brian2: what the kernel is held against, and timed beside.
 
-Only the network (who connects to whom, weights, delays), the list of kicks, and where it is asked for the coefficients
-of the fitted NMDA block come from animat; every equation is Brian2's own, in double precision, and with each arriving
-spike applied by itself.
+Only the network (who connects to whom, weights, delays) and the list of kicks come from animat; every equation is
+Brian2's own, in double precision, and with each arriving spike applied by itself.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from animat.cultures.tissue.coupling import Kicks
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import TissueParameters
-from animat.cultures.tissue.preparation import BLOCK_HALF_MV, BLOCK_MIDDLE_MV, block_polynomial
 
 EQUATIONS = """
 dv/dt = (E_L - v + drive - (gA + gN * B) * v + gG * (E_G - v) + gK * (E_K - v)) / tau_m : 1 (unless refractory)
@@ -25,6 +23,7 @@ dgK/dt = -gK / tau_K : 1
 dtheta/dt = -theta / tau_theta : 1
 relE : 1
 relI : 1
+B = 1 / (1 + exp(-0.062 * v) / 3.57) : 1 (constant over dt)
 drive : 1
 drive_mean : 1 (constant)
 needed : 1 (constant)
@@ -39,8 +38,6 @@ tau_recI : second (constant)
 tau_facE : second (constant)
 tau_facI : second (constant)
 """
-
-EXACT_BLOCK = "B = 1 / (1 + exp(-0.062 * v) / 3.57) : 1 (constant over dt)\n"
 
 EVERY_STEP = """
 dxE/dt = (1 - xE) / tau_recE : 1
@@ -95,7 +92,6 @@ class Brian2Tissue:
         noise: whether the drive is an Ornstein-Uhlenbeck process.
         target: Brian2's code generation, "numpy" or "cython".
         at_spikes: whether plasticity recovers at spikes (fast) or at every step (another way of saying it).
-        block: "exact", B(V) as Jahr & Stevens have it, or "fitted", the polynomial that the kernel has in its place.
     """
 
     def __init__(
@@ -109,7 +105,6 @@ class Brian2Tissue:
         noise: bool = False,
         target: str = "numpy",
         at_spikes: bool = False,
-        block: Literal["exact", "fitted"] = "exact",
     ) -> None:
         import brian2 as b2
 
@@ -142,9 +137,7 @@ class Brian2Tissue:
         clock = b2.Clock(p.step_ms * ms)
         group: Any = b2.NeuronGroup(
             len(network),
-            EQUATIONS
-            + (EXACT_BLOCK if block == "exact" else fitted_block())
-            + (AT_SPIKES if at_spikes else EVERY_STEP),
+            EQUATIONS + (AT_SPIKES if at_spikes else EVERY_STEP),
             threshold="v > v_threshold + theta",
             reset=(RECOVER if at_spikes else "") + RESET,
             refractory="refractory_time",
@@ -212,10 +205,3 @@ class Brian2Tissue:
         """Run on, and return the step and the neuron of every spike so far."""
         self._network.run(duration_ms * self._ms)
         return np.rint(np.asarray(self._monitor.t / self._ms) / self.step_ms).astype(int), np.asarray(self._monitor.i)
-
-
-def fitted_block() -> str:
-    """B(V) as the kernel has it, a polynomial in V, from its coefficients; what it is true to, `test_tissue` tests."""
-    powers = [f"({float(coefficient)!r}) * y**{power}" for power, coefficient in enumerate(block_polynomial())]
-    y = f"clip((v - ({BLOCK_MIDDLE_MV})) / {BLOCK_HALF_MV}, -1, 1)"
-    return f"y = {y} : 1 (constant over dt)\nB = {' + '.join(powers)} : 1 (constant over dt)\n"

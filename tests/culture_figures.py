@@ -141,7 +141,8 @@ class Figures:
     burst_ms: float
     medians_hz: list[float]
     ratio: float
-    right_at_every_edge: bool
+    right_short: float
+    """How far the distribution at 80 Hz falls short of lying right of that at 5 Hz, at the worst bin edge; 0 if not."""
     separability: float
     smallest_share: float
     one_pattern_ratio: float
@@ -207,7 +208,7 @@ def measure(seed: int, parameters: TissueParameters | None = None) -> Figures:
         burst_ms=float(1000 * proper.mean()) if len(proper) else float("nan"),
         medians_hz=medians_hz,
         ratio=medians_hz[-1] / medians_hz[0],
-        right_at_every_edge=bool(all(np.mean(quiet[80] > edge) >= np.mean(quiet[5] > edge) for edge in edges_hz)),
+        right_short=max(0.0, *(float(np.mean(quiet[5] > edge) - np.mean(quiet[80] > edge)) for edge in edges_hz)),
         separability=separability,
         smallest_share=min(len(quiet[f]) / len(first[f][0]) for f in FREQUENCIES_HZ),
         one_pattern_ratio=float(one_hz[80] / one_hz[5]),
@@ -229,7 +230,7 @@ def missed(figures: Figures) -> list[str]:
         "spontaneous rate 0.3-4 Hz": 0.3 <= f.channel_rate_hz <= 4,
         "2-15 network bursts a minute of 100-800 ms": 2 <= f.bursts_per_min <= 15,
         "80/5 ratio 1.6-3": 1.6 <= f.ratio <= 3,
-        "80 Hz right of 5 Hz at every bin edge": f.right_at_every_edge,
+        "80 Hz right of 5 Hz at every bin edge": f.right_short == 0,
         "separability above 0.6": f.separability > 0.6,
         "non-burst share 0.9 or more at every frequency": f.smallest_share >= 0.9,
         "one pattern repeated: ratio under 0.8": f.one_pattern_ratio < 0.8,
@@ -257,7 +258,8 @@ def main(seeds: list[int]) -> None:
     line("their mean duration, ms", "100-800", [f"{f.burst_ms:.0f}" for f in rows])
     line("medians at 5, 10, 20, 40, 80 Hz", "seed means rise", [hz(f.medians_hz) for f in rows])
     line("80/5 ratio", "1.6-3", [f"{f.ratio:.2f}" for f in rows])
-    line("80 Hz right of 5 Hz at every edge", "yes", ["yes" if f.right_at_every_edge else "no" for f in rows])
+    right = [f"no, by {f.right_short:.2f}" if f.right_short else "yes" for f in rows]
+    line("80 Hz right of 5 Hz at every edge", "yes", right)
     line("between-class over total variance", "> 0.6", [f"{f.separability:.2f}" for f in rows])
     line("smallest non-burst share", "0.9 or more", [f"{f.smallest_share:.2f}" for f in rows])
     line("one pattern repeated: 80/5", "< 0.8", [f"{f.one_pattern_ratio:.2f}" for f in rows])

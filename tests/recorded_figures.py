@@ -60,8 +60,7 @@ class Recorded:
             "80/5 ratio 1.6-3": 1.6 <= self.ratio <= 3,
             "separability above 0.6": self.separability > 0.6,
             "non-burst share 0.9 or more": self.smallest_share >= 0.9,
-            # To one response: a burst that begins late in a window can pass for the largest response of all.
-            "80 Hz right of 5 Hz at every edge": self.right_short <= 0.011,
+            "80 Hz right of 5 Hz at every edge": self.right_short == 0,
             "one pattern repeated under 0.8": self.one_pattern_ratio < 0.8,
             "NMDA off under 1.1": self.without_nmda_ratio < 1.1,
             "P(x > 18 Hz) left at most 0.4": self.large_left <= 0.4,

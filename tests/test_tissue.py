@@ -202,7 +202,7 @@ def test_silence_does_not_end_in_subnormal_numbers() -> None:
 def test_the_nmda_block_is_the_published_one() -> None:
     v_mv = np.linspace(-85, -35, 500)
     polynomial = np.polynomial.Polynomial(np.array(block_polynomial(), dtype=float))
-    np.testing.assert_allclose(polynomial((v_mv + 60) / 25), nmda_block(v_mv), atol=3e-6)
+    np.testing.assert_allclose(polynomial((v_mv + 60) / 25), nmda_block(v_mv), atol=1e-7)
     assert nmda_block(np.array([0.0]))[0] == pytest.approx(3.57 / 4.57)
 
 

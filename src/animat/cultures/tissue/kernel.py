@@ -27,7 +27,7 @@ SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 class Constants(NamedTuple):
     """Numbers that hold for all neurons; factors are per time step, conductances in units of the leak."""
 
-    block: Float32[np.ndarray, " coefficients"]  # B(V) = b0 + b1 y + ... + b7 y^7
+    block: Float32[np.ndarray, " coefficients"]  # B(V) = b0 + b1 y + ... + b9 y^9
     block_middle_mv: np.float32  # y = (V - middle) / half, between -1 and 1
     block_per_mv: np.float32  # 1 / half
     leak_mv: np.float32
@@ -134,13 +134,15 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
     v_mv, drive_mv, ampa, nmda, gaba = state.v_mv, state.drive_mv, state.ampa, state.nmda, state.gaba
     potassium, refractory = state.potassium, state.refractory
     block = constants.block
-    b0, b1, b2, b3, b4, b5, b6, b7 = block[0], block[1], block[2], block[3], block[4], block[5], block[6], block[7]
+    b0, b1, b2, b3, b4 = block[0], block[1], block[2], block[3], block[4]
+    b5, b6, b7, b8, b9 = block[5], block[6], block[7], block[8], block[9]
     middle_mv, per_mv = constants.block_middle_mv, constants.block_per_mv
     leak_mv, potassium_mv, gaba_mv = constants.leak_mv, constants.potassium_mv, constants.gaba_mv
     for i in range(v_mv.size):
         v = v_mv[i]
         y = min(max((v - middle_mv) * per_mv, -ONE), ONE)
-        unblocked = ((((((b7 * y + b6) * y + b5) * y + b4) * y + b3) * y + b2) * y + b1) * y + b0
+        unblocked = b4 + y * (b5 + y * (b6 + y * (b7 + y * (b8 + y * b9))))
+        unblocked = b0 + y * (b1 + y * (b2 + y * (b3 + y * unblocked)))
         total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
         current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
         z = total * step_over_membrane[i]

@@ -9,8 +9,8 @@ from animat.cultures.tissue import kernel
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
 
-BLOCK_MIDDLE_MV, BLOCK_HALF_MV, BLOCK_DEGREE = -60.0, 25.0, 7
-"""Where a polynomial stands for the NMDA block, to 1e-6; outside, its value at the nearer end holds."""
+BLOCK_MIDDLE_MV, BLOCK_HALF_MV, BLOCK_DEGREE = -60.0, 25.0, 9
+"""Where a polynomial stands for the NMDA block, to 1e-7; outside, its value at the nearer end holds."""
 
 
 def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
