@@ -27,8 +27,10 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.mapping import Thresholds
+from animat.neurons.conditions import Condition
+from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.responses import Responses, extract_responses
-from animat.neurons.simulator import silenced
+from animat.neurons.simulator import NeuronSimulator, fit_empirical, silenced
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, run_policies
 from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Presentation, Protocol
@@ -177,18 +179,65 @@ def test_a_policy_may_have_the_name_of_a_control_that_is_not_run(tmp_path: Path,
     assert gap.rows[0].pulses_per_action == 2
 
 
+def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
+    """n made-up responses to each of five conditions; of culture and recording alike."""
+    return Responses(
+        condition=np.repeat(np.arange(5), n),
+        rate_hz=np.concatenate([rng.gamma(6, mean_hz / 6, n) for mean_hz in MEANS_HZ]),
+        active_ratio=np.full(5 * n, 0.3),
+        is_burst=np.zeros(5 * n, bool),
+        conditions=tuple(Condition(label, float(i)) for i, label in enumerate(LABELS)),
+        window_ms=(2.0, 10.0),
+        n_channels=100,
+        threshold=0.9,
+        separability=0.7,
+    )
+
+
 @pytest.mark.oracle
-def test_an_interval_of_the_gap_covers_it_as_often_as_it_says(series: list[Responses], tmp_path: Path) -> None:
+def test_intervals_of_prediction_and_gap_cover_the_truth_as_often_as_they_say(
+    series: list[Responses], tmp_path: Path
+) -> None:
+    """A culture that does answer as its recording's distribution says, and 100 responses of it in each recording."""
     gap, _ = run(tmp_path, series, with_controls=False)
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
     rng = np.random.default_rng(5)
-    covered = 0
-    for _ in range(200):
-        row = replace(gap.rows[0], predicted=rng.normal(10, 3, 200), lived=rng.normal(7, 5, 30))
-        interval = row.gap
-        covered += interval.low <= -3 <= interval.high
-    # 95 % of 200 is 190, standard deviation 3.1; a bootstrap of 30 is a little too narrow.
-    assert 178 <= covered <= 199
+    environment = Animat(Cartpole(), Thresholds(1), 5)
+    culture = fit_empirical(drawn_responses(rng, 50_000))
+    rule = hand_made(environment, culture)
+
+    def returns(simulator: NeuronSimulator, episodes: int, seed: int) -> np.ndarray:
+        return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()
+
+    truth = returns(culture, 50_000, 1).mean()
+    recordings, predicted, lived = 100, 0, 0
+    for seed in range(recordings):
+        calibration = Calibration.of_series([drawn_responses(rng, 100)])
+        row = replace(
+            gap.rows[0],
+            predicted=returns(calibration.simulator, PREDICTED_EPISODES, seed),
+            predicted_anew=np.array([returns(s, PREDICTED_EPISODES, seed).mean() for s in calibration.redrawn]),
+            lived=returns(culture, 40, 1000 + seed),
+        )
+        predicted += row.prediction.low <= truth <= row.prediction.high
+        lived += row.gap.low <= 0 <= row.gap.high
+    # 95 of 100, standard deviation 2.2.
+    assert 88 <= predicted <= 100
+    assert 88 <= lived <= 100
+
+
+def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
+    rng, widths = np.random.default_rng(3), []
+    environment = Animat(Cartpole(), Thresholds(1), 5)
+    rule = hand_made(environment, fit_empirical(drawn_responses(rng, 5_000)))
+    for n in (50, 800):
+        calibration = Calibration.of_series([drawn_responses(rng, n)])
+        means = [roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.redrawn]
+        widths.append(np.std(means))
+        percentiles = [np.asarray(s.percentiles) for s in calibration.redrawn]
+        assert np.ptp(percentiles, axis=0).min() > 0
+    # As the square root of sixteen times as many.
+    assert 2.5 < widths[0] / widths[1] < 6
 
 
 def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:

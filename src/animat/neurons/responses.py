@@ -95,6 +95,20 @@ class Responses:
         """x of the non-burst responses of one condition, in Hz."""
         return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
 
+    def redrawn(self, rng: np.random.Generator) -> Responses:
+        """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample."""
+        rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
+        drawn = np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)])
+        return replace(
+            self,
+            condition=self.condition[drawn],
+            rate_hz=self.rate_hz[drawn],
+            active_ratio=self.active_ratio[drawn],
+            is_burst=self.is_burst[drawn],
+            findings=(),
+            time_s=None if self.time_s is None else self.time_s[drawn],
+        )
+
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
         """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""
         median_hz = self.median_rate_hz

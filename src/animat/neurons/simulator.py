@@ -168,6 +168,24 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
     )
 
 
+def fit_simulator(
+    responses: Responses,
+    *,
+    kind: Kind = "histogram",
+    bins: int = 20,
+    range_hz: float | None = None,
+    room: int | None = None,
+) -> NeuronSimulator:
+    """Fit a simulator of either kind: `bins` and `range_hz` are of a histogram, `room` of an empirical one.
+
+    Raises:
+        InvalidArgument, UnusableData: as `fit_histogram` and `fit_empirical` do.
+    """
+    if kind == "histogram":
+        return fit_histogram(responses, bins=bins, range_hz=range_hz)
+    return fit_empirical(responses, room=room)
+
+
 def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
     """A culture that always answers 0, beside the percentiles of the one that did not: the silent control."""
     conditions = simulator.n_conditions

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import Kind, NeuronSimulator, fit_empirical, fit_histogram
+from animat.neurons.simulator import Kind, NeuronSimulator, fit_simulator
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 
@@ -79,6 +80,8 @@ def fit_timeline(
     """
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
+    if kind not in get_args(Kind):
+        raise InvalidArgument(f"kind: expected 'histogram' or 'empirical', got {kind!r}")
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
     for other in ordered[1:]:
@@ -93,14 +96,8 @@ def fit_timeline(
         twice = start_min[:-1][np.diff(start_min) == 0][0]
         raise Mismatch(f"start_min: expected one recording a minute mark, got two at {twice:g} min")
 
-    if kind == "histogram":
-        fitted: list[NeuronSimulator] = [fit_histogram(r, bins=bins, range_hz=range_hz) for r in ordered]
-    elif kind == "empirical":
-        room = max(int(np.bincount(r.condition[~r.is_burst]).max()) for r in ordered)
-        fitted = [fit_empirical(r, room=room) for r in ordered]
-    else:
-        raise InvalidArgument(f"kind: expected 'histogram' or 'empirical', got {kind!r}")
-
+    room = max(int(np.bincount(r.condition[~r.is_burst], minlength=1).max()) for r in ordered)
+    fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(
         replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,11 +12,14 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument
 from animat.neurons.conditions import Condition
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import Kind, NeuronSimulator
+from animat.neurons.simulator import Kind, NeuronSimulator, fit_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 from animat.training.policy import Policy
+
+REDRAWN = 100
+"""Bootstrap samples of the recording's responses: enough for the 95 % interval of a prediction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,7 @@ class Calibration:
 
     Attributes:
         simulator: of the recording.
+        redrawn: simulators of bootstrap samples of its responses: what so many could as well have been.
         responses_hz: non-burst responses of each condition, in the order of time.
         burst_threshold: ratio of active channels above which its responses were bursts.
         start_min: of the recording on the culture's clock.
@@ -33,6 +37,7 @@ class Calibration:
     """
 
     simulator: NeuronSimulator
+    redrawn: tuple[NeuronSimulator, ...]
     responses_hz: tuple[Float64[np.ndarray, " responses"], ...]
     burst_threshold: float
     start_min: float
@@ -68,9 +73,12 @@ class Calibration:
         Raises:
             InvalidArgument, Mismatch, UnusableData: as `fit_timeline` does.
         """
-        timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
+
+        fit: dict[str, Any] = {"kind": kind, "bins": bins, "range_hz": range_hz}
+        timeline = fit_timeline(series, **fit)
         trained = {} if policy is None else policy.provenance.get("training", {})
-        if trained.get("percentiles") == "first":
+        holds_percentiles = trained.get("percentiles") == "first"
+        if holds_percentiles:
             timeline = timeline.with_first_percentiles()
         if at_min is None:
             at_min = float(timeline.start_min[-1] if policy is None else timeline.start_min[0])
@@ -81,8 +89,13 @@ class Calibration:
         row = timeline.row_at(at_min)
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)
+        simulator, rng = timeline.at(start_min), np.random.default_rng(0)
+        redrawn = tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN))
+        if holds_percentiles:
+            redrawn = tuple(replace(each, percentiles=simulator.percentiles) for each in redrawn)  # type: ignore[type-var]
         return cls(
-            simulator=timeline.at(start_min),
+            simulator=simulator,
+            redrawn=redrawn,
             responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             start_min=start_min,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +31,7 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import Actor, Constant, Uniform, networks_of, roll_out
 from animat.evaluation.statistics import compare
-from animat.neurons.simulator import silenced
+from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.progress import Progress
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.table import RealityGap, Row
@@ -44,6 +44,18 @@ PREDICTED_EPISODES = 200
 
 OLD_MIN = 30.0
 """Age of a recording from which on a warning says that the culture may be another by now."""
+
+
+class Predicted(NamedTuple):
+    """What a simulator says of one contender.
+
+    Attributes:
+        returns: of its episodes on the simulator of the recording, shape (episodes,).
+        anew: its mean return on each simulator of the recording's responses drawn anew, shape (redrawn,).
+    """
+
+    returns: Float64[np.ndarray, " episodes"]
+    anew: Float64[np.ndarray, " redrawn"]
 
 
 def run_policies(
@@ -128,14 +140,19 @@ def run_policies(
     else:
         contenders.append(random_control(len(loop.conditions)))
 
-    def predict(contender: Contender) -> Float64[np.ndarray, " episodes"]:
-        """The same contender on the simulator."""
+    def predict(contender: Contender, simulator: NeuronSimulator) -> Float64[np.ndarray, " episodes"]:
+        """The same contender on a simulator."""
         actor, many = _actor(contender.controller, rule, greedy=greedy)
         in_ = replace(environment, delivery="shuffled") if contender.delivery == "shuffled" else environment
         on = silenced(simulator) if contender.delivery == "silent" else simulator
         return roll_out(in_, on, actor, many, episodes=PREDICTED_EPISODES, seed=seed).returns.ravel()
 
-    predicted = {contender.name: predict(contender) for contender in contenders}
+    predicted = {
+        contender.name: Predicted(
+            predict(contender, simulator), np.array([predict(contender, each).mean() for each in calibration.redrawn])
+        )
+        for contender in contenders
+    }
     session = run_session(
         culture, loop, contenders, folder, episodes=episodes, seed=seed, account=account, progress=progress
     )
@@ -196,7 +213,7 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
 
 
 def _rows(
-    contenders: Sequence[Contender], names: tuple[str, ...], predicted: Mapping[str, Any], session: Session
+    contenders: Sequence[Contender], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
 ) -> tuple[Row, ...]:
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         whole = [episode for episode in session.episodes if episode.contender in of and episode.is_whole]
@@ -205,7 +222,8 @@ def _rows(
         return Row(
             name=name,
             meaning=meaning,
-            predicted=np.concatenate([predicted[each] for each in of]),
+            predicted=np.concatenate([predicted[each].returns for each in of]),
+            predicted_anew=np.mean([predicted[each].anew for each in of], axis=0),
             lived=np.array([episode.total for episode in whole], np.float64),
             pulses_per_action=sum(len(tick.pulse_time_s) for tick in ticks) / actions,
             seconds_per_action=sum(session.log.header["loop"]["pulses"] / tick.frequency_hz for tick in ticks)

@@ -26,6 +26,7 @@ class Row:
     Attributes:
         name, meaning: who acted.
         predicted: returns on the simulator, shape (episodes,).
+        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (redrawn,).
         lived: returns of whole episodes on the culture, shape (episodes,).
         pulses_per_action: that the culture was given.
         seconds_per_action: of the culture's time.
@@ -38,6 +39,7 @@ class Row:
     name: str
     meaning: str
     predicted: Float64[np.ndarray, " predicted"]
+    predicted_anew: Float64[np.ndarray, " redrawn"]
     lived: Float64[np.ndarray, " lived"]
     pulses_per_action: float
     seconds_per_action: float
@@ -47,12 +49,19 @@ class Row:
     wins: float | None = None
 
     @property
+    def prediction(self) -> Interval:
+        """Mean predicted return, and between which it lies as the recording's responses are drawn anew."""
+        return _between(self.predicted.mean(), self.predicted_anew)
+
+    @property
     def gap(self) -> Interval:
-        """Mean lived less mean predicted return, with its bootstrap interval: both are drawn anew."""
+        """Mean lived less mean predicted return; the interval is of the recording's responses and the lived episodes.
+
+        Both are drawn anew. The simulator's own episodes are so many that their number hardly matters.
+        """
         rng = np.random.default_rng(0)
-        means = [_resampled_means(returns, rng) for returns in (self.predicted, self.lived)]
-        low, high = np.quantile(means[1] - means[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-        return Interval(float(self.lived.mean() - self.predicted.mean()), float(low), float(high), CONFIDENCE)
+        lived = _resampled_means(self.lived, rng)
+        return _between(self.lived.mean() - self.predicted.mean(), lived - rng.choice(self.predicted_anew, len(lived)))
 
     def to_dict(self) -> dict[str, Any]:
         """The line as plain data."""
@@ -61,6 +70,7 @@ class Row:
             "name": self.name,
             "meaning": self.meaning,
             "predicted": float(self.predicted.mean()),
+            "prediction": self.prediction.to_dict(),
             "lived": float(self.lived.mean()) if lived else None,
             "gap": self.gap.to_dict() if lived else None,
             "episodes": len(self.lived),
@@ -149,11 +159,12 @@ class RealityGap:
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
             f"{self.calibrated_at_min:g} min",
-            f"  {'':16} {'predicted':>9} {'lived':>8} {'gap':>7}  {'95 % interval':>16} {'episodes':>8} "
-            f"{'pulses/action':>13} {'p':>8}",
+            f"  {'':16} {'predicted':>9}  {'95 % interval':>16} {'lived':>8} {'gap':>7}  {'95 % interval':>16} "
+            f"{'episodes':>8} {'pulses/action':>13} {'p':>8}",
         ]
         for row in self.rows:
-            told = row.to_dict()
+            told, prediction = row.to_dict(), row.prediction
+            anew = f"{prediction.low:.1f} to {prediction.high:.1f}"
             lived = "         -        -                  "
             if told["gap"] is not None:
                 gap = told["gap"]
@@ -161,8 +172,8 @@ class RealityGap:
                 lived = f"{told['lived']:8.1f} {gap['value']:+7.1f}  {between:>16}"
             p = "" if row.p is None else f"{row.p:.2g}"
             lines.append(
-                f"  {row.name:16} {told['predicted']:9.1f} {lived} {len(row.lived):8} {row.pulses_per_action:13.1f} "
-                f"{p:>8}  {row.meaning}"
+                f"  {row.name:16} {told['predicted']:9.1f}  {anew:>16} {lived} {len(row.lived):8} "
+                f"{row.pulses_per_action:13.1f} {p:>8}  {row.meaning}"
             )
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
@@ -176,6 +187,12 @@ class RealityGap:
         if self.session.left_out:
             lines.append(f"  left out: {told_left_out(self.session)}")
         return "\n".join(lines)
+
+
+def _between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
+    """A value with the interval that holds 95 % of what was drawn anew."""
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Interval(float(value), float(low), float(high), CONFIDENCE)
 
 
 def _can_tell(policies: int, control: int) -> bool:
