@@ -207,17 +207,19 @@ def main() -> None:
     print(f"from the window's end to the next stimulus, {CHANNELS} channels, {options.ticks:,} ticks (us)")
     print(f"  {'':24} {'median':>8} {'p99':>8} {'p99.9':>8} {'largest':>9}")
     for name, us in (("closed loop", decided), ("idle, the same median", idle)):
-        print(f"  {name:24} {us['median']:8.1f} {us['p99']:8.1f} {us['p99.9']:8.1f} {us['largest']:9.1f}")
+        print(f"  {name:24} {us['median']:8.1f} {us['p99']:8.1f} {us['p99.9']:8.1f} {us['largest']:9.1f}", flush=True)
     measured: dict[str, Any] = {"decision_us": decided, "idle_us": idle, "ticks": options.ticks}
 
     if options.minutes > 0:
         pieces = max(1, round(options.minutes))
         seconds = 60 * options.minutes / pieces
         late, idle_late = [], []
-        for _ in range(pieces):
+        print(f"deadlines at 80 Hz, {options.minutes:g} min in real time and as much of the idle loop between")
+        for piece in range(pieces):
             late.append(late_ms(seconds))
             idle_late.append(idle_late_ms(seconds))
-        print(f"deadlines at 80 Hz, {options.minutes:g} min in real time and as much of the idle loop between")
+            missed, idle_missed = np.sum(late[-1] > 0), np.sum(idle_late[-1] > 0)
+            print(f"  {piece + 1} of {pieces}: the loop missed {missed}, the idle loop {idle_missed}", flush=True)
         for name, each in (("closed loop", np.concatenate(late)), ("idle loop", np.concatenate(idle_late))):
             measured[f"deadlines, {name}"] = {"missed": int(np.sum(each > 0)), "of": len(each), "latest_ms": each.max()}
             print(f"  {name:24} {np.sum(each > 0):6} missed of {len(each):,}; the latest by {each.max():.2f} ms")

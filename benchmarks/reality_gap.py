@@ -56,7 +56,7 @@ def main() -> None:
                     rows = json.loads(table.read_text())["rows"]
                     lines.append((seed, robot, f"{order}, {pulses}", thresholds, rows))
                     print(told(*lines[-1]), flush=True)
-    print("\n| culture | robot | presentation | percentiles | predicted | lived | gap, 95 % | random | pulses/action |")
+    print("\n| culture | robot | presentation | percentiles | predicted, 95 % | lived | gap, 95 % | random | pulses/action |")
     print("|---|---|---|---|---|---|---|---|---|")
     for line in lines:
         print(told(*line))
@@ -65,10 +65,11 @@ def main() -> None:
 def told(seed: int, robot: str, presentation: str, thresholds: str, rows: list[dict[str, Any]]) -> str:
     """A line of the table."""
     policies, random = rows[0], next(row for row in rows if row["name"] == "random")
-    gap = policies["gap"]
+    prediction, gap = policies["prediction"], policies["gap"]
+    predicted = f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})"
     between = f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})"
     return (
-        f"| {seed} | {robot} | {presentation} | {thresholds} | {policies['predicted']:.1f} | {policies['lived']:.1f} | "
+        f"| {seed} | {robot} | {presentation} | {thresholds} | {predicted} | {policies['lived']:.1f} | "
         f"{between} | {random['lived']:.1f} | {policies['pulses_per_action']:.0f} |"
     )
 

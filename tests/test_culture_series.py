@@ -18,6 +18,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.selection import Selection
+from animat.writing import alone_in
 from cultures import small_culture
 
 SHORT = Protocol((20.0, 80.0), patterns=5, presentations=10, setup_s=0.5, pause_s=0.2)
@@ -131,6 +132,13 @@ def test_a_complete_series_gets_its_selection_back_and_needs_no_state(undisturbe
     record(folder)
     assert (folder / "selection.json").read_bytes() == selection
     assert not (folder / STATE_FILE).exists()
+
+
+def test_a_second_run_in_a_folder_at_work_is_refused(undisturbed: list[Path]) -> None:
+    folder = undisturbed[0].parent
+    with alone_in(folder), pytest.raises(Mismatch, match="another run is at work in this folder"):
+        record(folder)
+    record(folder)
 
 
 def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path], tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.selection import Selection
 from animat.recordings.stimulus import BALANCED_PULSE
+from animat.writing import alone_in
 from fake_culture import FakeCulture
 
 SHORT = Protocol((20.0, 80.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
@@ -77,6 +78,13 @@ def test_a_culture_that_fails_leaves_what_was_recorded_before(tmp_path: Path) ->
         assert [file.name for file in tmp_path.iterdir()] == ["recording_0000_min.nwb"]
         series = record_living_series(culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
         assert len(series.files) == 3
+
+
+def test_a_second_run_in_a_folder_at_work_is_refused_before_any_stimulus(tmp_path: Path) -> None:
+    with replay() as culture, alone_in(tmp_path):
+        with pytest.raises(Mismatch, match="another run is at work in this folder"):
+            record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+        assert culture.delivered == 0
 
 
 def test_nothing_is_mixed_or_written_over(tmp_path: Path) -> None:

@@ -437,6 +437,15 @@ class TestCommand:
         assert Recording.load(out / "calibration.nwb").presentation == Presentation("mixed", 2)
         assert "other-presentation" not in printed.err
 
+    def test_a_bad_simulator_is_found_before_the_culture_is_recorded_for_it(
+        self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], never_opened: None
+    ) -> None:
+        policy, out = str(folder / "policies" / "p0.safetensors"), tmp_path / "session"
+        for option, value in (("--bins", "0"), ("--range-hz", "-5")):
+            assert main(["run", policy, option, value, "--out", str(out)]) == 1
+            assert f"{option.strip('-').replace('-', '_')}: expected" in capsys.readouterr().err.splitlines()[-1]
+        assert not out.exists()
+
     @pytest.mark.parametrize(
         ("more", "words"),
         [

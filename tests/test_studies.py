@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import hashlib
 import json
 import os
@@ -54,6 +53,7 @@ from animat.studies.specification import Body, Compared, Simulators, Source, Stu
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.policy import Policy
+from animat.writing import alone_in
 from cultures import small_culture
 
 TINY = Path(__file__).parent / "tiny_study.toml"
@@ -188,10 +188,8 @@ def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused(finished: Path) -> None:
-    with (finished / ".lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(Mismatch, match="another run is at work in this folder"):
-            run_study(read_study(TINY), finished, base=TINY.parent)
+    with alone_in(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
+        run_study(read_study(TINY), finished, base=TINY.parent)
     assert run_study(read_study(TINY), finished, base=TINY.parent).done_now == {}
 
 

@@ -23,6 +23,7 @@ from animat.training.policy import Policy
 from animat.training.sac import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.training.trainer import describe, train
+from animat.writing import alone_in
 from test_simulator import responses_of
 
 SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
@@ -172,6 +173,12 @@ def test_a_folder_of_another_training_is_refused_and_left_alone(tmp_path: Path) 
     (tmp_path / "training.json").unlink()
     with pytest.raises(Mismatch, match=r"without a training\.json"):
         train(short, timeline_of(), tmp_path)
+
+
+def test_a_second_training_in_a_folder_at_work_is_refused(tmp_path: Path) -> None:
+    with alone_in(tmp_path), pytest.raises(Mismatch, match="another run is at work in this folder"):
+        train(SHORT, timeline_of(), tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: Path) -> None:

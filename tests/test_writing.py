@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from animat.errors import InvalidFile
-from animat.writing import is_unfinished, written_whole
+from animat.errors import InvalidFile, Mismatch
+from animat.writing import alone_in, is_unfinished, written_whole
 
 
 def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_path: Path) -> None:
@@ -61,3 +64,35 @@ def test_both_the_content_and_the_name_are_on_disk_before_it_returns(
     assert [is_renamed for _, is_renamed in synced] == [False, True]
     assert synced[0][0] == beside
     assert synced[1][0] == tmp_path
+
+
+HOLD = """
+import sys
+from animat.writing import alone_in
+with alone_in(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_folder_is_for_one_run_at_a_time_until_that_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(Mismatch, match="b: another run is at work in this folder"), alone_in(folder):
+            pass
+        other.send_signal(signal.SIGKILL)
+    with alone_in(folder):
+        assert not any(folder.iterdir())
+    with alone_in(folder):
+        pass
+
+
+def test_a_folder_that_is_a_file_or_below_one_cannot_be_held(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("")
+    for path in (tmp_path / "a", tmp_path / "a" / "b"):
+        with pytest.raises(InvalidFile, match="cannot be made"), alone_in(path):
+            pass

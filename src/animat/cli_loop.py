@@ -108,6 +108,7 @@ class Run(Stimulating):
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.mapping import N_PERCENTILES
+        from animat.neurons.simulator import check_binning
         from animat.progress import Bar
         from animat.reality_gap import check_conditions, check_policies, run_policies
         from animat.recordings.reading import read_recordings
@@ -118,6 +119,7 @@ class Run(Stimulating):
             raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        check_binning(self.bins, self.range_hz)
         policies = load_policies(self.policies)
         first = check_policies(policies)
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}

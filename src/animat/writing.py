@@ -1,7 +1,8 @@
-"""Files that are either complete or absent: written beside their place, then renamed into it."""
+"""Files that are complete or absent, written beside their place and renamed into it; folders for one run at a time."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import tempfile
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, Mismatch
 
 _UNFINISHED = re.compile(r"\..+\.[a-z0-9_]{8}\.partial(\.[^.]*)?")
 
@@ -47,6 +48,34 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep other runs out of a folder, made where it is missing, until the block ends or the process does.
+
+    Raises:
+        Mismatch: if another run is at work in it.
+        InvalidFile: if it cannot be made.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise InvalidFile(f"{folder}: cannot be made or read: {error.strerror or error}") from error
+    try:
+        # The folder itself is locked: nothing is left in it, and one that cannot be written to can be held as well.
+        # File systems that cannot lock folders (NFS) leave it to the user.
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise Mismatch(f"{folder}: another run is at work in this folder; wait for it, or stop it") from error
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def is_unfinished(path: Path) -> bool:

@@ -13,6 +13,7 @@ from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.writing import alone_in
 
 
 class LivingSeries(NamedTuple):
@@ -54,26 +55,27 @@ def record_living_series(
 
     Raises:
         InvalidArgument: for no sessions, or an interval shorter than a recording.
-        Mismatch: if recordings are there that another culture or protocol made, or that lie ahead of its clock.
+        Mismatch: if recordings are there that another culture or protocol made, or that lie ahead of its clock, or
+            another run is at work in the folder.
         InvalidFile: if a file cannot be written, or one that is there is damaged.
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
     check_interval(protocol, sessions, interval_min)
     folder, progress = Path(folder), progress or Silent()
-    folder.mkdir(parents=True, exist_ok=True)
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
     zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
     missed_min = []
-    for session, file in enumerate(files):
-        due_s = zero_s + 60 * session * interval_min
-        if not file.exists():
-            if culture.now_s >= due_s + 60 * interval_min:
-                missed_min.append(session * interval_min)
-                continue
-            culture.rest(max(0.0, due_s - culture.now_s))
-            part = PartOfSeries(progress, session, sessions, file.name)
-            culture.record(protocol, seed * 10_000 + session, part).save(file)
-        progress.update(session + 1, sessions, file.name)
+    with alone_in(folder):
+        for session, file in enumerate(files):
+            due_s = zero_s + 60 * session * interval_min
+            if not file.exists():
+                if culture.now_s >= due_s + 60 * interval_min:
+                    missed_min.append(session * interval_min)
+                    continue
+                culture.rest(max(0.0, due_s - culture.now_s))
+                part = PartOfSeries(progress, session, sessions, file.name)
+                culture.record(protocol, seed * 10_000 + session, part).save(file)
+            progress.update(session + 1, sessions, file.name)
     return LivingSeries([file for file in files if file.exists()], missed_min)
 
 

@@ -16,6 +16,7 @@ from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.recordings.schedule import make_schedule
+from animat.writing import alone_in
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
@@ -56,24 +57,39 @@ def record_virtual_series(
 
     Raises:
         InvalidArgument: for no sessions, or an interval shorter than a recording.
-        Mismatch: if a file of the series is there but from another culture, protocol or version.
+        Mismatch: if a file of the series is there but from another culture, protocol or version, or another run is at
+            work in the folder.
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
     """
     check_interval(protocol, sessions, interval_min)
     folder, progress = Path(folder), progress or Silent()
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
-    there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
     fresh = make_culture()
     for session, file in enumerate(files):
         if file.exists():
             _expect_of_series(file, fresh, protocol, session, 60 * session * interval_min)
-    _remove_leftovers(folder)
+    with alone_in(folder):
+        _remove_leftovers(folder)
+        _record(make_culture, protocol, files, interval_min, progress)
+    return files
+
+
+def _record(
+    make_culture: Callable[[], VirtualCulture],
+    protocol: Protocol,
+    files: list[Path],
+    interval_min: float,
+    progress: Progress,
+) -> None:
+    """Record what is missing of a series, from the state that it came to."""
+    folder, sessions = files[0].parent, len(files)
+    there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
     if there == sessions and not _is_behind(make_culture(), folder / STATE_FILE, sessions):
         if not (folder / SELECTION_FILE).exists():
-            with fresh:
+            with make_culture() as fresh:
                 fresh.selection.save(folder / SELECTION_FILE)
         progress.update(sessions, sessions, "all there already")
-        return files
+        return
     culture, recorded = _resume(make_culture, folder / STATE_FILE, there)
     with culture:
         if not recorded or not (folder / SELECTION_FILE).exists():
@@ -91,7 +107,6 @@ def record_virtual_series(
             # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
             culture.save_state(folder / STATE_FILE, sessions=session + 1)
             progress.update(session + 1, sessions, files[session].name)
-    return files
 
 
 def _seed(culture: VirtualCulture, session: int) -> int:

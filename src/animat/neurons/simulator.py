@@ -109,6 +109,18 @@ class EmpiricalSimulator(NeuronSimulator):
         return self.values_hz[condition, row]
 
 
+def check_binning(bins: int, range_hz: float | None) -> None:
+    """Raise unless a histogram can have such bins, before there is anything to fit it to.
+
+    Raises:
+        InvalidArgument: for fewer bins than one or more than `LARGEST_BINS`, or a range that is not positive.
+    """
+    if not 1 <= bins <= LARGEST_BINS:
+        raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS}, got {bins}; the empirical simulator has none")
+    if range_hz is not None and not 0 < range_hz < np.inf:
+        raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {range_hz:g}")
+
+
 def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
     """Fit a histogram per condition to the non-burst responses.
 
@@ -124,17 +136,14 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
             bin, and `fidelity` says how many they are.
 
     Raises:
-        InvalidArgument: for fewer bins than one or more than `LARGEST_BINS`, or a range that is not positive.
+        InvalidArgument: as `check_binning` does.
         UnusableData: if a condition has no non-burst response.
     """
-    if not 1 <= bins <= LARGEST_BINS:
-        raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS}, got {bins}; the empirical simulator has none")
+    check_binning(bins, range_hz)
     if range_hz is None:
         edges = np.percentile(_non_burst(responses), np.linspace(0.0, 100.0, bins + 1))
-    elif np.isfinite(range_hz) and range_hz > 0:
-        edges = np.linspace(0.0, range_hz, bins + 1)
     else:
-        raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {range_hz:g}")
+        edges = np.linspace(0.0, range_hz, bins + 1)
     # Counted in the precision that thresholds are compared in: a response that is a percentile lies above its edge.
     edges = edges.astype(np.float32)
     values = [np.minimum(x.astype(np.float32), edges[-1]) for x in _by_condition(responses)]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import importlib.metadata
 import json
-import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,11 +17,10 @@ from animat.studies.jobs import sha256
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
-from animat.writing import is_unfinished, written_whole
+from animat.writing import alone_in, is_unfinished, written_whole
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
-_LOCK = ".lock"
 _PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "matplotlib", "jinja2")
 _ABOUT_FILES = "# files: as seen from where the specification lay. To run it from here: files = ['recordings']\n"
 
@@ -93,8 +90,7 @@ def _place(file: Path, base: Path) -> str:
 def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]:
     """Make the folder this study's, or see that it is; keep other runs out; clear away what a killed one was writing.
 
-    Nothing in the folder is touched before it is known to be this study's. A finished folder that cannot be written
-    to is held without a lock, as nothing can change in it.
+    Nothing in the folder is touched before it is known to be this study's.
 
     Raises:
         Mismatch: if it is another study's, holds other files, or another run is at work in it.
@@ -102,21 +98,8 @@ def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]
     """
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the study, got a file")
-    ours = _is_ours(folder, manifest)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # It stays: were it removed, one run could lock the removed file and another one a new file of the same name.
-        lock = (folder / _LOCK).open("a")
-    except OSError as error:
-        if ours and not os.access(folder, os.W_OK):
-            yield
-            return
-        raise InvalidFile(f"{folder}: cannot be written: {error.strerror or error}") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise Mismatch(f"{folder}: another run is at work in this folder; wait for it, or stop it") from error
+    _is_ours(folder, manifest)
+    with alone_in(folder):
         if not _is_ours(folder, manifest):
             for path, words in (
                 (folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True) + "\n"),
@@ -139,7 +122,7 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     """
     path = folder / MANIFEST
     if not path.exists():
-        others = [e for e in folder.iterdir() if e.name != _LOCK and not is_unfinished(e)] if folder.is_dir() else []
+        others = [e for e in folder.iterdir() if not is_unfinished(e)] if folder.is_dir() else []
         if others:
             raise Mismatch(f"{folder}: expected an empty folder or one of this study, got one with other files in it")
         return False
@@ -152,7 +135,7 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
         return (folder / SPECIFICATION).exists()
     # A study that stopped at its first step left a specification and no more.
     begun = (path for path in folder.rglob("*") if not path.is_dir() and not is_unfinished(path))
-    if any(path.name not in (_LOCK, MANIFEST, SPECIFICATION) for path in begun):
+    if any(path.name not in (MANIFEST, SPECIFICATION) for path in begun):
         raise Mismatch(
             f"{folder}: expected a folder of this study, got one of another ({_first_difference(found, manifest)}"
             "); give another folder, or remove this one"

@@ -26,7 +26,7 @@ from animat.progress import Progress, Silent
 from animat.training.group import CHECKPOINT_S, Group, split_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
-from animat.writing import written_whole
+from animat.writing import alone_in, written_whole
 
 MANIFEST = "training.json"
 _UNFINISHED = ".unfinished"
@@ -61,7 +61,7 @@ def train(
 
     Raises:
         InvalidArgument: if neurons are missing for a mapping or given without one, or for fewer workers than one.
-        Mismatch: if the folder holds another training.
+        Mismatch: if the folder holds another training, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
     """
     if (timeline is None) != (training.mapping is None):
@@ -74,16 +74,20 @@ def train(
     progress = progress or Silent()
     folder = Path(folder)
     manifest = describe(training, timeline, sources)
-    _claim(folder, manifest)
-
-    groups = [
-        Group(training, members, _on_host(timeline), manifest["fingerprint"], _provenance(manifest, members))
-        for members in split_groups(training.policies)
-    ]
-    _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
-    shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
-    for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
-        leftover.unlink(missing_ok=True)
+    # Seen before it is touched: somebody else's folder stays as it is.
+    _is_ours(folder, manifest)
+    with alone_in(folder):
+        if not _is_ours(folder, manifest):
+            with written_whole(folder / MANIFEST) as beside:
+                beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+        groups = [
+            Group(training, members, _on_host(timeline), manifest["fingerprint"], _provenance(manifest, members))
+            for members in split_groups(training.policies)
+        ]
+        _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
+        shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
+        for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
+            leftover.unlink(missing_ok=True)
     return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
 
 
@@ -102,8 +106,13 @@ def describe(training: Training, timeline: SimulatorTimeline | None, sources: Se
     return manifest | {"sources": list(sources), "fingerprint": digest.hexdigest()}
 
 
-def _claim(folder: Path, manifest: dict[str, Any]) -> None:
-    """Make the folder this training's, or see that it is."""
+def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
+    """Whether the training is already in the folder; not if it is free for it.
+
+    Raises:
+        Mismatch: if it is another training's, or holds policies that no description tells of.
+        InvalidFile: if its description cannot be read, or it is a file.
+    """
     path = folder / MANIFEST
     if path.exists():
         try:
@@ -117,13 +126,12 @@ def _claim(folder: Path, manifest: dict[str, Any]) -> None:
                 f"{folder}: expected a folder of this training, got one of another ({difference}); "
                 "give another folder, or remove this one"
             )
-        return
+        return True
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
-    with written_whole(path) as beside:
-        beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+    return False
 
 
 def _first_difference(found: Any, wanted: Any, name: str = "") -> str:
