@@ -8,6 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -139,6 +141,40 @@ def test_a_second_run_in_a_folder_at_work_is_refused(undisturbed: list[Path]) ->
     with alone_in(folder), pytest.raises(Mismatch, match="another run is at work in this folder"):
         record(folder)
     record(folder)
+
+
+def test_what_another_run_left_at_the_last_moment_is_checked_too(
+    undisturbed: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "series"
+
+    @contextmanager
+    def ended_in_between(path: Path) -> Iterator[None]:
+        copied(undisturbed, path)
+        with alone_in(path):
+            yield
+
+    monkeypatch.setattr("animat.cultures.series.alone_in", ended_in_between)
+    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture and protocol \(seed 2\)"):
+        record(folder, seed=2)
+
+
+def test_a_leftover_that_cannot_be_removed_stays(
+    undisturbed: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = copied(undisturbed, tmp_path / "series")
+    leftover = folder / ".culture.state.abcd1234.partial.state"
+    leftover.write_text("half")
+
+    def refused(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refused)
+        record(folder)
+    assert leftover.exists()
+    record(folder)
+    assert not leftover.exists()
 
 
 def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path], tmp_path: Path) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +85,25 @@ def test_a_second_run_in_a_folder_at_work_is_refused_before_any_stimulus(tmp_pat
     with replay() as culture, alone_in(tmp_path):
         with pytest.raises(Mismatch, match="another run is at work in this folder"):
             record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+        assert culture.delivered == 0
+
+
+def test_what_another_run_left_at_the_last_moment_is_checked_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with replay() as other:
+        (file,) = record_living_series(other, SHORT, tmp_path / "other", sessions=1, interval_min=2.0).files
+
+    @contextmanager
+    def ended_in_between(folder: Path) -> Iterator[None]:
+        shutil.copytree(file.parent, folder)
+        with alone_in(folder):
+            yield
+
+    monkeypatch.setattr("animat.cultures.living_series.alone_in", ended_in_between)
+    with replay() as culture:
+        with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* another protocol"):
+            record_living_series(culture, replace(SHORT, pulses=2), tmp_path / "series", sessions=2, interval_min=2.0)
         assert culture.delivered == 0
 
 

@@ -53,7 +53,7 @@ from animat.studies.specification import Body, Compared, Simulators, Source, Stu
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.policy import Policy
-from animat.writing import alone_in
+from animat.writing import LOCK, alone_in
 from cultures import small_culture
 
 TINY = Path(__file__).parent / "tiny_study.toml"
@@ -203,8 +203,17 @@ def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
             raise PermissionError(13, "Permission denied")
         return opened(self, mode, *args, **options)
 
+    def unlink(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "Permission denied")
+
     folder = tmp_path / "archive"
     shutil.copytree(finished, folder)
+    leftover = folder / ".study.toml.abcd1234.partial.toml"
+    leftover.write_text("half")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
+    assert leftover.exists()
     monkeypatch.setattr(Path, "open", open_)
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
@@ -213,6 +222,33 @@ def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
         run_study(read_study(TINY), folder, base=TINY.parent)
     with pytest.raises(InvalidFile, match="cannot be written"):
         run_study(read_study(TINY), tmp_path / "new", base=TINY.parent)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_finished_read_only_folder_keeps_what_a_killed_run_left(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "archive"
+    shutil.copytree(finished, folder)
+    leftovers = [folder / ".study.toml.abcd1234.partial.toml", folder / "figures/.a.png.abcd1234.partial.png"]
+    for leftover in leftovers:
+        leftover.write_text("half")
+    folders = [folder, *(path for path in folder.rglob("*") if path.is_dir())]
+    for each in folders:
+        each.chmod(0o555)
+    try:
+        assert run_study(read_study(TINY), folder, base=TINY.parent).done_now == {}
+        assert all(leftover.exists() for leftover in leftovers)
+    finally:
+        for each in folders:
+            each.chmod(0o755)
+
+
+def test_a_file_that_is_there_to_be_locked_is_nobody_s(tmp_path: Path) -> None:
+    (tmp_path / LOCK).write_text("")
+    study = replace(read_study(TINY), seed=1)
+    for seed in (1, 2):
+        with pytest.raises(AnimatError, match="halted"):
+            run_study(replace(study, seed=seed), tmp_path, executor=Halts())
+    assert read_study(tmp_path / "study.toml").seed == 2
 
 
 def test_a_specification_can_be_corrected_before_anything_is_made(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
 import stat
@@ -12,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from animat.errors import InvalidFile, Mismatch
-from animat.writing import alone_in, is_unfinished, written_whole
+from animat.writing import LOCK, alone_in, clear_away, is_unfinished, written_whole
 
 
 def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_path: Path) -> None:
@@ -89,6 +91,94 @@ def test_a_folder_is_for_one_run_at_a_time_until_that_is_killed(tmp_path: Path) 
         assert not any(folder.iterdir())
     with alone_in(folder):
         pass
+
+
+def without_locks(patch: pytest.MonkeyPatch, *, of_files: bool) -> None:
+    """A file system that locks no folders (NFS), or nothing at all."""
+    flock = fcntl.flock
+
+    def refusing(descriptor: int, operation: int) -> None:
+        if not of_files:
+            raise OSError(errno.ENOLCK, "No locks available")
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        flock(descriptor, operation)
+
+    patch.setattr(fcntl, "flock", refusing)
+
+
+def test_where_folders_cannot_be_locked_a_file_in_them_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_locks(monkeypatch, of_files=True)
+    for _ in range(2):
+        with alone_in(tmp_path), pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path):
+            pass
+        assert [file.name for file in tmp_path.iterdir()] == [LOCK]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_to_can_be_held_without_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_locks(monkeypatch, of_files=True)
+    tmp_path.chmod(0o555)
+    with alone_in(tmp_path):
+        assert not any(tmp_path.iterdir())
+    tmp_path.chmod(0o755)
+
+
+def test_without_any_locks_the_block_still_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_locks(monkeypatch, of_files=False)
+    open_ = os.open
+
+    def read_only(path: str | os.PathLike[str], flags: int, *args: int) -> int:
+        if flags & os.O_CREAT:
+            raise OSError(errno.EROFS, "Read-only file system")
+        return open_(path, flags, *args)
+
+    with alone_in(tmp_path / "a"):
+        assert [file.name for file in (tmp_path / "a").iterdir()] == [LOCK]
+    (tmp_path / "b").mkdir()
+    monkeypatch.setattr(os, "open", read_only)
+    with alone_in(tmp_path / "b"):
+        assert not any((tmp_path / "b").iterdir())
+
+
+def test_a_block_that_fails_leaves_no_empty_folder_behind(tmp_path: Path) -> None:
+    for name in ("a/b", "mine"):
+        with pytest.raises(ValueError, match="no"), alone_in(tmp_path / name):
+            if name == "mine":
+                (tmp_path / name / "result").write_text("")
+            raise ValueError("no")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    (tmp_path / "mine" / "result").unlink()
+    # It was there before.
+    with pytest.raises(ValueError, match="no"), alone_in(tmp_path / "mine"):
+        raise ValueError("no")
+    assert (tmp_path / "mine").is_dir()
+
+
+def test_a_folder_that_is_removed_before_it_is_locked_is_not_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flock, folder = fcntl.flock, tmp_path / "a"
+    monkeypatch.setattr(fcntl, "flock", lambda *args: (folder.rmdir(), flock(*args)))
+    with pytest.raises(Mismatch, match="start again"), alone_in(folder):
+        pass
+
+
+def test_a_leftover_that_cannot_be_removed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_text("")
+    clear_away(tmp_path / "a")
+    clear_away(tmp_path / "a")
+    assert not any(tmp_path.iterdir())
+    (tmp_path / "b").write_text("")
+
+    def refused(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    clear_away(tmp_path / "b")
+    assert (tmp_path / "b").exists()
 
 
 def test_a_folder_that_is_a_file_or_below_one_cannot_be_held(tmp_path: Path) -> None:

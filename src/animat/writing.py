@@ -12,6 +12,9 @@ from pathlib import Path
 
 from animat.errors import InvalidFile, Mismatch
 
+LOCK = ".lock"
+"""A file that is locked where a folder cannot be."""
+
 _UNFINISHED = re.compile(r"\..+\.[a-z0-9_]{8}\.partial(\.[^.]*)?")
 
 
@@ -54,28 +57,68 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep other runs out of a folder, made where it is missing, until the block ends or the process does.
 
+    The folder itself is locked, and nothing is left in it. File systems that lock files only (NFS) get a file to lock,
+    `LOCK`, which stays: whoever removed it could remove one that another run has just locked. Where nothing can be
+    locked at all, as in a folder that cannot be written to, in which nothing can change, the block runs unlocked. What
+    it made of the folder is removed again if the block fails with nothing in it.
+
     Raises:
         Mismatch: if another run is at work in it.
         InvalidFile: if it cannot be made.
     """
     folder = Path(folder)
     try:
+        made = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
+        descriptors = [os.open(folder, os.O_RDONLY)]
     except OSError as error:
         raise InvalidFile(f"{folder}: cannot be made or read: {error.strerror or error}") from error
     try:
-        # The folder itself is locked: nothing is left in it, and one that cannot be written to can be held as well.
-        # File systems that cannot lock folders (NFS) leave it to the user.
+        if _is_locked(folder, descriptors[0]):
+            _expect_same(folder, descriptors[0])
+        else:
+            with suppress(OSError):
+                descriptors.append(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666))
+                _is_locked(folder, descriptors[1])
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise Mismatch(f"{folder}: another run is at work in this folder; wait for it, or stop it") from error
-        except OSError:
-            pass
-        yield
+            yield
+        except BaseException:
+            with suppress(OSError):
+                for each in made:
+                    each.rmdir()
+            raise
     finally:
-        os.close(descriptor)
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _is_locked(folder: Path, descriptor: int) -> bool:
+    """Lock what is open, for as long as it is; False where the file system cannot.
+
+    Raises:
+        Mismatch: if it is locked already.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise Mismatch(f"{folder}: another run is at work in this folder; wait for it, or stop it") from error
+    except OSError:
+        return False
+    return True
+
+
+def _expect_same(folder: Path, descriptor: int) -> None:
+    """Raise if the folder was removed, by a run that failed, between its being opened and locked."""
+    with suppress(FileNotFoundError):
+        if os.path.samestat(os.fstat(descriptor), folder.stat()):
+            return
+    raise Mismatch(f"{folder}: another run was at work in this folder, and removed it; start again")
+
+
+def clear_away(leftover: Path) -> None:
+    """Remove a file that a killed run left, if it can be: in a read-only folder it does no harm."""
+    with suppress(OSError):
+        leftover.unlink()
 
 
 def is_unfinished(path: Path) -> bool:

@@ -63,9 +63,12 @@ def record_living_series(
     check_interval(protocol, sessions, interval_min)
     folder, progress = Path(folder), progress or Silent()
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
-    zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
     missed_min = []
+    # Seen before it is touched: somebody else's folder stays as it is.
+    _beginning_s(culture, protocol, files, 60 * interval_min)
     with alone_in(folder):
+        # And again now that nobody writes: another run may have ended in between.
+        zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
         for session, file in enumerate(files):
             due_s = zero_s + 60 * session * interval_min
             if not file.exists():

@@ -16,7 +16,7 @@ from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.recordings.schedule import make_schedule
-from animat.writing import alone_in
+from animat.writing import alone_in, clear_away
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
@@ -34,6 +34,7 @@ def record_virtual_series(
     *,
     sessions: int = 15,
     interval_min: float = 10.0,
+    needs_state: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record a virtual culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
@@ -41,7 +42,7 @@ def record_virtual_series(
     Whatever interrupts it, at whatever moment, calling it again gives the very recordings that an undisturbed run
     gives, and the state after the last. Every file is complete or absent. After each recording the culture's state is
     written (`culture.state`); a series goes on from it. What lies between the state and the recordings that are there
-    is recorded again and compared; where there is no state, that is all. The electrodes in use are written to
+    is recorded again and compared; where there is no state, that is all of an unfinished series. The electrodes in use are written to
     `selection.json`.
 
     Args:
@@ -50,6 +51,7 @@ def record_virtual_series(
         folder: where the files go; made if it is missing.
         sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
+        needs_state: whether a complete series without its state is recorded again to have it.
         progress: told about the scan and after each block.
 
     Returns:
@@ -65,12 +67,13 @@ def record_virtual_series(
     folder, progress = Path(folder), progress or Silent()
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
     fresh = make_culture()
-    for session, file in enumerate(files):
-        if file.exists():
-            _expect_of_series(file, fresh, protocol, session, 60 * session * interval_min)
+    # Seen before it is touched: somebody else's folder stays as it is.
+    _expect_series(files, fresh, protocol, interval_min)
     with alone_in(folder):
+        # And again now that nobody writes: another run may have ended in between.
+        _expect_series(files, fresh, protocol, interval_min)
         _remove_leftovers(folder)
-        _record(make_culture, protocol, files, interval_min, progress)
+        _record(make_culture, protocol, files, interval_min, needs_state, progress)
     return files
 
 
@@ -79,12 +82,13 @@ def _record(
     protocol: Protocol,
     files: list[Path],
     interval_min: float,
+    needs_state: bool,
     progress: Progress,
 ) -> None:
     """Record what is missing of a series, from the state that it came to."""
     folder, sessions = files[0].parent, len(files)
     there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
-    if there == sessions and not _is_behind(make_culture(), folder / STATE_FILE, sessions):
+    if there == sessions and not _is_behind(make_culture(), folder / STATE_FILE, sessions, needs_state):
         if not (folder / SELECTION_FILE).exists():
             with make_culture() as fresh:
                 fresh.selection.save(folder / SELECTION_FILE)
@@ -118,27 +122,38 @@ def _remove_leftovers(folder: Path) -> None:
     """Remove what a killed run was just writing; no reader takes such files for whole ones."""
     for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
         for leftover in folder.glob(f"{name}.*.partial*"):
-            leftover.unlink(missing_ok=True)
+            clear_away(leftover)
 
 
-def _is_behind(culture: VirtualCulture, state: Path, sessions: int) -> bool:
+def _is_behind(culture: VirtualCulture, state: Path, sessions: int, needs_state: bool) -> bool:
     """Whether a run was killed between the last recording and the state after it: the series is to end with both.
 
-    A state that is missing was taken away, as one is written before the first recording; one that cannot be read
-    matters to a series that goes on, not to one that is complete.
+    A state that is missing was taken away, as one is written before the first recording; that, and one that cannot be
+    read, matters to a series that goes on or needs its state, not to one that is complete.
     """
     if not state.exists():
-        return False
-    with suppress(InvalidFile, Mismatch):
-        return culture.restore_state(state)["sessions"] < sessions
+        return needs_state
+    with suppress(*(() if needs_state else (InvalidFile, Mismatch))):
+        return _recorded(culture, state) < sessions
     return False
+
+
+def _recorded(culture: VirtualCulture, state: Path) -> int:
+    """Make a culture what it was when the state of its series was written; returns how many recordings came before."""
+    sessions = culture.restore_state(state).get("sessions")
+    if sessions is None:
+        raise Mismatch(
+            f"{state}: expected the state of a series of recordings, got one after something else (animat live): "
+            "choose another folder"
+        )
+    return sessions
 
 
 def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int) -> tuple[VirtualCulture, int]:
     """The culture as it was after the recordings that are there, or as near before that as is known."""
     culture = make_culture()
     if state.exists():
-        recorded = culture.restore_state(state)["sessions"]
+        recorded = _recorded(culture, state)
         if recorded <= there:
             return culture, recorded
         # Recordings were taken away that came before the state: only the beginning is before them.
@@ -158,6 +173,12 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float) -> No
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"
         )
+
+
+def _expect_series(files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_min: float) -> None:
+    for session, file in enumerate(files):
+        if file.exists():
+            _expect_of_series(file, culture, protocol, session, 60 * session * interval_min)
 
 
 def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, session: int, start_s: float) -> None:

@@ -17,7 +17,7 @@ from animat.studies.jobs import sha256
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
-from animat.writing import alone_in, is_unfinished, written_whole
+from animat.writing import LOCK, alone_in, clear_away, is_unfinished, written_whole
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
@@ -109,7 +109,7 @@ def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]
                     beside.write_text(words)
         for leftover in [*folder.iterdir(), *(path for name in OWN_FOLDERS for path in (folder / name).rglob("*"))]:
             if is_unfinished(leftover):
-                leftover.unlink(missing_ok=True)
+                clear_away(leftover)
         yield
 
 
@@ -122,7 +122,7 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     """
     path = folder / MANIFEST
     if not path.exists():
-        others = [e for e in folder.iterdir() if not is_unfinished(e)] if folder.is_dir() else []
+        others = [e for e in folder.iterdir() if not _is_passing(e)] if folder.is_dir() else []
         if others:
             raise Mismatch(f"{folder}: expected an empty folder or one of this study, got one with other files in it")
         return False
@@ -134,13 +134,18 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     if fingerprint == manifest["fingerprint"]:
         return (folder / SPECIFICATION).exists()
     # A study that stopped at its first step left a specification and no more.
-    begun = (path for path in folder.rglob("*") if not path.is_dir() and not is_unfinished(path))
+    begun = (path for path in folder.rglob("*") if not path.is_dir() and not _is_passing(path))
     if any(path.name not in (MANIFEST, SPECIFICATION) for path in begun):
         raise Mismatch(
             f"{folder}: expected a folder of this study, got one of another ({_first_difference(found, manifest)}"
             "); give another folder, or remove this one"
         )
     return False
+
+
+def _is_passing(path: Path) -> bool:
+    """Whether a file is nobody's: half written by a killed run, or there to be locked."""
+    return is_unfinished(path) or path.name == LOCK
 
 
 def _first_difference(found: Any, wanted: Any, name: str = "") -> str:

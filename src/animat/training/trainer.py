@@ -26,7 +26,7 @@ from animat.progress import Progress, Silent
 from animat.training.group import CHECKPOINT_S, Group, split_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
-from animat.writing import alone_in, written_whole
+from animat.writing import alone_in, clear_away, written_whole
 
 MANIFEST = "training.json"
 _UNFINISHED = ".unfinished"
@@ -87,7 +87,7 @@ def train(
         _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
         shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
         for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
-            leftover.unlink(missing_ok=True)
+            clear_away(leftover)
     return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
 
 
