@@ -9,13 +9,21 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from animat.animat import Animat
 from animat.cli import _say_findings, main
+from animat.evaluation.optimum import Optimum, best_return
+from animat.mapping import Thresholds
+from animat.neurons.series import extract_series
+from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.made_up import write_made_up_series
+from animat.recordings.reading import read_recordings
+from animat.robots import Cartpole
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
 QUICK = ["--policies", "2", "--iterations", "2000"]
@@ -71,6 +79,30 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     told = last_json(capsys.readouterr().out)
     assert told["recorded_at_min"] == 0.0
     assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
+
+
+def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
+    recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def rough(*case: Any, resolution: float, seed: int) -> Optimum:
+        asked.append(resolution)
+        return best_return(*case, resolution=0.25, episodes=0, seed=seed)
+
+    monkeypatch.setattr("animat.evaluation.table.best_return", rough)
+    command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0", "--episodes", "10"]
+    assert main([*command, "--limit", "--json"]) == 0
+    said = capsys.readouterr().out
+    told: dict[str, Any] = last_json(said)
+    assert asked == [1.0]
+    simulator = fit_timeline(extract_series(read_recordings([recordings]))).at(0.0)
+    direct = best_return(Animat(Cartpole(), Thresholds(1), 5), simulator, resolution=0.25, episodes=0)
+    assert told["limit"] == direct.to_dict()
+    assert direct.to_text() in said
+    means = {row["name"]: row["mean_return"] for row in told["rows"]}
+    score = (means["policies"] - means["random"]) / (direct.value - means["random"])
+    assert told["rows"][0]["normalised_score"] == pytest.approx(score)
 
 
 def test_one_of_several_recordings_in_a_file_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ import pytest
 from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
+from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.mapping import Linear, Thresholds
@@ -23,6 +26,17 @@ from animat.robots.base import Robot
 from animat.training.policy import Policy
 from test_simulator import responses_of
 from test_training import timeline_of
+
+SHORT = Cartpole(episode_limit=40)
+
+WITHOUT_NEURONS = Policy(
+    weights=(np.zeros((4, 8), np.float32), np.zeros((8, 8), np.float32), np.zeros((8, 2), np.float32)),
+    biases=(np.zeros(8, np.float32), np.zeros(8, np.float32), np.zeros(2, np.float32)),
+    scales=np.ones(4, np.float32),
+    robot=Cartpole(),
+    mapping=None,
+    commands=(-1.0, 1.0),
+)
 
 
 def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int = 0) -> Policy:  # type: ignore[type-arg]  # noqa: B008
@@ -178,6 +192,73 @@ def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> No
     )
 
 
+def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
+    """The limit is `best_return` of the very simulator; scores are worked out again from the means."""
+    timeline = timeline_of()
+    policies = {"a": policy_of(timeline, SHORT, seed=1), "b": policy_of(timeline, SHORT, seed=2)}
+    told: list[str] = []
+
+    class Noting:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            assert done <= total == 9
+            told.append(note)
+
+    plainly = evaluate(policies, timeline, at_min=14.0, episodes=20, seed=3)
+    found = evaluate(policies, timeline, at_min=14.0, episodes=20, seed=3, limit_resolution=0.25, progress=Noting())
+    environment = Animat(SHORT, Thresholds(1), 3)
+    assert found.limit == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
+    assert told[-2:] == ["shuffled", "best possible return"]
+    assert set(found.limit.findings()) <= set(found.findings)
+
+    data = json.loads(json.dumps(found.to_dict()))
+    assert data["limit"] == found.limit.to_dict() and data["no_limit"] is None
+    rows = {row["name"]: row for row in data["rows"]}
+    random, best = rows["random"]["mean_return"], data["limit"]["value"]
+    for name, row in rows.items():
+        if name in ("silent", "shuffled"):
+            assert row["normalised_score"] is None
+        else:
+            assert row["normalised_score"] == pytest.approx((row["mean_return"] - random) / (best - random))
+    assert rows["random"]["normalised_score"] == 0
+    text = found.to_text()
+    assert found.limit.to_text() in text and "none for silent and shuffled, whose limit is another" in text
+    assert f"{rows['policies']['normalised_score']:.2f}  as trained" in text
+
+    # Nothing else changes by it, and nothing is told of it where it was not asked for.
+    assert plainly.limit is None and plainly.no_limit is None
+    assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in data["rows"]]
+    assert "score" not in plainly.to_text() and "best possible" not in plainly.to_text()
+    assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
+
+
+def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
+    """In closed form: a reward of 1 an iteration, and no fall, as two forces are enough to hold the pole."""
+    evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, limit_resolution=0.6)
+    assert evaluation.limit is not None
+    assert evaluation.limit.value == pytest.approx(120, abs=0.01)
+    rows = {row.name: row for row in evaluation.rows}
+    by_hand, random = (float(rows[name].mean_returns.mean()) for name in ("made by hand", "random"))
+    assert evaluation.score(rows["made by hand"]) == pytest.approx((by_hand - random) / (120 - random), abs=0.001)
+    assert evaluation.score(rows["constant -1"]) == pytest.approx(
+        (float(rows["constant -1"].mean_returns.mean()) - random) / (120 - random), abs=0.001
+    )
+    assert "none for" not in evaluation.to_text()
+
+
+def test_where_there_is_no_limit_or_no_score_a_line_says_so() -> None:
+    wide = replace(WITHOUT_NEURONS, robot=Cartpole(angle_limit_rad=1.0, episode_limit=10))
+    unknown = evaluate({"a": wide}, None, episodes=3, limit_resolution=0.25)
+    (line,) = [line for line in unknown.to_text().splitlines() if "no best possible return: " in line]
+    assert "angle_limit_rad" in line
+    data = unknown.to_dict()
+    assert data["limit"] is None and data["no_limit"] in line
+    assert {row["normalised_score"] for row in data["rows"]} == {None}
+
+    nothing_to_learn = replace(unknown, limit=Optimum(-200.0, 0.0, -200.0, 1.0, -200.0, 1.0, 100, 1000), no_limit=None)
+    assert {row["normalised_score"] for row in nothing_to_learn.to_dict()["rows"]} == {None}
+    assert "no score, as the best possible return is not above" in nothing_to_learn.to_text()
+
+
 def test_shuffling_makes_every_policy_a_random_one() -> None:
     timeline = timeline_of()
     evaluation = evaluate({"a": policy_of(timeline)}, timeline, episodes=3_000)
@@ -187,15 +268,7 @@ def test_shuffling_makes_every_policy_a_random_one() -> None:
 
 
 def test_without_neurons_there_is_nothing_to_silence() -> None:
-    policy = Policy(
-        weights=(np.zeros((4, 8), np.float32), np.zeros((8, 8), np.float32), np.zeros((8, 2), np.float32)),
-        biases=(np.zeros(8, np.float32), np.zeros(8, np.float32), np.zeros(2, np.float32)),
-        scales=np.ones(4, np.float32),
-        robot=Cartpole(),
-        mapping=None,
-        commands=(-1.0, 1.0),
-    )
-    evaluation = evaluate({"p0": policy}, None, episodes=4)
+    evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=4)
     assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "made by hand"]
     assert isinstance(WithoutNeurons(Cartpole(), (-1.0, 1.0)).n_actions, int)
 
@@ -214,6 +287,9 @@ def test_what_does_not_belong_together_is_refused() -> None:
     for seed in (-1, 2**32):
         with pytest.raises(InvalidArgument, match="seed: expected a whole number"):
             evaluate({"a": policy}, timeline, seed=seed)
+    for resolution in (0.0, float("nan")):
+        with pytest.raises(InvalidArgument, match="limit_resolution: expected a positive number"):
+            evaluate({"a": policy}, timeline, limit_resolution=resolution)
     with pytest.raises(Mismatch, match="robot: expected cartpole"):
         evaluate({"a": policy}, timeline, robot=Navigation())
     with pytest.raises(Mismatch, match="b: expected the same robot as a"):

@@ -17,7 +17,7 @@ from animat.report.learning_curves import LearningCurve, draw_learning_curves
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.robots import Cartpole
 from animat.studies.differences import came_out_otherwise, decisions, explain
-from animat.studies.learned import known_of, learned_of
+from animat.studies.learned import as_good_as_the_limit_allows, known_of, learned_of
 from animat.studies.limits import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import limits_file, table_file, write_table
@@ -199,6 +199,14 @@ LEARNED: dict[str, Any] = {
 def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
     rows = [LEARNED | {"at_min": 140.0}, LEARNED, LEARNED | {"condition": "1 threshold"}]
     assert learned_of(paper_study(), rows) == [LEARNED]
+
+
+def test_what_was_learned_stands_between_random_actions_and_the_limit() -> None:
+    known = {"standard_deviation": 3.0, "policies": 9, "limit": 120.0, "limit_without_clock": 100.0}
+    table = as_good_as_the_limit_allows(paper_study(), [LEARNED | known])
+    (shown,) = (dict(zip(table.head, row, strict=True)) for row in table.rows)
+    assert (shown["random"], shown["limit"], shown["score"]) == (-80.0, 120.0, 0.88)
+    assert table.head.index("mean ± s.e.") < table.head.index("random") < table.head.index("limit")
 
 
 def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:

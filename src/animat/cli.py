@@ -271,6 +271,8 @@ class Evaluate(Fitting):
     """The robot that is expected; default: the one the policies were trained on"""
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
+    limit: bool = False
+    """Also compute the best return that any controller could get there, and scores beside it; takes seconds"""
     seed: int = 1
     """Decides every random draw"""
     json: bool = False
@@ -302,6 +304,7 @@ class Evaluate(Fitting):
                 episodes=self.episodes,
                 seed=self.seed,
                 greedy=not self.drawn,
+                limit_resolution=1.0 if self.limit else None,
                 progress=progress,
             )
         _say_findings(evaluation.findings)

@@ -1,4 +1,4 @@
-"""Policies beside the controls that ask whether it is the culture that does the work."""
+"""Policies beside the controls that ask whether it is the culture that does the work, and the best possible return."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from jaxtyping import Float64
 from animat.animat import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.controls import Control, controls_of
+from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
+from animat.evaluation.statistics import normalised_score
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
@@ -29,11 +31,13 @@ class Row:
         name: `policies`, or the control.
         meaning: what the control takes away, in a few words.
         episodes: one row an actor.
+        changed: whether it was run in something else than the policies: another culture, or another delivery.
     """
 
     name: str
     meaning: str
     episodes: Episodes
+    changed: bool = False
 
     @property
     def mean_returns(self) -> Float64[np.ndarray, " actors"]:
@@ -67,7 +71,9 @@ class Evaluation:
         recorded_at_min: the recording the simulator was made of; None without neurons.
         names: the policies, in the order of the first row's actors.
         rows: the policies first, then the controls.
-        findings: where the policies' training and this simulator differ.
+        findings: where the policies' training and this simulator differ, and where the limit is not well known.
+        limit: the best possible return of any controller; None where it was not asked for, or is not known.
+        no_limit: why it is not known, though it was asked for.
     """
 
     robot: str
@@ -76,6 +82,22 @@ class Evaluation:
     names: tuple[str, ...]
     rows: tuple[Row, ...]
     findings: tuple[Finding, ...]
+    limit: Optimum | None = None
+    no_limit: str | None = None
+
+    def score(self, row: Row) -> float | None:
+        """The normalised score of a row's mean return, (mean - random) / (limit - random).
+
+        None where no limit is known or it is not above random actions, and for controls that act in something else than
+        what the limit is of: under shuffled delivery nothing can be chosen, and a silent culture is another one.
+        """
+        if self.limit is None or row.changed:
+            return None
+        random = next(each for each in self.rows if each.name == "random")
+        try:
+            return normalised_score(float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.limit.value)
+        except InvalidArgument:
+            return None
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -84,7 +106,9 @@ class Evaluation:
             "mapping": self.mapping,
             "recorded_at_min": self.recorded_at_min,
             "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
-            "rows": [row.to_dict() for row in self.rows],
+            "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
+            "limit": None if self.limit is None else self.limit.to_dict(),
+            "no_limit": self.no_limit,
             "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
         }
 
@@ -94,17 +118,34 @@ class Evaluation:
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
         lines = [
             f"{self.robot}, {on}: {first.shape[0]} policies, {first.shape[1]} episodes each",
-            f"  {'':16} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}",
+            f"  {'':16} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}"
+            + ("" if self.limit is None else f"  {'score':>6}"),
         ]
         for row in self.rows:
             told = row.to_dict()
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
+            score = self.score(row)
+            scored = "" if self.limit is None else f"  {'' if score is None else f'{score:.2f}':>6}"
             lines.append(
                 f"  {row.name:16} {told['mean_return']:11.1f}  {error:>5}  {told['mean_length']:10.1f}"
-                f"  {100 * told['terminated_share']:9.0f} %  {row.meaning}"
+                f"  {100 * told['terminated_share']:9.0f} %{scored}  {row.meaning}"
             )
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
-        return "\n".join([*lines, f"  each policy: {each}"])
+        return "\n".join([*lines, f"  each policy: {each}", *self._limit_lines()])
+
+    def _limit_lines(self) -> list[str]:
+        if self.no_limit is not None:
+            return [f"  no best possible return: {self.no_limit}"]
+        if self.limit is None:
+            return []
+        if self.score(self.rows[0]) is None:
+            meaning = "no score, as the best possible return is not above that of random actions"
+        else:
+            meaning = "score: (mean return - random) / (best possible return - random)"
+            changed = [row.name for row in self.rows if row.changed]
+            if changed:
+                meaning += f"; none for {' and '.join(changed)}, whose limit is another"
+        return [f"  {self.limit.to_text()}", f"  {meaning}"]
 
 
 def evaluate(
@@ -116,6 +157,7 @@ def evaluate(
     seed: int = 1,
     greedy: bool = True,
     robot: Robot[Any] | None = None,
+    limit_resolution: float | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Run policies and the controls beside them on the simulator of one minute.
@@ -130,10 +172,12 @@ def evaluate(
         seed: decides every random draw.
         greedy: whether the most probable action is taken, or one drawn from the policy as in training.
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
-        progress: told after the policies and each control.
+        limit_resolution: of the grid for the best possible return in the same environment (`best_returns`; a study's is
+            1), which takes seconds; None: it is not computed.
+        progress: told after the policies and each control, and before the limit.
 
     Raises:
-        InvalidArgument: for no policies, fewer episodes than one, or an `at_min` or a seed that is none.
+        InvalidArgument: for no policies, fewer episodes than one, or an `at_min`, a seed or a resolution that is none.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
     if not policies:
@@ -170,14 +214,33 @@ def evaluate(
         Control("policies", "as trained", environment, simulator, networks, n),
         *controls_of(environment, simulator, _action_labels(first), networks, n),
     ]
+    if limit_resolution is not None and not 0 < limit_resolution < float("inf"):
+        raise InvalidArgument(f"limit_resolution: expected a positive number, got {limit_resolution!r}")
     rows = []
+    steps = len(acting) + (limit_resolution is not None)
     for each in acting:
         ran = roll_out(each.environment, each.simulator, each.actor, each.n_actors, episodes=episodes, seed=seed)
-        rows.append(Row(each.name, each.meaning, ran))
+        changed = each.environment is not environment or each.simulator is not simulator
+        rows.append(Row(each.name, each.meaning, ran, changed))
         if progress is not None:
-            progress.update(len(rows), len(acting), each.name)
+            progress.update(len(rows), steps, each.name)
+    limit, no_limit = None, None
+    if limit_resolution is not None:
+        if progress is not None:
+            progress.update(len(rows), steps, "best possible return")
+        try:
+            limit = best_return(environment, simulator, resolution=limit_resolution, seed=seed)
+        except InvalidArgument as error:
+            no_limit = str(error)
     return Evaluation(
-        body.name, None if first.mapping is None else first.mapping.name, minute, tuple(policies), tuple(rows), findings
+        body.name,
+        None if first.mapping is None else first.mapping.name,
+        minute,
+        tuple(policies),
+        tuple(rows),
+        (*findings, *(() if limit is None else limit.findings())),
+        limit,
+        no_limit,
     )
 
 
