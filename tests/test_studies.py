@@ -516,7 +516,82 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "learning-curves", "limits", "controllability", "findings",
+        "culture-array", "culture-psth", "culture-bursts", "culture-conditions", "culture-drift",
+        "navigation-learning", "navigation-over-time",
     }  # fmt: skip
+
+
+def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finished: Path) -> None:
+    recordings = read_recordings(finished / "recordings")
+    first, window_s = recordings[0], (0.002, 0.010)
+    psth = rows(finished / "tables/culture-psth.csv")
+    since_s = (first.spike_times_s[:, None] - first.stimuli.time_s)[:, first.stimuli.is_last_of_presentation]
+    for row in psth:
+        low_s, high_s = float(row["from_ms"]) * 1e-3, float(row["to_ms"]) * 1e-3
+        # Spikes of made-up recordings lie on no edge.
+        spikes = np.count_nonzero((since_s > low_s) & (since_s < high_s))
+        assert int(row["spikes"]) == spikes
+        exposure_s = (high_s - low_s) * since_s.shape[1] * 32
+        assert float(row["rate_hz_per_channel"]) == pytest.approx(spikes / exposure_s)
+        assert float(row["in_window"]) == (window_s[0] - 1e-6 < low_s and high_s < window_s[1] + 1e-6)
+    drift, bursts = rows(finished / "tables/culture-drift.csv"), rows(finished / "tables/culture-bursts.csv")
+    of_condition = rows(finished / "tables/culture-conditions.csv")
+    responses = rows(finished / "simulators/responses.csv")
+    assert [row["at_min"] for row in drift] == [row["at_min"] for row in bursts] == ["0.0", "140.0"]
+    for row, separated in zip(drift, bursts, strict=True):
+        here = [each for each in responses if each["start_min"] == row["at_min"]]
+        kept = [float(each["rate_hz"]) for each in here if each["is_burst"] == "0"]
+        for percent in (10, 25, 50, 75, 90):
+            assert float(row[f"p{percent}_hz"]) == pytest.approx(np.quantile(kept, percent / 100))
+        assert float(row["burst_share"]) == float(separated["burst_share"]) == pytest.approx(1 - len(kept) / len(here))
+        assert (int(separated["responses"]), int(separated["bursts"])) == (len(here), len(here) - len(kept))
+        ratios = np.array([float(each["active_ratio"]) for each in here])
+        is_burst = ratios > float(separated["threshold_active_ratio"])
+        assert is_burst.tolist() == [each["is_burst"] == "1" for each in here]
+        between = is_burst.mean() * (1 - is_burst.mean()) * (ratios[is_burst].mean() - ratios[~is_burst].mean()) ** 2
+        assert float(separated["separability"]) == pytest.approx(between / ratios.var())
+        conditions = [each for each in of_condition if each["at_min"] == row["at_min"]]
+        assert sum(int(each["non_bursts"]) for each in conditions) == len(kept)
+        for each in conditions:
+            x = [float(r["rate_hz"]) for r in here if r["condition"] == each["condition"] and r["is_burst"] == "0"]
+            assert float(each["median_hz"]) == np.median(x)
+            assert float(each["above_median"]) == pytest.approx(np.mean(np.array(x) >= np.median(kept)))
+    array = rows(finished / "tables/culture-array.csv")
+    assert [row["channel"] for row in array if row["channel"]] == first.channels.label.tolist()
+    counts = [np.count_nonzero(first.spike_channels == i) for i in range(32)]
+    assert [float(row["rate_hz"]) for row in array[:32]] == pytest.approx(np.array(counts) / first.duration_s)
+    stimulated = {int(row["electrode"]) for row in array if row["is_stimulated"] == "1"}
+    assert stimulated == set(first.stimuli.electrodes.ravel().tolist()) - {-1}
+
+
+def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path) -> None:
+    curves: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for row in rows(finished / "tables/learning-curves.csv"):
+        curves[row["condition"], row["iterations"]] += [float(row["mean_return"])] if row["mean_return"] else []
+    learning = rows(finished / "tables/navigation-learning.csv")
+    assert [(row["condition"], row["iterations"]) for row in learning] == list(curves)
+    for row in learning:
+        of = curves[row["condition"], row["iterations"]]
+        assert int(row["policies"]) == len(of)
+        if not of:
+            assert row["mean_return"] == row["low_95"] == row["high_95"] == ""
+            continue
+        assert float(row["mean_return"]) == pytest.approx(np.mean(of))
+        # Of two policies a bootstrap draws one of them twice in half of all cases: the interval goes from one to the
+        # other.
+        assert [float(row["low_95"]), float(row["high_95"])] == pytest.approx([min(of), max(of)])
+    course = rows(finished / "tables/navigation-over-time.csv")
+    assert {row["condition"] for row in course} == {"before training", "1 threshold", "control"}
+    for row in course:
+        slug = row["condition"].replace(" ", "-")
+        means = [
+            float(each["mean_return"])
+            for each in rows(finished / "episodes/navigation" / slug / "over-time.csv")
+            if float(each["at_min"]) == float(row["at_min"])
+        ]
+        told = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
+        assert told == pytest.approx(np.quantile(means, [0.25, 0.5, 0.75]))
+        assert int(row["policies"]) == len(means) == 2
 
 
 def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.recordings.recording import UNKNOWN, Recording
 from animat.recordings.selection import Selection
@@ -25,7 +26,7 @@ def draw_array(recording: Recording) -> Figure:
     channels, stimuli = recording.channels, recording.stimuli
     figure = new_figure(8.5, 5.2)
     axes = figure.subplots()
-    rate_hz = np.bincount(recording.spike_channels, minlength=len(channels)) / max(recording.duration_s, 1e-9)
+    rate_hz = rates_of_sites(recording)
     known = np.isfinite(channels.x_um) & np.isfinite(channels.y_um)
     # A few channels of a very high rate must not leave all others dark.
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
@@ -54,6 +55,12 @@ def draw_array(recording: Recording) -> Figure:
         title += f"\n{unplaced} stimulated electrodes that no channel reads are not drawn"
     _finish(axes, title)
     return figure
+
+
+def rates_of_sites(recording: Recording) -> Float64[np.ndarray, " channels"]:
+    """Spikes a second on each channel over the whole recording, stimulated time included."""
+    counts = np.bincount(recording.spike_channels, minlength=len(recording.channels))
+    return np.asarray(counts / max(recording.duration_s, 1e-9), np.float64)
 
 
 def draw_selection(selection: Selection) -> Figure:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.neurons.responses import Responses
 from animat.report.style import BLACK, BURST, GREY, add_legend, condition_colours, new_figure, style_axes
@@ -13,8 +15,38 @@ from animat.report.style import BLACK, BURST, GREY, add_legend, condition_colour
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PERCENTILES = (10, 25, 50, 75, 90)
+PERCENTILES = (10, 25, 50, 75, 90)
+"""Of the responses, that are drawn."""
+
 _MOST_CONDITIONS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """What changes from recording to recording; NaN where there are no responses.
+
+    Attributes:
+        minutes: starts of the recordings, shape (recordings,).
+        percentiles_hz: `PERCENTILES` of the pooled non-burst responses, shape (recordings, 5).
+        shares: P(x >= P50) of each condition, shape (recordings, conditions).
+        bursts: share of the responses that are bursts, shape (recordings,).
+    """
+
+    minutes: Float64[np.ndarray, " recordings"]
+    percentiles_hz: Float64[np.ndarray, "recordings percentiles"]
+    shares: Float64[np.ndarray, "recordings conditions"]
+    bursts: Float64[np.ndarray, " recordings"]
+
+
+def drift_of(series: Sequence[Responses]) -> Drift:
+    """The numbers of the figure, of responses with the same conditions in the order of time."""
+    pooled = [responses.non_burst_rate_hz for responses in series]
+    return Drift(
+        np.array([responses.start_min for responses in series]),
+        np.array([np.percentile(x, PERCENTILES) if len(x) else np.full(len(PERCENTILES), np.nan) for x in pooled]),
+        np.array([responses.shares_above_median() for responses in series]),
+        np.array([np.mean(r.is_burst) if len(r) else np.nan for r in series]),
+    )
 
 
 def draw_drift(series: Sequence[Responses]) -> Figure:
@@ -24,13 +56,8 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
         series: responses of the recordings in the order of time, with the same conditions. At most 12 conditions
             are drawn.
     """
-    minutes = np.array([responses.start_min for responses in series])
-    pooled = [responses.non_burst_rate_hz for responses in series]
-    percentiles = np.array(
-        [np.percentile(x, _PERCENTILES) if len(x) else np.full(len(_PERCENTILES), np.nan) for x in pooled]
-    )
-    shares = np.array([responses.shares_above_median() for responses in series])
-    bursts = np.array([np.mean(r.is_burst) if len(r) else np.nan for r in series])
+    drift = drift_of(series)
+    minutes, percentiles = drift.minutes, drift.percentiles_hz
     figure = new_figure(7.0, 7.5)
     upper, middle, lower = figure.subplots(3, 1, sharex=True, height_ratios=[1.3, 1.3, 0.7])
 
@@ -42,7 +69,7 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
             color=GREY,
             alpha=alpha,
             linewidth=0,
-            label=f"P{_PERCENTILES[low]} to P{_PERCENTILES[high]}",
+            label=f"P{PERCENTILES[low]} to P{PERCENTILES[high]}",
         )
     upper.plot(minutes, percentiles[:, 2], color=BLACK, marker="o", markersize=3, label="P50")
     upper.set_ylim(0, None)
@@ -52,7 +79,7 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     conditions = series[0].conditions[:_MOST_CONDITIONS]
     colours = condition_colours([condition.unit for condition in series[0].conditions])
     for i, condition in enumerate(conditions):
-        middle.plot(minutes, shares[:, i], color=colours[i], marker="o", markersize=3, label=condition.label)
+        middle.plot(minutes, drift.shares[:, i], color=colours[i], marker="o", markersize=3, label=condition.label)
     middle.axhline(0.5, color=GREY, linewidth=0.8, linestyle="--")
     middle.set_ylim(0, 1)
     left_out = len(series[0].conditions) - len(conditions)
@@ -60,7 +87,7 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     style_axes(middle, title, "", "P(x ≥ P50)")
     add_legend(middle, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    lower.plot(minutes, bursts, color=BURST, marker="o", markersize=3)
-    lower.set_ylim(0, max(0.1, 1.1 * float(np.nan_to_num(bursts).max())))
+    lower.plot(minutes, drift.bursts, color=BURST, marker="o", markersize=3)
+    lower.set_ylim(0, max(0.1, 1.1 * float(np.nan_to_num(drift.bursts).max())))
     style_axes(lower, "responses that are bursts", "start of the recording (min)", "share")
     return figure

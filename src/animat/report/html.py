@@ -26,7 +26,7 @@ class Picture:
         file: the PNG.
         title: in a few words; also the text for those who cannot see it.
         caption: what is to be seen in it.
-        beside: names of the same figure in other formats, relative to the page.
+        beside: names of the same figure in other formats, and of its numbers, relative to the page.
     """
 
     file: Path

@@ -50,10 +50,11 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
             ended = np.isfinite(of_policy)
             axes.plot(x[ended], of_policy[ended], color=GREY, linewidth=0.5, alpha=0.6)
         # Parts in which no episode of any policy ended are passed over, not drawn as gaps.
-        some = np.isfinite(curve.returns).any(axis=0)
-        mean, low, high = _mean_with_interval(curve.returns[:, some])
-        axes.fill_between(x[some], low, high, color=BLUE, alpha=0.3, linewidth=0, label="95 % interval of the mean")
-        axes.plot(x[some], mean, color=BLUE, linewidth=1.5, label="mean of the policies")
+        mean, low, high = mean_with_interval(curve.returns)
+        some = np.isfinite(mean)
+        label = "95 % interval of the mean"
+        axes.fill_between(x[some], low[some], high[some], color=BLUE, alpha=0.3, linewidth=0, label=label)
+        axes.plot(x[some], mean[some], color=BLUE, linewidth=1.5, label="mean of the policies")
         for name, levels, colour, line in (
             ("best possible return", curve.limit, LIMIT, "--"),
             ("random actions", curve.random, GREY, ":"),
@@ -70,10 +71,13 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
     return figure
 
 
-def _mean_with_interval(
+def mean_with_interval(
     returns: Float64[np.ndarray, "policies parts"],
 ) -> tuple[Float64[np.ndarray, " parts"], Float64[np.ndarray, " parts"], Float64[np.ndarray, " parts"]]:
-    """Policies are drawn again with the same luck in all parts, as each is one sample."""
+    """The mean over policies in each part and its 95 % bootstrap interval; NaN where no episode of any ended.
+
+    Policies are drawn again with the same luck in all parts, as each is one sample.
+    """
     known = np.isfinite(returns)
     filled = np.where(known, returns, 0.0)
     often = np.random.default_rng(0).multinomial(len(returns), np.full(len(returns), 1 / len(returns)), _RESAMPLES)
@@ -82,5 +86,8 @@ def _mean_with_interval(
         resampled = (often @ filled) / (often @ known)
     some = np.isfinite(resampled)
     # A part in which no episode of the drawn policies ended says nothing; the mean stands for it.
-    low, high = np.quantile(np.where(some, resampled, mean), [0.025, 0.975], axis=0)
+    any_ended = np.isfinite(mean)
+    low, high = np.full_like(mean, np.nan), np.full_like(mean, np.nan)
+    drawn = np.where(some, resampled, mean)[:, any_ended]
+    low[any_ended], high[any_ended] = np.quantile(drawn, [0.025, 0.975], axis=0)
     return mean, low, high

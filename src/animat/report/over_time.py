@@ -46,6 +46,11 @@ class Course:
     minutes: Float64[np.ndarray, " recordings"]
     returns: Float64[np.ndarray, "policies recordings"]
 
+    @property
+    def quartiles(self) -> Float64[np.ndarray, "3 recordings"]:
+        """Lower quartile, median and upper quartile over policies at each recording."""
+        return np.asarray(np.quantile(self.returns, [0.25, 0.5, 0.75], axis=0), np.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class Courses:
@@ -53,7 +58,7 @@ class Courses:
 
     Attributes:
         title: the mapping.
-        courses: with the same minutes, at most `MOST`.
+        courses: with the same minutes, at most `MOST` to be drawn.
         random: of random actions at the same minutes; None where not known.
         limit: the best possible return on a rough grid at the same minutes; None where not known.
         fine_limit: minutes and the best possible return on a fine grid at some of them.
@@ -81,7 +86,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
     for axes, of in zip(panels, panels_of, strict=True):
         for course in of.courses:
             colour = _COLOURS[names.index(course.name) % MOST]
-            low, middle, high = np.quantile(course.returns, [0.25, 0.5, 0.75], axis=0)
+            low, middle, high = course.quartiles
             axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
         minutes = of.courses[0].minutes

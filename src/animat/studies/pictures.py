@@ -1,10 +1,10 @@
-"""The report's figures as jobs, each as PNG, SVG and PDF: of the culture, and of every robot."""
+"""The report's figures as jobs, each as PNG, SVG and PDF, and their numbers: of the culture, and of every robot."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -17,7 +17,7 @@ from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.comparisons import Group, Pair, draw_comparisons
 from animat.report.controls import Controls, draw_controls
-from animat.report.drift import draw_drift
+from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.first_and_last import draw_first_and_last
 from animat.report.learning_curves import LearningCurve, draw_learning_curves
@@ -28,6 +28,15 @@ from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, save_figure
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
+from animat.studies.figure_tables import (
+    write_array,
+    write_bursts,
+    write_conditions,
+    write_courses,
+    write_drift,
+    write_learning,
+    write_psth,
+)
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
 from animat.studies.places import (
@@ -49,7 +58,7 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class CulturePictures(Task):
-    """Draw the first recording, and the series."""
+    """Draw the first recording, and the series; write their numbers beside."""
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         series = read_series(study, folder)
@@ -58,26 +67,37 @@ class CulturePictures(Task):
         to_ms = max(50.0, 2 * responses.window_ms[1])
         histogram = post_stimulus_histogram(first, -0.4 * to_ms, to_ms, 1.0 if to_ms <= 100 else 5.0)
         spontaneous_hz, _ = spontaneous_rate(first, responses.window_ms[1])
+        spontaneous_hz /= len(first.channels)
         figures = {
             "raster": draw_raster(first, responses),
-            "psth": draw_psth(histogram, responses.window_ms, spontaneous_hz / len(first.channels)),
+            "psth": draw_psth(histogram, responses.window_ms, spontaneous_hz),
             "bursts": draw_burst_separation(responses),
             "responses": draw_response_histograms(responses),
         }
+        tables = [
+            write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
+            write_bursts(folder, series),
+            write_conditions(folder, series),
+        ]
         report(0.3, "first recording")
         if first.channels.has_positions:
             figures["array"] = draw_array(first)
+            tables.append(write_array(folder, first))
         if len(series) > 1:
             figures["first-and-last"] = draw_first_and_last(series)
             figures["over-time"] = draw_responses_over_time(series, 0)
             figures["drift"] = draw_drift(series)
-        return _save(folder, "culture", figures, report)
+            tables.append(write_drift(folder, drift_of(series)))
+        return tables + _save(folder, "culture", figures, report)
 
 
 @final
 @dataclass(frozen=True)
 class RobotPictures(Task):
-    """Draw learning, comparisons, the course over the recordings, controls, paths and frames of one robot."""
+    """Draw learning, comparisons, the course over the recordings, controls, paths and frames of one robot.
+
+    The numbers of what no other table holds are written beside: learning with its intervals, and the course.
+    """
 
     body: Body
 
@@ -87,15 +107,21 @@ class RobotPictures(Task):
         last = last_minute(timeline)
         known = References(study, folder, self.body)
         figures: dict[str, Figure] = {}
+        tables: list[Path] = []
         curves = _curves(study, folder, self.body, known, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
+            tables.append(write_learning(folder, name, curves))
         if study.comparisons:
             figures["comparisons"] = draw_comparisons(
                 _pairs(study, folder, self.body, known, last), f"{name}: comparisons"
             )
         if timeline is not None and len(timeline) > 1:
-            figures["over-time"] = _draw_course(study, folder, self.body, known, timeline)
+            courses = _courses(study, folder, self.body, known, timeline)
+            until_min = float(timeline.start_min[0]) + study.training_min
+            drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
+            figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
+            tables.append(write_courses(folder, name, courses))
         report(0.2, "controls")
         figures["controls"] = draw_controls(_controls(folder, self.body), f"{name}: controls")
         paths = {condition.name: _paths(folder, self.body, condition) for condition in study.conditions}
@@ -104,7 +130,7 @@ class RobotPictures(Task):
         )
         middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
         figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each condition")
-        return _save(folder, name, figures, report)
+        return tables + _save(folder, name, figures, report)
 
 
 def _save(folder: Path, of: str, figures: Mapping[str, Figure], report: Report) -> list[Path]:
@@ -203,14 +229,14 @@ def _pairs(study: Study, folder: Path, body: Body, known: References, last: floa
     return pairs
 
 
-def _draw_course(study: Study, folder: Path, body: Body, known: References, timeline: SimulatorTimeline) -> Figure:
+def _courses(study: Study, folder: Path, body: Body, known: References, timeline: SimulatorTimeline) -> list[Courses]:
     rough = _over_time(study, folder, body)
     every_min = [float(at_min) for at_min in timeline.start_min]
     panels = []
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
         same = [c for c in study.conditions if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
         courses = []
-        for condition in same[:MOST]:
+        for condition in same:
             of_policy: dict[str, list[float]] = defaultdict(list)
             for row in read_table(episodes_file(folder, body, condition, "over-time")):
                 of_policy[row["actor"]].append(row["mean_return"])
@@ -224,11 +250,9 @@ def _draw_course(study: Study, folder: Path, body: Body, known: References, time
                 np.array([random for random, _ in at]),
                 None if at[0][1] is None else np.array([limit for _, limit in at], np.float64),
                 tuple(fine),
-                max(0, len(same) - MOST),
             )
         )
-    until_min = every_min[0] + study.training_min
-    return draw_over_time(panels, f"{body.name}: at every recording", trained_until_min=until_min)
+    return panels
 
 
 def _controls(folder: Path, body: Body) -> list[Controls]:

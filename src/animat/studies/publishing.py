@@ -16,7 +16,7 @@ from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
 from animat.studies.jobs import Report, Task
 from animat.studies.learned import as_good_as_the_limit_allows, learned_of
-from animat.studies.places import REPORT, read_table, table_file
+from animat.studies.places import REPORT, RESPONSES, read_table, table_file
 from animat.studies.shown import (
     comparisons_shown,
     controllability_shown,
@@ -124,25 +124,39 @@ def _scores(study: Study, folder: Path) -> Section:
 
 def _culture(study: Study, folder: Path) -> Section:
     table = controllability_shown(study, folder)
-    return Section("The culture", tables=(table,), pictures=_pictures(folder, "culture", CULTURE))
+    return Section("The culture", tables=(table,), pictures=_pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE))
 
 
 def _robot(folder: Path, robot: str) -> Section:
-    return Section(robot.capitalize(), pictures=_pictures(folder, robot, ROBOT))
+    return Section(robot.capitalize(), pictures=_pictures(folder, robot, ROBOT, _NUMBERS_OF_ROBOT))
 
 
-_NUMBERS = {"learning": "learning-curves", "comparisons": "comparisons", "controls": "controls"}
-"""Tables that hold what figures of a robot show."""
+_NUMBERS_OF_CULTURE = {
+    "array": ("tables/culture-array.csv",),
+    "psth": ("tables/culture-psth.csv",),
+    "bursts": ("tables/culture-bursts.csv", RESPONSES),
+    "responses": (RESPONSES, "tables/culture-conditions.csv"),
+    "first-and-last": (RESPONSES, "tables/culture-conditions.csv"),
+    "over-time": (RESPONSES, "tables/culture-conditions.csv"),
+    "drift": ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
+}
+_NUMBERS_OF_ROBOT = {
+    "learning": ("tables/{of}-learning.csv", "tables/learning-curves.csv"),
+    "comparisons": ("tables/comparisons.csv",),
+    "over-time": ("tables/{of}-over-time.csv",),
+    "controls": ("tables/controls.csv",),
+}
+"""Files that hold what figures show."""
 
 
-def _pictures(folder: Path, of: str, captions: dict[str, tuple[str, str]]) -> tuple[Picture, ...]:
+def _pictures(
+    folder: Path, of: str, captions: dict[str, tuple[str, str]], numbers: dict[str, tuple[str, ...]]
+) -> tuple[Picture, ...]:
     pictures = []
     for name, (title, caption) in captions.items():
         files = [Path("figures") / f"{of}-{name}.{ending}" for ending in FORMATS]
         if (folder / files[0]).exists():
-            beside = tuple(file.as_posix() for file in files[1:])
-            if name in _NUMBERS:
-                beside = (*beside, f"tables/{_NUMBERS[name]}.csv")
+            beside = (*(file.as_posix() for file in files[1:]), *(n.format(of=of) for n in numbers.get(name, ())))
             pictures.append(Picture(folder / files[0], f"{of.capitalize()}: {title}", caption, beside))
     return tuple(pictures)
 

@@ -1,0 +1,119 @@
+"""The numbers of figures that no other table holds, from the arrays that are drawn: `tables/` by the figure's name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.neurons.psth import PostStimulusHistogram
+from animat.neurons.responses import Responses
+from animat.recordings.recording import UNKNOWN, Recording
+from animat.report.array import rates_of_sites
+from animat.report.drift import PERCENTILES, Drift
+from animat.report.learning_curves import LearningCurve, mean_with_interval
+from animat.report.over_time import Courses
+from animat.studies.places import table_file, write_table
+
+
+def write_psth(
+    folder: Path, histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float
+) -> Path:
+    """The post-stimulus time histogram of the first recording, a line a bin, from the stimulus.
+
+    `in_window` is the share of the bin that lies in the response window.
+    """
+    from_ms, to_ms = histogram.edges_ms[:-1], histogram.edges_ms[1:]
+    inside_ms = np.clip(np.minimum(to_ms, window_ms[1]) - np.maximum(from_ms, window_ms[0]), 0.0, None)
+    head = ("from_ms", "to_ms", "in_window", "spikes", "stimuli", "channels", "rate_hz_per_channel")
+    columns = (from_ms, to_ms, inside_ms / (to_ms - from_ms), histogram.count, histogram.rate_hz)
+    rows = (
+        (*bounds, inside, count, histogram.n_stimuli, histogram.n_channels, rate_hz, spontaneous_hz)
+        for *bounds, inside, count, rate_hz in zip(*(column.tolist() for column in columns), strict=True)
+    )
+    return _write(folder, "culture-psth", (*head, "spontaneous_hz_per_channel"), rows)
+
+
+def write_bursts(folder: Path, series: Sequence[Responses]) -> Path:
+    """How bursts stand apart in every recording; above the threshold, a ratio of active channels, is a burst."""
+    head = ("at_min", "responses", "bursts", "burst_share", "threshold_active_ratio", "separability", "channels")
+    rows = []
+    for responses in series:
+        n, bursts = len(responses), int(np.count_nonzero(responses.is_burst))
+        share = bursts / n if n else None
+        told = (responses.threshold, responses.separability, responses.n_channels)
+        rows.append((responses.start_min, n, bursts, share, *told))
+    return _write(folder, "culture-bursts", head, rows)
+
+
+def write_conditions(folder: Path, series: Sequence[Responses]) -> Path:
+    """The non-burst responses to every condition in every recording: how many, median, and P(x >= P50 of all)."""
+    head = ("at_min", "condition", "value", "unit", "non_bursts", "median_hz", "above_median")
+    rows = []
+    for responses in series:
+        for i, share in enumerate(responses.shares_above_median().tolist()):
+            condition, x = responses.conditions[i], responses.rates_of(i)
+            median_hz = float(np.median(x)) if len(x) else None
+            rows.append(
+                (responses.start_min, condition.label, condition.value, condition.unit, len(x), median_hz, share)
+            )
+    return _write(folder, "culture-conditions", head, rows)
+
+
+def write_drift(folder: Path, drift: Drift) -> Path:
+    """Percentiles of the non-burst responses to all conditions, and the share of bursts, at every recording."""
+    head = ("at_min", *(f"p{percent}_hz" for percent in PERCENTILES), "burst_share")
+    columns = (drift.minutes, *drift.percentiles_hz.T, drift.bursts)
+    return _write(folder, "culture-drift", head, zip(*(column.tolist() for column in columns), strict=True))
+
+
+def write_array(folder: Path, recording: Recording) -> Path:
+    """Every recording site of the first recording with its rate, and stimulated electrodes that no channel reads."""
+    channels, electrodes = recording.channels, recording.stimuli.electrodes
+    stimulated = set(electrodes[electrodes != UNKNOWN].tolist())
+    columns = (channels.label, channels.electrode, channels.x_um, channels.y_um, rates_of_sites(recording))
+    rows: list[tuple[Any, ...]] = [
+        (label, None if electrode == UNKNOWN else electrode, *told, int(electrode in stimulated))
+        for label, electrode, *told in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+    unread = sorted(stimulated - set(channels.electrode.tolist()))
+    rows += [(None, electrode, None, None, None, 1) for electrode in unread]
+    return _write(folder, "culture-array", ("channel", "electrode", "x_um", "y_um", "rate_hz", "is_stimulated"), rows)
+
+
+def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) -> Path:
+    """Learning curves as means over policies with their 95 % intervals, random actions and the limit beside."""
+    head = ("condition", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "limit")
+    rows: list[tuple[Any, ...]] = []
+    for curve in curves:
+        ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
+        interval = (column.tolist() for column in mean_with_interval(curve.returns))
+        beside = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.limit))
+        iterations = (int(done) for done in curve.iterations)
+        rows += [(curve.name, *told) for told in zip(iterations, ended, *interval, *beside, strict=True)]
+    return _write(folder, f"{robot}-learning", head, rows)
+
+
+def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
+    """Quartiles over policies of every condition at every recording, random actions and the limits beside."""
+    head = ("mapping", "condition", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
+    rows = []
+    for panel in panels:
+        fine = dict(panel.fine_limit)
+        for course in panel.courses:
+            for i, at_min in enumerate(course.minutes.tolist()):
+                beside = (None if each is None else float(each[i]) for each in (panel.random, panel.limit))
+                quartiles = course.quartiles[:, i].tolist()
+                rows.append(
+                    (panel.title, course.name, at_min, len(course.returns), *quartiles, *beside, fine.get(at_min))
+                )
+    return _write(folder, f"{robot}-over-time", (*head, "limit_rough_grid", "limit_fine_grid"), rows)
+
+
+def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
+    """What is not known is an empty cell."""
+    known = ([None if isinstance(cell, float) and math.isnan(cell) else cell for cell in row] for row in rows)
+    return write_table(table_file(folder, name), head, known)
