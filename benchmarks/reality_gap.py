@@ -18,6 +18,19 @@ from typing import Any
 
 from animat.cli import main as animat
 
+COLUMNS = (
+    "culture",
+    "robot",
+    "presentation",
+    "percentiles",
+    "random",
+    "limit",
+    "predicted, 95 %",
+    "lived",
+    "gap, 95 %",
+    "of the range",
+    "pulses/action",
+)
 PRESENTATIONS = (("blocked", 1), ("mixed", 1), ("mixed", 5))
 
 
@@ -34,7 +47,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("gap"))
     options = parser.parse_args()
 
-    lines = []
+    lines: list[str] = []
     for seed in options.seeds:
         for order, pulses in PRESENTATIONS:
             folder = options.out / f"culture{seed}-{order}-{pulses}"
@@ -53,25 +66,35 @@ def main() -> None:
                         run += ["--controls", "all" if options.controls else "random", "--thresholds", thresholds]
                         run += ["--out", str(free(folder / robot / thresholds))]
                         table.write_text(json.dumps(ran(run)) + "\n")
-                    rows = json.loads(table.read_text())["rows"]
-                    lines.append((seed, robot, f"{order}, {pulses}", thresholds, rows))
-                    print(told(*lines[-1]), flush=True)
-    print("\n| culture | robot | presentation | percentiles | predicted, 95 % | lived | gap, 95 % | random | pulses/action |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for line in lines:
-        print(told(*line))
-
-
-def told(seed: int, robot: str, presentation: str, thresholds: str, rows: list[dict[str, Any]]) -> str:
-    """A line of the table."""
-    policies, random = rows[0], next(row for row in rows if row["name"] == "random")
-    prediction, gap = policies["prediction"], policies["gap"]
-    predicted = f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})"
-    between = f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})"
-    return (
-        f"| {seed} | {robot} | {presentation} | {thresholds} | {predicted} | {policies['lived']:.1f} | "
-        f"{between} | {random['lived']:.1f} | {policies['pulses_per_action']:.0f} |"
+                    lines.append(told(seed, f"{order}, {pulses}", thresholds, json.loads(table.read_text())))
+                    print(lines[-1], flush=True)
+    print(
+        "\n| culture | robot | presentation | percentiles | random | limit | predicted, 95 % | lived | gap, 95 % ",
+        end="",
     )
+    print("| of the range | pulses/action |")
+    print("|---" * 11 + "|")
+    print("\n".join(lines))
+
+
+def told(seed: int, presentation: str, thresholds: str, ran: dict[str, Any]) -> str:
+    """A line of the table; the range is from random to the limit, both on the simulator."""
+    policies, random = ran["rows"][0], next(row for row in ran["rows"] if row["name"] == "random")
+    prediction, gap = policies["prediction"], policies["gap"]
+    cells = (
+        f"{seed}",
+        ran["robot"],
+        presentation,
+        thresholds,
+        f"{random['predicted']:.1f}",
+        f"{ran['limit']:.1f}",
+        f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})",
+        f"{policies['lived']:.1f}",
+        f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})",
+        f"{100 * ran['gap_share']:+.0f} %",
+        f"{policies['pulses_per_action']:.0f}",
+    )
+    return f"| {' | '.join(cells)} |"
 
 
 def free(folder: Path) -> Path:

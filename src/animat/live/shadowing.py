@@ -18,7 +18,8 @@ import jax
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.series import recording_name
+from animat.cultures.series import STATE_FILE, recording_name
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Pace, check_plan
@@ -26,7 +27,7 @@ from animat.live.recording import record_within
 from animat.live.trainers import Trainers
 from animat.neurons.responses import Responses
 from animat.neurons.series import extract_series
-from animat.neurons.simulator import Kind
+from animat.neurons.simulator import Kind, pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies
@@ -95,6 +96,8 @@ def live(
     Then the policies run in closed loop, with percentiles of the last recording they were trained on.
 
     A simulated culture whose clock runs fast is not recorded again before all have gone over to the last simulators.
+    Beside the recordings of a virtual culture lies its state, after the newest of them and in the end after the loop
+    (`culture.state`): `animat run` goes on from it.
 
     Args:
         training: robot, mapping, policies, seed, algorithm; its duration is set to the pace's.
@@ -122,9 +125,7 @@ def live(
         policies = run.shadow()
         calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
         if training.percentiles == "first":
-            first = Calibration.of_series(run.used[:1], kind=kind).simulator.percentiles
-            held = replace(calibration.simulator, percentiles=first)  # type: ignore[type-var]
-            calibration = replace(calibration, simulator=held)
+            calibration = calibration.holding(pooled_percentiles(run.used[0]))
         gap = run_policies(
             policies,
             culture,
@@ -140,6 +141,9 @@ def live(
             **settings,
         )
         run.write("closed loop", **gap.session.to_dict())
+        # A culture that failed or hangs is in the middle of something: the state after its last recording is whole.
+        if gap.session.ending.by not in ("culture", "hang"):
+            run.keep_state()
     except BaseException:
         with suppress(InvalidFile):
             run.write("end", budget=run.account.to_dict())
@@ -259,6 +263,7 @@ class _Run:
         file = self.folder / RECORDINGS / recording_name(round(recording.start_min, 3))
         recording.save(file)
         self.files.append(file)
+        self.keep_state()
         try:
             series = [*self.used, *extract_series([recording])]
             timeline = self._fit(series)
@@ -275,8 +280,13 @@ class _Run:
         )
         return timeline
 
+    def keep_state(self) -> None:
+        """Write what a virtual culture is now beside its recordings, where `animat run` looks for it."""
+        if isinstance(self._culture, VirtualCulture):
+            self._culture.save_state(self.folder / RECORDINGS / STATE_FILE)
+
     def _fit(self, series: Sequence[Responses]) -> SimulatorTimeline:
-        # All are fitted again, so that histograms have the range of the first recording, and one shape.
+        # All are fitted again, so that they have one shape.
         timeline = fit_timeline(series, kind=self._kind)
         return timeline.with_first_percentiles() if self._training.percentiles == "first" else timeline
 

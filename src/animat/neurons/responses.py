@@ -96,9 +96,12 @@ class Responses:
         return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
 
     def redrawn(self, rng: np.random.Generator) -> Responses:
-        """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample."""
+        """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
+
+        Bursts are left out, and a condition without other responses stays without.
+        """
         rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
-        drawn = np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)])
+        drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
         return replace(
             self,
             condition=self.condition[drawn],

@@ -180,19 +180,22 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
 def fit_simulator(
     responses: Responses,
     *,
-    kind: Kind = "histogram",
+    kind: str = "histogram",
     bins: int = 20,
     range_hz: float | None = None,
     room: int | None = None,
 ) -> NeuronSimulator:
-    """Fit a simulator of either kind: `bins` and `range_hz` are of a histogram, `room` of an empirical one.
+    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of an empirical one.
 
     Raises:
-        InvalidArgument, UnusableData: as `fit_histogram` and `fit_empirical` do.
+        InvalidArgument: for another kind, and as `fit_histogram` and `fit_empirical` do.
+        UnusableData: if a condition has no non-burst response.
     """
     if kind == "histogram":
         return fit_histogram(responses, bins=bins, range_hz=range_hz)
-    return fit_empirical(responses, room=room)
+    if kind == "empirical":
+        return fit_empirical(responses, room=room)
+    raise InvalidArgument(f"kind: expected 'histogram' or 'empirical', got {kind!r}")
 
 
 def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -80,8 +79,6 @@ def fit_timeline(
     """
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
-    if kind not in get_args(Kind):
-        raise InvalidArgument(f"kind: expected 'histogram' or 'empirical', got {kind!r}")
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
     for other in ordered[1:]:

@@ -19,7 +19,7 @@ from animat.recordings.protocol import Presentation
 from animat.training.policy import Policy
 
 REDRAWN = 100
-"""Bootstrap samples of the recording's responses: enough for the 95 % interval of a prediction."""
+"""Bootstrap samples of the recording's responses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,9 @@ class Calibration:
         Raises:
             InvalidArgument, Mismatch, UnusableData: as `fit_timeline` does.
         """
-
         fit: dict[str, Any] = {"kind": kind, "bins": bins, "range_hz": range_hz}
         timeline = fit_timeline(series, **fit)
         trained = {} if policy is None else policy.provenance.get("training", {})
-        holds_percentiles = trained.get("percentiles") == "first"
-        if holds_percentiles:
-            timeline = timeline.with_first_percentiles()
         if at_min is None:
             at_min = float(timeline.start_min[-1] if policy is None else timeline.start_min[0])
             if trained.get("shadowing"):
@@ -89,13 +85,10 @@ class Calibration:
         row = timeline.row_at(at_min)
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)
-        simulator, rng = timeline.at(start_min), np.random.default_rng(0)
-        redrawn = tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN))
-        if holds_percentiles:
-            redrawn = tuple(replace(each, percentiles=simulator.percentiles) for each in redrawn)  # type: ignore[type-var]
-        return cls(
-            simulator=simulator,
-            redrawn=redrawn,
+        rng = np.random.default_rng(0)
+        calibration = cls(
+            simulator=timeline.at(start_min),
+            redrawn=tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN)),
             responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             start_min=start_min,
@@ -104,3 +97,13 @@ class Calibration:
             presentation=timeline.presentation,
             findings=tuple(f for f in timeline.findings if f.sentence.startswith(f"at {start_min:g} min: ")),
         )
+        held = trained.get("percentiles") == "first"
+        return calibration.holding(timeline.with_first_percentiles().at(start_min).percentiles) if held else calibration
+
+    def holding(self, percentiles: Any) -> Self:
+        """The same with one set of percentiles in all simulators, shape (11,): they do not move with the responses."""
+
+        def held(simulator: NeuronSimulator) -> NeuronSimulator:
+            return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
+
+        return replace(self, simulator=held(self.simulator), redrawn=tuple(map(held, self.redrawn)))

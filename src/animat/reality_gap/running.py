@@ -5,23 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
 
 from animat.animat import Animat
-from animat.closed_loop.contenders import (
-    AnyCondition,
-    Contender,
-    Greedy,
-    HandMadeRule,
-    InTurn,
-    OneCondition,
-    controls,
-    random_control,
-)
+from animat.closed_loop.contenders import Contender, Greedy, controls, random_control
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
@@ -29,33 +18,20 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
-from animat.evaluation.rollouts import Actor, Constant, Uniform, networks_of, roll_out
+from animat.evaluation.optimum import best_return
 from animat.evaluation.statistics import compare
-from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.progress import Progress
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.predicting import Predicted, predict
 from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding
 from animat.robots.steering import STEERED
 from animat.training.policy import Policy
 
-PREDICTED_EPISODES = 200
-"""Of each policy and control on the simulator."""
-
 OLD_MIN = 30.0
 """Age of a recording from which on a warning says that the culture may be another by now."""
-
-
-class Predicted(NamedTuple):
-    """What a simulator says of one contender.
-
-    Attributes:
-        returns: of its episodes on the simulator of the recording, shape (episodes,).
-        anew: its mean return on each simulator of the recording's responses drawn anew, shape (redrawn,).
-    """
-
-    returns: Float64[np.ndarray, " episodes"]
-    anew: Float64[np.ndarray, " redrawn"]
+LIMIT_RESOLUTION = 0.6
+"""Of the grid of the best possible return: fast and rough, 0.5 of the cartpole's 200."""
 
 
 def run_policies(
@@ -140,19 +116,17 @@ def run_policies(
     else:
         contenders.append(random_control(len(loop.conditions)))
 
-    def predict(contender: Contender, simulator: NeuronSimulator) -> Float64[np.ndarray, " episodes"]:
-        """The same contender on a simulator."""
-        actor, many = _actor(contender.controller, rule, greedy=greedy)
-        in_ = replace(environment, delivery="shuffled") if contender.delivery == "shuffled" else environment
-        on = silenced(simulator) if contender.delivery == "silent" else simulator
-        return roll_out(in_, on, actor, many, episodes=PREDICTED_EPISODES, seed=seed).returns.ravel()
-
-    predicted = {
-        contender.name: Predicted(
-            predict(contender, simulator), np.array([predict(contender, each).mean() for each in calibration.redrawn])
-        )
-        for contender in contenders
-    }
+    predicted = predict(
+        [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
+        environment,
+        # Held percentiles are what they are; those that follow the culture would follow other responses too.
+        calibration if follow else calibration.holding(calibration.simulator.percentiles),
+        rule,
+        greedy=greedy,
+        seed=seed,
+        progress=progress,
+    )
+    limit = best_return(environment, simulator, resolution=LIMIT_RESOLUTION, episodes=0).value
     session = run_session(
         culture, loop, contenders, folder, episodes=episodes, seed=seed, account=account, progress=progress
     )
@@ -162,24 +136,12 @@ def run_policies(
         loop.mapping.name,
         loop,
         calibration.start_min,
+        limit,
         rows,
         session,
         account,
         (*noticed, *findings, *calibration.findings),
     )
-
-
-def _actor(controller: Any, rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
-    """Who acts on the simulator as a controller does on the culture, and how many they are."""
-    if isinstance(controller, AnyCondition):
-        return Uniform(), 1
-    if isinstance(controller, OneCondition):
-        return Constant(jnp.array([controller.condition])), 1
-    if isinstance(controller, HandMadeRule) and rule is not None:
-        return rule, 1
-    acting = list(controller.by_name.values()) if isinstance(controller, InTurn) else [controller]
-    policies: list[Any] = [each.policy if isinstance(each, Greedy) else each for each in acting]
-    return networks_of(policies, greedy=greedy), len(policies)
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
