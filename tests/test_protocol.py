@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from animat.errors import InvalidArgument
-from animat.recordings.protocol import CLOSED_LOOP, PAPER, Presentation, Protocol
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.protocol import CLOSED_LOOP, PAPER, Presentation, Protocol, read_protocol
 from animat.recordings.schedule import make_schedule
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE
+from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
 
 PATTERNS = np.arange(500).reshape(100, 5)
 
@@ -145,6 +147,86 @@ def test_a_schedule_needs_the_patterns_that_its_protocol_uses(tmp_path: Path) ->
         make_schedule(PAPER, PATTERNS[:20], 0)
     with pytest.raises(InvalidArgument, match="seed: expected 0 or more"):
         make_schedule(PAPER, PATTERNS, -1)
-    for text in ("", "{}", '{"pulse": []}', PAPER.to_json().replace("pulses", "pulse_s")):
-        with pytest.raises(InvalidArgument, match=r"protocol: expected what Protocol.to_json writes|phases: expected"):
-            Protocol.from_json(text)
+
+
+def test_a_protocol_with_more_pulses_than_a_recording_can_have_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match="pulses: expected at most 10,000,000 in a recording"):
+        Protocol(pulses=10**12)
+
+
+# --- as JSON ----------------------------------------------------------------------------------------------------------
+
+PHASE = {"duration_us": 200, "amplitude_ua": -1}
+
+NOT_PROTOCOLS = {
+    "": "protocol: expected what Protocol.to_json writes, got ''",
+    "[5, 10]": "protocol: expected what Protocol.to_json writes",
+    "[" * 100_000: "protocol: expected what Protocol.to_json writes",
+    '{"pulse_s": 1}': "protocol: expected settings among frequencies_hz, .*, got 'pulse_s'",
+    '{"pulses": 1, "pulses": 2}': "pulses: expected once",
+    '{"pulses": 0}': "pulses: expected at least 1",
+    '{"pulses": 2.5}': "pulses: expected a whole number, got 2.5",
+    '{"pulses": true}': "pulses: expected a whole number, got True",
+    '{"patterns": "20"}': "patterns: expected a whole number, got '20'",
+    '{"presentations": 0}': "presentations: expected 1 to",
+    '{"order": "shuffled"}': "order: expected 'blocked' or 'mixed'",
+    '{"order": ["mixed"]}': "order: expected 'blocked' or 'mixed'",
+    '{"frequencies_hz": 5}': "frequencies_hz: expected a list of numbers, got 5",
+    '{"frequencies_hz": "5"}': "frequencies_hz: expected a list of numbers",
+    '{"frequencies_hz": [5, "10"]}': "frequencies_hz: expected a number, got '10'",
+    '{"frequencies_hz": [5, 5]}': "frequencies_hz: expected each once",
+    '{"frequencies_hz": [1' + "0" * 400 + "]}": "frequencies_hz: expected a number",
+    '{"frequencies_hz": [NaN]}': "frequencies_hz: expected some",
+    '{"pause_s": null}': "pause_s: expected a number, got 'None'",
+    '{"pause_s": Infinity}': "pause_s: expected finite seconds",
+    '{"tail_s": -1}': "tail_s: expected finite seconds from 0",
+    '{"pulse": []}': "phases: expected at least one",
+    '{"pulse": {"duration_us": 1}}': "pulse: expected a list of phases",
+    '{"pulse": [{"duration_us": 200}]}': "phase: expected either amplitude_mv or amplitude_ua",
+    '{"pulse": [{"duration_us": "200", "amplitude_ua": 1}]}': "pulse.duration_us: expected a number",
+    '{"pulse": [{"duration": 200, "amplitude_ua": 1}]}': "pulse: expected phases with duration_us",
+}
+
+
+@pytest.mark.parametrize("text", NOT_PROTOCOLS, ids=[text[:40] for text in NOT_PROTOCOLS])
+def test_what_is_no_protocol_is_refused_and_a_file_of_it_is_named(text: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match=NOT_PROTOCOLS[text]):
+        Protocol.from_json(text, PAPER)
+    with pytest.raises(InvalidArgument):
+        Protocol.from_json(text)
+    file = tmp_path / "mine.json"
+    file.write_text(text)
+    with pytest.raises(InvalidFile, match=rf"mine\.json: {NOT_PROTOCOLS[text]}"):
+        read_protocol(file)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):
+        read_protocol(tmp_path / "nothing.json")
+    for name in ("", "binary.json"):
+        with pytest.raises(InvalidFile, match="cannot be read"):
+            read_protocol(tmp_path / name)
+
+
+def test_without_a_pulse_it_is_not_known_what_a_recording_was_made_with() -> None:
+    with pytest.raises(InvalidArgument, match="with a pulse"):
+        Protocol.from_json('{"pulses": 5}')
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(protocol=protocols)
+def test_a_file_holds_a_protocol(protocol: Protocol, tmp_path: Path) -> None:
+    (tmp_path / "mine.json").write_text(protocol.to_json())
+    assert read_protocol(tmp_path / "mine.json", CLOSED_LOOP) == protocol
+
+
+def test_what_a_file_leaves_out_is_usual_and_whole_numbers_are_numbers(tmp_path: Path) -> None:
+    (tmp_path / "mine.json").write_text(json.dumps({"frequencies_hz": [5, 20], "pause_s": 3, "pulse": [PHASE]}))
+    found = read_protocol(tmp_path / "mine.json", CLOSED_LOOP)
+    pulse = Pulse((Phase(200.0, amplitude_ua=-1.0),))
+    same = replace(CLOSED_LOOP, frequencies_hz=(5.0, 20.0), pause_s=3.0, pulse=pulse)
+    # As text too, which is how a series knows its own protocol again.
+    assert (found, found.to_json()) == (same, same.to_json())
+    (tmp_path / "mine.json").write_text("{}")
+    assert read_protocol(tmp_path / "mine.json") == PAPER

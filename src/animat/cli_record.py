@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,6 +11,7 @@ from animat.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from animat.progress import Progress
+    from animat.recordings.protocol import Protocol
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,14 @@ class Record:
     """How many recordings"""
     interval_min: float = 10.0
     """Minutes from one recording to the next"""
-    order: Literal["blocked", "mixed"] = "blocked"
-    """blocked: all stimuli of a frequency together (the paper); mixed: shuffled, as a closed loop meets them"""
-    pulses: int = 1
-    """Pulses a presentation, the last one read; for a closed loop: mixed with 5"""
-    presentations: int = 100
-    """Presentations at each frequency"""
+    order: Literal["blocked", "mixed"] | None = None
+    """blocked: all stimuli of a frequency together (the paper), the default; mixed: shuffled, as in a closed loop"""
+    pulses: int | None = None
+    """Pulses a presentation, the last one read; for a closed loop: mixed with 5; default: 1"""
+    presentations: int | None = None
+    """Presentations at each frequency; default: 100"""
+    protocol: Path | None = None
+    """A file of JSON in place of these three, as Protocol.to_json writes it, with frequencies, times and pulse too"""
     out: Path = Path("recordings")
     """Folder for the files"""
     json: bool = False
@@ -55,6 +58,9 @@ class Record:
                 f"--selection: expected a file of electrodes for a maxone and none for others, got {self.selection} "
                 f"for --culture {self.culture}"
             )
+        asked = [f"--{name}" for name in ("order", "pulses", "presentations") if getattr(self, name) is not None]
+        if asked and self.protocol is not None:
+            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
         with Bar("recording") as progress:
             if self.culture == "made-up":
                 files = self._made_up(progress)
@@ -66,10 +72,11 @@ class Record:
     def _made_up(self, progress: Progress) -> list[Path]:
         from animat.recordings.made_up import write_made_up_series
 
-        if (self.order, self.pulses, self.presentations) != ("blocked", 1, 100):
+        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.presentations in (None, 100)
+        if not usual or self.protocol is not None:
             raise InvalidArgument(
-                "--order, --pulses, --presentations: made-up recordings are blocked, with one pulse and 100 "
-                "presentations; --culture virtual takes others"
+                "--order, --pulses, --presentations, --protocol: made-up recordings are blocked, with one pulse and "
+                "100 presentations; --culture virtual takes others"
             )
         return write_made_up_series(
             self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
@@ -78,11 +85,10 @@ class Record:
     def _virtual(self, progress: Progress) -> list[Path]:
         from animat.cultures.series import record_virtual_series
         from animat.cultures.virtual import VirtualCulture
-        from animat.recordings.protocol import Protocol
 
         return record_virtual_series(
             lambda: VirtualCulture(self.seed, progress=progress),
-            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations),
+            self._protocol(),
             self.out,
             sessions=self.sessions,
             interval_min=self.interval_min,
@@ -90,24 +96,19 @@ class Record:
         )
 
     def _living(self, progress: Progress) -> list[Path]:
-        from animat.cultures.kinds import culture_of, pulse_for
+        from animat.cultures.kinds import culture_of
         from animat.cultures.living_series import record_living_series
-        from animat.recordings.protocol import Protocol
+        from animat.cultures.series import check_interval
         from animat.recordings.reading import read_recordings
 
         assert self.culture != "made-up"
+        # What can be refused is refused before a culture is opened, whose patterns are not known until then.
+        check_interval(self._protocol(), self.sessions, self.interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
         with culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture:
-            protocol = Protocol(
-                order=self.order,
-                pulses=self.pulses,
-                presentations=self.presentations,
-                patterns=min(100, len(culture.patterns)),
-                pulse=pulse_for(self.culture),
-            )
             series = record_living_series(
                 culture,
-                protocol,
+                self._protocol(len(culture.patterns)),
                 self.out,
                 sessions=self.sessions,
                 interval_min=self.interval_min,
@@ -117,3 +118,15 @@ class Record:
         for minute in series.missed_min:
             print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
         return series.files
+
+    def _protocol(self, patterns: int = 100) -> Protocol:
+        """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
+        from animat.cultures.kinds import pulse_for
+        from animat.recordings.protocol import Protocol, read_protocol
+
+        assert self.culture != "made-up"
+        usual = Protocol(patterns=min(100, patterns), pulse=pulse_for(self.culture))
+        if self.protocol is not None:
+            return read_protocol(self.protocol, usual)
+        asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}
+        return replace(usual, **{name: value for name, value in asked.items() if value is not None})

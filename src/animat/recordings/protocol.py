@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
-from typing import Literal, get_args
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
 
 Order = Literal["blocked", "mixed"]
+
+_MOST_PULSES = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,16 @@ class Protocol:
         for name in ("setup_s", "pause_s", "tail_s"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InvalidArgument(f"{name}: expected finite seconds from 0, got {getattr(self, name)}")
+            # A series knows its own protocol by its text, in which 14 is not 14.0.
+            object.__setattr__(self, name, float(getattr(self, name)))
         # The order and the number of pulses are checked there.
         _ = self.presentation
+        pulses = len(self.frequencies_hz) * self.presentations * self.pulses
+        if pulses > _MOST_PULSES:
+            raise InvalidArgument(
+                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x presentations x pulses), got "
+                f"{pulses:,}"
+            )
 
     @property
     def presentation(self) -> Presentation:
@@ -103,17 +115,89 @@ class Protocol:
         return json.dumps({**data, "pulse": self.pulse.to_list()})
 
     @staticmethod
-    def from_json(text: str) -> Protocol:
+    def from_json(text: str, defaults: Protocol | None = None) -> Protocol:
         """From what `to_json` gave.
 
+        Args:
+            text: an object of JSON whose keys are the attributes.
+            defaults: what a key that is left out stands for; None: the defaults above, and the pulse must be given.
+
         Raises:
-            InvalidArgument: for anything else.
+            InvalidArgument: for anything else, naming the key, what was expected and what came.
         """
         try:
-            data = json.loads(text)
-            return Protocol(**{**data, "pulse": Pulse.from_list(data["pulse"])})
-        except (ValueError, TypeError, KeyError) as error:
+            data = json.loads(text, object_pairs_hook=_each_once)
+        except (ValueError, RecursionError) as error:
+            if isinstance(error, InvalidArgument):
+                raise
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}") from error
+        if not isinstance(data, dict):
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
+        known = [each.name for each in fields(Protocol)]
+        for name in data:
+            if name not in known:
+                raise InvalidArgument(f"protocol: expected settings among {', '.join(known)}, got {name!r}")
+        if defaults is None and "pulse" not in data:
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
+        return replace(defaults or PAPER, **{name: _setting(name, value) for name, value in data.items()})
+
+
+def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
+    """Read a protocol from a file of JSON, as `Protocol.to_json` writes it.
+
+    Args:
+        path: of the file.
+        defaults: what a key that is left out stands for; None: the defaults of `Protocol`.
+
+    Raises:
+        InvalidFile: naming the file, the key, what was expected and what came.
+    """
+    path = Path(path)
+    try:
+        return Protocol.from_json(path.read_text(encoding="utf-8"), defaults or PAPER)
+    except FileNotFoundError as error:
+        raise InvalidFile(f"{path}: no such file") from error
+    except InvalidArgument as error:
+        raise InvalidFile(f"{path}: {error}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidFile(f"{path}: cannot be read: {error}") from error
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; of a key that stands there twice, one value would be dropped in silence."""
+    data: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in data:
+            raise InvalidArgument(f"{name}: expected once, got it twice")
+        data[name] = value
+    return data
+
+
+def _setting(name: str, value: Any) -> Any:
+    """A value of JSON as its attribute is; what it may be beyond its type is checked where a `Protocol` is made."""
+    if name == "frequencies_hz":
+        if not isinstance(value, list):
+            raise InvalidArgument(f"{name}: expected a list of numbers, got {value!r}")
+        return tuple(_number(name, each) for each in value)
+    if name == "pulse":
+        if not isinstance(value, list) or not all(isinstance(phase, dict) for phase in value):
+            raise InvalidArgument(f"{name}: expected a list of phases with duration_us and an amplitude, got {value!r}")
+        return Pulse.from_list([{key: _number(f"pulse.{key}", x) for key, x in phase.items()} for phase in value])
+    if name in ("patterns", "presentations", "pulses"):
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise InvalidArgument(f"{name}: expected a whole number, got {value!r}")
+        return value
+    return value if name == "order" else _number(name, value)
+
+
+def _number(name: str, value: Any) -> float:
+    # As a float always, as it is in a `Protocol`: a series knows its own by its text.
+    try:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+    except OverflowError:
+        pass
+    raise InvalidArgument(f"{name}: expected a number, got {str(value)[:40]!r}")
 
 
 PAPER = Protocol()

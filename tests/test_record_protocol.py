@@ -1,0 +1,130 @@
+"""`animat record --protocol`: what is recorded is what the file says, and a file that cannot be is told at once."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.cultures.base import Culture
+from animat.cultures.kinds import pulse_for
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.protocol import Protocol, read_protocol
+from animat.recordings.reading import read_recording
+from animat.recordings.schedule import make_schedule
+from animat.recordings.stimulus import BALANCED_PULSE
+
+PATTERNS = np.arange(500).reshape(100, 5)
+MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)
+
+
+@pytest.fixture
+def replayed(tmp_path: Path) -> list[str]:
+    """The command that records a replay of a made-up recording, as far as the protocol."""
+    make_up_recording(1, patterns=6, channels=16).save(tmp_path / "made-up.nwb")
+    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(tmp_path / "made-up.nwb"), "--out",
+            str(tmp_path / "out")]  # fmt: skip
+
+
+def test_a_culture_is_recorded_as_the_file_says(
+    replayed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.json").write_text(MINE.to_json())
+    assert main([*replayed, "--protocol", str(tmp_path / "mine.json"), "--json"]) == 0
+    (file,) = json.loads(capsys.readouterr().out.splitlines()[-1])["recordings"]
+    recording = read_recording(file)
+    assert Protocol.from_json(recording.provenance["protocol"]) == MINE
+    assert str(recording.presentation) == "mixed, 3 pulses a presentation"
+    frequency_hz, times = np.unique(recording.stimuli.frequency_hz, return_counts=True)
+    assert (frequency_hz.tolist(), times.tolist()) == ([5.0, 40.0], [6, 6])
+    assert recording.stimuli.time_s[0] == pytest.approx(3.0)
+    assert set(recording.stimuli.pattern.tolist()) <= set(range(4))
+    # The same command finds nothing to do; with another file it is another series.
+    assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 1
+    assert "clock" in capsys.readouterr().err
+    (tmp_path / "mine.json").write_text(MINE.to_json().replace("40.0", "20.0"))
+    assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 1
+    assert "another protocol" in capsys.readouterr().err
+
+
+def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path: Path) -> None:
+    """Patterns are as many as the culture has, which a replay of six has fewer of than usual; order and pulses too."""
+    (tmp_path / "mine.json").write_text('{"presentations": 6}')
+    assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 0
+    told = read_recording(tmp_path / "out" / "recording_0000_min.nwb").provenance["protocol"]
+    assert Protocol.from_json(told) == Protocol(patterns=6, presentations=6, pulse=pulse_for("replay"))
+
+
+def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(
+        "animat.cultures.series.record_virtual_series", lambda culture, protocol, out, **_: asked.append(protocol) or []
+    )
+    (tmp_path / "mine.json").write_text('{"frequencies_hz": [5, 20], "setup_s": 0}')
+    assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]) == 0
+    assert main(["record", "--order", "mixed", "--pulses", "5", "--out", str(tmp_path / "out")]) == 0
+    assert main(["record", "--out", str(tmp_path / "out")]) == 0
+    assert asked == [Protocol((5, 20), setup_s=0), Protocol(order="mixed", pulses=5), Protocol()]
+
+
+@pytest.mark.parametrize("culture", ["virtual", "replay"])
+@pytest.mark.parametrize(
+    ("text", "more", "words"),
+    [
+        (None, [], "no such file"),
+        ("frequencies_hz = [5]", [], "mine.json: protocol: expected what Protocol.to_json writes"),
+        ('{"frequency_hz": [5]}', [], "mine.json: protocol: expected settings among frequencies_hz"),
+        ('{"pulses": 0}', [], "mine.json: pulses: expected at least 1"),
+        ('{"setup_s": 700}', ["--sessions", "2"], "interval_min: expected at least"),
+        (MINE.to_json(), ["--order", "mixed"], "--protocol: expected it alone, got --order too"),
+        (MINE.to_json(), ["--pulses", "1", "--presentations", "100"], "got --pulses, --presentations too"),
+    ],
+)
+def test_what_cannot_be_is_one_line_before_a_culture_is_opened(
+    culture: str,
+    text: str | None,
+    more: list[str],
+    words: str,
+    replayed: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Culture, "open", lambda self: pytest.fail("opened"))
+    if text is not None:
+        (tmp_path / "mine.json").write_text(text)
+    command = replayed if culture == "replay" else ["record", "--out", str(tmp_path / "out")]
+    assert main([*command, "--protocol", str(tmp_path / "mine.json"), *more]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("animat: ") and words in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_made_up_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.json").write_text(MINE.to_json())
+    command = ["record", "--culture", "made-up", "--out", str(tmp_path / "out")]
+    for more in (["--protocol", str(tmp_path / "mine.json")], ["--pulses", "0"], ["--order", "mixed"]):
+        assert main([*command, *more]) == 1
+        assert "--protocol: made-up recordings are blocked" in capsys.readouterr().err
+
+
+def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "recording-a-culture.md").read_text()
+    (example,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "mine.json").write_text(example)
+    protocol = read_protocol(tmp_path / "mine.json")
+    assert set(json.loads(example)) == set(json.loads(protocol.to_json()))
+    assert protocol.pulse == BALANCED_PULSE
+    schedule = make_schedule(protocol, PATTERNS, seed=1)
+    stimulated_s = sum(protocol.pulses * protocol.presentations / f for f in protocol.frequencies_hz)
+    told = re.search(r"([\d,]+)\s+pulses, ([\d.]+) s of stimulation, ([\d.]+) s with set-up and pause", page)
+    assert told is not None
+    pulses, stimulated, whole = told.groups()
+    assert int(pulses.replace(",", "")) == len(schedule)
+    assert float(stimulated) == pytest.approx(stimulated_s, abs=0.05)
+    assert float(whole) == pytest.approx(schedule.duration_s, abs=0.06)
