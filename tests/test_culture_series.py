@@ -136,6 +136,34 @@ def test_a_complete_series_gets_its_selection_back_and_needs_no_state(undisturbe
     assert not (folder / STATE_FILE).exists()
 
 
+def test_a_series_that_needs_its_state_is_recorded_again_to_have_it(undisturbed: list[Path], tmp_path: Path) -> None:
+    folder = copied(undisturbed[:2], tmp_path / "series")
+    state = (folder / STATE_FILE).read_bytes()
+    (folder / STATE_FILE).unlink()
+
+    def again() -> list[Path]:
+        return record_virtual_series(
+            lambda: small_culture(1), SHORT, folder, sessions=4, interval_min=2.0, needs_state=True
+        )
+
+    assert same(again(), undisturbed)
+    assert (folder / STATE_FILE).read_bytes() == state
+    (folder / STATE_FILE).write_bytes(b"damaged")
+    with pytest.raises(InvalidFile, match=r"culture.state: expected the whole state"):
+        again()
+
+
+def test_a_state_after_something_else_is_not_gone_on_from(undisturbed: list[Path], tmp_path: Path) -> None:
+    folder = copied(undisturbed, tmp_path / "series")
+    culture = small_culture(1)
+    culture.restore_state(folder / STATE_FILE)
+    with culture:
+        culture.save_state(folder / STATE_FILE)
+    assert same(record(folder), undisturbed)
+    with pytest.raises(Mismatch, match=r"culture.state: expected the state of a series .* choose another folder"):
+        record(folder, sessions=5)
+
+
 def test_a_second_run_in_a_folder_at_work_is_refused(undisturbed: list[Path]) -> None:
     folder = undisturbed[0].parent
     with alone_in(folder), pytest.raises(Mismatch, match="another run is at work in this folder"):

@@ -12,7 +12,9 @@ import pytest
 
 from animat.cli import main
 from animat.cultures.budget import Account, Budget
+from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import (
     AnimatError,
     BudgetSpent,
@@ -37,6 +39,7 @@ from animat.robots import Navigation
 from animat.training.policy import load_policies
 from animat.training.sac import SAC
 from animat.training.specification import Training
+from cultures import small_culture
 from fake_culture import FakeCulture
 
 SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
@@ -116,6 +119,30 @@ def test_the_loop_runs_with_what_was_trained_on_last(lived: tuple[Lived, Path, i
     again = Calibration.of_series(series, found.policies["p0"])
     np.testing.assert_array_equal(again.percentiles, gap.loop.percentiles)
     assert gap.account.pulses == delivered == 3 * PULSES + sum(e.pulses for e in gap.session.episodes)
+
+
+def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    after = []
+    save_state = VirtualCulture.save_state
+
+    def noted(self: VirtualCulture, *given: Any, **more: Any) -> None:
+        after.append(self.now_s)
+        save_state(self, *given, **more)
+
+    monkeypatch.setattr(VirtualCulture, "save_state", noted)
+    with small_culture() as culture:
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+        lived_s = culture.now_s
+    recordings = read_recordings(found.recordings)
+    # After each recording, in case the run is killed, and after the loop.
+    begun_s = [60 * each.start_min for each in recordings]
+    assert [begun < kept < begun + 600 for begun, kept in zip(begun_s, after[:-1], strict=True)] == [True] * 3
+    assert after[-1] == lived_s > 30 * 60
+    known = recorded_culture("virtual", recordings, [tmp_path / "live" / "recordings"])
+    assert known == {"seed": 1, "state": tmp_path / "live" / "recordings" / "culture.state"}
+    goes_on = small_culture()
+    goes_on.restore_state(known["state"])
+    assert goes_on.now_s == lived_s
 
 
 def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
@@ -296,8 +297,16 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
 
     undisturbed = record("undisturbed")
     assert sorted(undisturbed.outputs) == [
-        "recordings/recording_0000_min.nwb", "recordings/recording_0002_min.nwb", "recordings/selection.json",
+        "recordings/culture.state", "recordings/recording_0000_min.nwb", "recordings/recording_0002_min.nwb",
+        "recordings/selection.json",
     ]  # fmt: skip
+    # From there `animat run` goes on: from after the last recording.
+    recordings = tmp_path / "undisturbed" / "recordings"
+    known = recorded_culture("virtual", read_recordings(recordings), [recordings])
+    assert known == {"seed": 1, "state": recordings / "culture.state"}
+    later = small_culture(1, rule=rule)
+    assert later.restore_state(known["state"]) == {"sessions": 2}
+    assert later.now_s > 120 + read_recording(recordings / "recording_0002_min.nwb").duration_s
     save_state = VirtualCulture.save_state
 
     def killed(self: VirtualCulture, path: Path, *, sessions: int) -> None:
@@ -311,6 +320,12 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
             record("killed")
     assert record("killed") == undisturbed
     assert files(tmp_path / "killed") == files(tmp_path / "undisturbed")
+
+    state = tmp_path / "killed" / "recordings" / "culture.state"
+    for damage in (state.unlink, lambda: state.write_bytes(b"damaged")):
+        undisturbed.save(tmp_path / "killed")
+        damage()
+        assert record("killed") == undisturbed
 
 
 def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:

@@ -138,7 +138,7 @@ class Run(Stimulating):
             Bar("closed loop") as progress,
             self._culture(recordings, progress) as culture,
         ):
-            pulse, patterns, noticed = self._presenting(culture, recordings)
+            pulse, patterns, noticed = self._presenting(culture, recordings, calibration)
             if calibration is None:
                 recording = self._record(culture, first, account, progress)
                 calibration = self._calibration([recording], first, recording.start_min)
@@ -181,17 +181,18 @@ class Run(Stimulating):
         )
 
     def _presenting(
-        self, culture: Culture, recordings: Sequence[Recording]
+        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration | None
     ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
         """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
         from animat.cultures.kinds import pulse_for
+        from animat.cultures.same_culture import other_culture
         from animat.cultures.same_patterns import other_patterns
         from animat.recordings.protocol import Protocol
 
-        if not recordings:
+        if calibration is None:
             return pulse_for(self.culture), None, ()
-        found = other_patterns(recordings[0], culture)
-        noticed = () if found is None else (found,)
+        found = other_culture(recordings[0], calibration.start_min, culture), other_patterns(recordings[0], culture)
+        noticed = tuple(finding for finding in found if finding is not None)
         told = recordings[0].provenance.get("protocol")
         if told is None:
             return pulse_for(self.culture), None, noticed

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +41,8 @@ def record_virtual_series(
     Whatever interrupts it, at whatever moment, calling it again gives the very recordings that an undisturbed run
     gives, and the state after the last. Every file is complete or absent. After each recording the culture's state is
     written (`culture.state`); a series goes on from it. What lies between the state and the recordings that are there
-    is recorded again and compared; where there is no state, that is all of an unfinished series. The electrodes in use are written to
-    `selection.json`.
+    is recorded again and compared; where there is no state, that is all of an unfinished series. The electrodes in use
+    are written to `selection.json`.
 
     Args:
         make_culture: makes the culture, new and closed.
@@ -133,9 +132,12 @@ def _is_behind(culture: VirtualCulture, state: Path, sessions: int, needs_state:
     """
     if not state.exists():
         return needs_state
-    with suppress(*(() if needs_state else (InvalidFile, Mismatch))):
+    try:
         return _recorded(culture, state) < sessions
-    return False
+    except (InvalidFile, Mismatch):
+        if needs_state:
+            raise
+        return False
 
 
 def _recorded(culture: VirtualCulture, state: Path) -> int:

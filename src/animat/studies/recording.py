@@ -36,8 +36,8 @@ class Record(Task):
         )
         for file in files:
             settle_identity(file)
-        selection = out / SELECTION_FILE
-        return [*files, *([selection] if study.culture.kind == "virtual" else [])]
+        kept = (SELECTION_FILE, STATE_FILE) if study.culture.kind == "virtual" else ()
+        return [*files, *(out / name for name in kept)]
 
     def _copies(self, study: Study, out: Path, progress: _Told) -> list[Path]:
         from animat.recordings.reading import read_recordings
@@ -68,17 +68,16 @@ def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
     from animat.recordings.protocol import Protocol
 
     culture = study.culture
-    files = record_virtual_series(
+    return record_virtual_series(
         lambda: VirtualCulture(culture.seed),
         Protocol(order=culture.order, pulses=culture.pulses, presentations=culture.presentations),
         out,
         sessions=culture.sessions,
         interval_min=culture.interval_min,
+        # From which `animat run` goes on; its bytes follow from the culture.
+        needs_state=True,
         progress=progress,
     )
-    # For a series that goes on. This one is complete, and the file tells which run made it.
-    (out / STATE_FILE).unlink(missing_ok=True)
-    return files
 
 
 def _made_up(study: Study, out: Path, progress: _Told) -> list[Path]:
