@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,8 @@ from animat.closed_loop.contenders import (
 from animat.closed_loop.following import Following
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import read_session
+from animat.closed_loop.session import read_session, recover_session
+from animat.closed_loop.tick import Tick
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
 from animat.cultures.observed import Observed, Spikes
@@ -115,6 +117,75 @@ def assert_read_alike(folder: Path, loop: Loop) -> None:
     np.testing.assert_array_equal(responses.is_burst, [tick.is_burst for tick in stimulated])
     np.testing.assert_array_equal(responses.condition, [tick.delivered for tick in stimulated])
     np.testing.assert_array_equal(responses.time_s, [tick.read_after_s for tick in stimulated])
+
+
+def assert_table_is_the_session(folder: Path, names: list[str]) -> None:
+    """`ticks.csv`, read without this package, is what the log says."""
+    session = read_session(folder)
+    with session.ticks_file.open(newline="") as file:
+        table = list(csv.DictReader(file))
+
+    def number(cell: str) -> float | None:
+        return float(cell) if cell else None
+
+    def numbers(cell: str) -> tuple[float, ...]:
+        return tuple(float(word) for word in cell.split())
+
+    again = [
+        Tick(
+            number=int(row["tick"]),
+            contender=row["contender"],
+            episode=int(row["episode"]),
+            iteration=int(row["iteration"]),
+            chosen=[c.label for c in CONDITIONS].index(row["chosen"]),
+            delivered=[c.label for c in CONDITIONS].index(row["delivered"]),
+            frequency_hz=float(row["frequency_hz"]),
+            patterns=tuple(int(pattern) for pattern in numbers(row["patterns"])),
+            pulse_time_s=numbers(row["pulse_times_s"]),
+            read_after_s=float(row["time_s"]),
+            spikes=int(row["spikes"]),
+            rate_hz=float(row["rate_hz"]),
+            active_ratio=float(row["active_ratio"]),
+            is_burst=row["is_burst"] == "1",
+            handled=row["handled"],  # type: ignore[arg-type]
+            command=number(row["command"]),
+            reward=number(row["reward"]),
+            observation=tuple(float(row[name]) for name in names if row[name]),
+            terminated=row["is_terminated"] == "1",
+            truncated=row["is_truncated"] == "1",
+            late_s=float(row["late_s"]),
+            decided_s=float(row["decided_s"]),
+            wall_s=float(row["wall_s"]),
+        )
+        for row in table
+    ]
+    assert tuple(again) == session.ticks
+    assert len(again) > 0
+
+
+@pytest.mark.parametrize(
+    ("robot", "names"),
+    [
+        (SHORT, ["x_m", "y_m", "heading_rad"]),
+        (
+            Cartpole(episode_limit=6),
+            ["cart_position_m", "cart_velocity_m_per_s", "pole_angle_rad", "pole_angular_velocity_rad_per_s"],
+        ),
+    ],
+)
+def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Robot[Any], names: list[str]) -> None:
+    loop = loop_of(robot=robot, pulses=2, burst_threshold=0.9, on_burst="repeat")
+    contenders = [RANDOM, Contender("no", "", OneCondition(0), "silent")]
+    with FakeCulture(1) as culture:
+        session = run_session(culture, loop, contenders, tmp_path, episodes=3)
+    assert {tick.handled for tick in session.ticks} == {"used", "repeated"}
+    assert_table_is_the_session(tmp_path, names)
+    said = read_recording(session.recording_file).provenance["session_description"]
+    assert "(random, no): ticks.csv" in said
+    written = session.ticks_file.read_bytes()
+    session.ticks_file.unlink()
+    recover_session(tmp_path)
+    assert session.ticks_file.read_bytes() == written
 
 
 def test_on_the_virtual_culture_too(tmp_path: Path) -> None:

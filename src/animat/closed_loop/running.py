@@ -60,7 +60,7 @@ def run_session(
         culture: open; it stays open.
         loop: the settings.
         contenders: who acts.
-        folder: for `session.log` and `session.nwb`.
+        folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line a tick.
         episodes: of each contender.
         seed: decides every random draw, but what the culture does.
         account: of a stimulation budget; None: without end.
@@ -84,7 +84,7 @@ def run_session(
         log.close()
     session = replace(read_session(log.path), ending=ending)
     try:
-        session.recording().save(session.recording_file)
+        session.write()
     except InvalidFile as error:
         sentence = f"{ending.sentence}; and {error} (animat recover {folder} writes it when there is room)"
         session = replace(session, ending=replace(ending, sentence=sentence))

@@ -14,12 +14,15 @@ import numpy as np
 
 from animat.closed_loop.log import Log, read_log
 from animat.closed_loop.tick import Ending, Tick
+from animat.closed_loop.tick_table import write_ticks
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.robots.registry import robot_from_dict
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
+TICKS_FILE = "ticks.csv"
 FORMAT = "animat closed-loop session 1"
 
 
@@ -68,6 +71,11 @@ class Session:
     def recording_file(self) -> Path:
         """Where its recording is, once it was written."""
         return self.folder / RECORDING_FILE
+
+    @property
+    def ticks_file(self) -> Path:
+        """Where its ticks are as a table, once it was written."""
+        return self.folder / TICKS_FILE
 
     @cached_property
     def ticks(self) -> tuple[Tick, ...]:
@@ -141,6 +149,7 @@ class Session:
                 presentation=Presentation("mixed", header["loop"]["pulses"]),
                 provenance={
                     **header["provenance"],
+                    "session_description": _described([each["name"] for each in header["contenders"]]),
                     "recorded_at": header["recorded_at"],
                     "closed_loop": json.dumps(header["loop"]),
                     "closed_loop_ended": f"{self.ending.by}: {self.ending.sentence}",
@@ -151,6 +160,20 @@ class Session:
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InvalidFile(f"{self.folder / LOG_FILE}: expected a session's log, got {error!r}") from error
+
+    def write(self) -> None:
+        """Write the ticks as a table, and the recording after it: once it is there, so are both.
+
+        Raises:
+            InvalidFile: if the log does not fit together, or a file cannot be written.
+        """
+        try:
+            loop = self.log.header["loop"]
+            conditions, quantities = loop["conditions"], robot_from_dict(loop["robot"]).quantities
+            write_ticks(self.ticks_file, self.ticks, conditions, quantities)
+        except (KeyError, TypeError, IndexError, InvalidArgument) as error:
+            raise InvalidFile(f"{self.folder / LOG_FILE}: expected a session's log, got {error!r}") from error
+        self.recording().save(self.recording_file)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
@@ -214,13 +237,13 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
 
 
 def recover_session(path: str | os.PathLike[str]) -> Session:
-    """Read a session whose program was killed, and write the recording that it did not come to write.
+    """Read a session whose program was killed, and write the recording and the table that it did not come to write.
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
     """
     session = read_session(path)
-    session.recording().save(session.recording_file)
+    session.write()
     return session
 
 
@@ -235,6 +258,14 @@ def told_unanswered(session: Session) -> str:
 def told_left_out(session: Session) -> str:
     """What the session does not have, in words."""
     return ", ".join(f"{count} {what}" for what, count in session.left_out.items())
+
+
+def _described(contenders: Sequence[str]) -> str:
+    return (
+        "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
+        f"from episode to episode ({', '.join(contenders)}): {TICKS_FILE} beside this file tells whose each stimulus "
+        "was, and what came of it."
+    )
 
 
 def _pulses(asked: Sequence[dict[str, Any]]) -> int:
