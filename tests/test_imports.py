@@ -100,6 +100,27 @@ def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
     for name in animat.__all__:
         thing = getattr(animat, name)
         assert getattr(thing, "__name__", name) == name
+    # What is in the package under the same name would be there or not, by what was imported before.
+    assert not set(animat.__all__) & {path.stem for path in PACKAGE.iterdir()}
     # The nouns of the story that a study is made of are not those of its specification.
     assert animat.Condition.__module__ == "animat.neurons.conditions"
     assert {"Study", "run_study", "read_study", "paper_study", "best_return"} <= set(animat.__all__)
+
+
+def test_every_error_that_a_user_may_catch_is_public() -> None:
+    import animat
+    from animat import errors
+
+    kinds = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
+    assert {"UnsafeStimulus", "DeviceFailed", "BudgetSpent", "LoopEnded"} < kinds
+    assert kinds <= set(animat.__all__)
+
+
+def test_the_whole_story_is_public() -> None:
+    import animat
+
+    story = ["Recording", "Protocol", "Selection", "Culture", "Limits", "VirtualCulture", "ReplayCulture", "Responses",
+             "NeuronSimulator", "Mapping", "Robot", "Animat", "train", "Policy", "evaluate", "Loop", "run_policies",
+             "Study"]  # fmt: skip
+    assert [name for name in animat.__all__ if name in story] == story
+    assert issubclass(animat.VirtualCulture, animat.Culture) and issubclass(animat.ReplayCulture, animat.Culture)

@@ -12,7 +12,22 @@ from animat.gym import register_environments
 
 if TYPE_CHECKING:
     from animat.animat import Animat, WithoutNeurons
-    from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
+    from animat.closed_loop.loop import Loop
+    from animat.cultures.base import Culture
+    from animat.cultures.replay import ReplayCulture
+    from animat.cultures.safety import Limits
+    from animat.cultures.virtual import VirtualCulture
+    from animat.errors import (
+        AnimatError,
+        BudgetSpent,
+        DeviceFailed,
+        InvalidArgument,
+        InvalidFile,
+        LoopEnded,
+        Mismatch,
+        UnsafeStimulus,
+        UnusableData,
+    )
     from animat.evaluation.optimum import Optimum, best_return, best_returns
     from animat.evaluation.prospects import prospects
     from animat.evaluation.statistics import compare
@@ -24,10 +39,12 @@ if TYPE_CHECKING:
     from animat.neurons.series import extract_series
     from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
     from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+    from animat.reality_gap import Calibration, run_policies
     from animat.recordings.findings import Finding
-    from animat.recordings.protocol import Presentation
+    from animat.recordings.protocol import Presentation, Protocol, read_protocol
     from animat.recordings.reading import read_recording, read_recordings
     from animat.recordings.recording import Channels, Recording, Stimuli
+    from animat.recordings.selection import Selection
     from animat.robots import Cartpole, Navigation, Robot, robot_named
     from animat.studies.paper import paper_study
     from animat.studies.run import run_study
@@ -40,9 +57,14 @@ if TYPE_CHECKING:
 
 _WHERE = {
     "recordings.recording": ("Recording", "Channels", "Stimuli"),
-    "recordings.protocol": ("Presentation",),
+    "recordings.protocol": ("Presentation", "Protocol", "read_protocol"),
+    "recordings.selection": ("Selection",),
     "recordings.findings": ("Finding",),
     "recordings.reading": ("read_recording", "read_recordings"),
+    "cultures.base": ("Culture",),
+    "cultures.safety": ("Limits",),
+    "cultures.virtual": ("VirtualCulture",),
+    "cultures.replay": ("ReplayCulture",),
     "neurons.conditions": ("Condition", "conditions_named"),
     "neurons.responses": ("Responses", "extract_responses"),
     "neurons.series": ("extract_series",),
@@ -60,11 +82,23 @@ _WHERE = {
     "evaluation.optimum": ("Optimum", "best_return", "best_returns"),
     "evaluation.prospects": ("prospects",),
     "evaluation.statistics": ("compare",),
+    "closed_loop.loop": ("Loop",),
+    "reality_gap": ("Calibration", "run_policies"),
     "studies.specification": ("Study",),
     "studies.paper": ("paper_study",),
     "studies.toml": ("read_study",),
     "studies.run": ("run_study",),
-    "errors": ("AnimatError", "InvalidArgument", "InvalidFile", "UnusableData", "Mismatch"),
+    "errors": (
+        "AnimatError",
+        "InvalidArgument",
+        "InvalidFile",
+        "UnusableData",
+        "Mismatch",
+        "UnsafeStimulus",
+        "BudgetSpent",
+        "LoopEnded",
+        "DeviceFailed",
+    ),
 }
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -73,9 +107,16 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "Channels",
     "Stimuli",
     "Presentation",
+    "Protocol",
+    "read_protocol",
+    "Selection",
     "Finding",
     "read_recording",
     "read_recordings",
+    "Culture",
+    "Limits",
+    "VirtualCulture",
+    "ReplayCulture",
     "Condition",
     "conditions_named",
     "Responses",
@@ -110,6 +151,9 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "best_returns",
     "prospects",
     "compare",
+    "Loop",
+    "Calibration",
+    "run_policies",
     "Study",
     "paper_study",
     "read_study",
@@ -119,6 +163,10 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "InvalidFile",
     "UnusableData",
     "Mismatch",
+    "UnsafeStimulus",
+    "BudgetSpent",
+    "LoopEnded",
+    "DeviceFailed",
 ]
 
 # Gymnasium has known plugins only by their import since 1.0. Nothing of an environment is loaded by this.
