@@ -211,6 +211,12 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
     first = Calibration.of_series(series, policy, at_min=series[-1].start_min)
     for each in (first.simulator, *first.redrawn):
         np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
+    for follow in (True, False):
+        with FakeCulture() as culture:
+            lived = run_policies(
+                {"p": policy}, culture, first, tmp_path / str(follow), episodes=1, with_controls=False, follow=follow
+            )
+        assert ("moving-percentiles" in [finding.name for finding in lived.findings]) == follow
     gap, _ = run(tmp_path / "held", series, with_controls=False, follow=False)
     other, _ = run(tmp_path / "follow", series, with_controls=False, follow=True)
     assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)

@@ -7,7 +7,6 @@ from the exchange; progress and swaps go out as JSON lines.
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import signal
 import sys
@@ -19,13 +18,11 @@ from typing import Any
 
 def main() -> int:
     """Read a job, train until the exchange says to finish, write the policies."""
-    # JAX sizes its thread pool by the cores it may use: pin first. Ctrl-C is for the process that records, which ends
-    # this one by the exchange.
-    os.sched_setaffinity(0, {int(sys.argv[1])})
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from animat.training.worker import end_with_parent
+    from animat.training.worker import settle_on
 
-    end_with_parent()
+    settle_on(int(sys.argv[1]))
+    # Ctrl-C is for the process that records, which ends this one by the exchange.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     from animat.compilation import keep_compilations
     from animat.errors import AnimatError

@@ -17,7 +17,7 @@ from typing import Any
 from animat.errors import AnimatError
 from animat.studies.jobs import Task
 from animat.studies.specification import Study
-from animat.training.worker import end_with_parent
+from animat.training.worker import settle_on
 
 _TELL_EVERY_S = 0.2
 
@@ -27,9 +27,7 @@ _LARGEST_MIB = 800
 
 def main() -> int:
     """Run tasks until standard input ends."""
-    # Before JAX or BLAS are loaded: they size their threads by the cores they may use.
-    os.sched_setaffinity(0, {int(sys.argv[1])})
-    end_with_parent()
+    settle_on(int(sys.argv[1]))
     # What libraries print must not end up among the events.
     events = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

@@ -16,9 +16,7 @@ from pathlib import Path
 
 def main() -> int:
     """Read a job, train it, write its policies; report each chunk as a line."""
-    # JAX sizes its thread pool by the cores it may use, and one pinned core beats two shared ones: pin first.
-    os.sched_setaffinity(0, {int(sys.argv[1])})
-    end_with_parent()
+    settle_on(int(sys.argv[1]))
 
     from animat.compilation import keep_compilations
     from animat.errors import AnimatError
@@ -45,8 +43,16 @@ def main() -> int:
     return 0
 
 
-def end_with_parent() -> None:
-    """Ask the kernel to kill this process when the one that started it is gone, however that ended."""
+def settle_on(core: int) -> None:
+    """Make this process a worker: on one core, without an accelerator, and gone when the one that started it is.
+
+    To be called before JAX or BLAS are loaded.
+    """
+    # They size their threads by the cores they may use, and one pinned core beats two shared ones.
+    os.sched_setaffinity(0, {core})
+    # Networks of 64 units keep a core busy and no GPU, and workers, one a core, would all take the same one.
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    # However the parent ends, the kernel then kills this process.
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
