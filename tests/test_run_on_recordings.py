@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.closed_loop.session import read_session
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition
+from animat.neurons.conditions import Condition, conditions_named
+from animat.neurons.series import extract_series
+from animat.neurons.simulator import pooled_percentiles
+from animat.reality_gap import Calibration
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.protocol import Presentation, Protocol
+from animat.recordings.reading import read_recording
 from animat.recordings.selection import SelectionRule
 from animat.robots import Navigation
 from animat.training.policy import Policy
@@ -109,3 +114,51 @@ def test_recordings_of_no_virtual_culture_are_told(
     make_up_recording(1, channels=32).save(tmp_path / "made-up.nwb")
     assert run(tmp_path / "session", policy_of(0), tmp_path / "made-up.nwb") == 0
     assert "the recordings are of no virtual culture, and this is virtual culture 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("frequencies_hz", [(5.0, 80.0), (80.0, 5.0), (80.0, 40.0, 20.0, 10.0, 5.0)])
+@pytest.mark.parametrize("is_recorded", [True, False])
+def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
+    frequencies_hz: tuple[float, ...],
+    is_recorded: bool,
+    series: Path,
+    tmp_path: Path,
+    small_ones: None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken = []
+
+    class Noted(Calibration):
+        @classmethod
+        def of_series(cls, *given: Any, **more: Any) -> Any:
+            taken.append(Calibration.of_series(*given, **more))
+            return taken[-1]
+
+    monkeypatch.setattr("animat.reality_gap.Calibration", Noted)
+    policy = policy_of(0, frequencies_hz)
+    if is_recorded:
+        assert run(tmp_path / "session", policy, series, "--at-min", "2") == 0
+        recording = read_recording(series / "recording_0002_min.nwb")
+    else:
+        policy.save(tmp_path / "p0.safetensors")
+        given = ["--out", str(tmp_path / "session"), "--controls", "random", "--episodes", "1"]
+        assert main(["run", str(tmp_path / "p0.safetensors"), *given]) == 0
+        recording = read_recording(tmp_path / "session" / "calibration.nwb")
+    (calibration,) = taken
+    assert calibration.conditions == policy.conditions
+    # As animat train --conditions has it, whose percentiles are those of the responses to these frequencies.
+    (trained_on,) = extract_series([recording], conditions_named(f"frequency:{','.join(map(str, frequencies_hz))}"))
+    np.testing.assert_allclose(calibration.percentiles, pooled_percentiles(trained_on), rtol=1e-6)
+    for own, read in enumerate(calibration.responses_hz):
+        np.testing.assert_array_equal(read, trained_on.rates_of(own))
+    ticks = read_session(tmp_path / "session").ticks
+    assert {tick.frequency_hz for tick in ticks} <= set(frequencies_hz)
+
+
+def test_recordings_that_lack_a_frequency_are_refused_with_what_they_have(
+    series: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tmp_path / "session", policy_of(0, (5.0, 30.0)), series) == 1
+    said = capsys.readouterr().err
+    assert "conditions: expected 5 Hz, 30 Hz, which the policies pick from, got recordings with 5 Hz, 10 Hz, 20" in said
+    assert not (tmp_path / "session").exists()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from animat.closed_loop.session import Session
     from animat.cultures.base import Culture
     from animat.cultures.budget import Account
+    from animat.neurons.conditions import Conditions
     from animat.progress import Progress
     from animat.reality_gap import Calibration
     from animat.recordings.findings import Finding
@@ -224,6 +225,7 @@ class Run(Stimulating):
 
         series = extract_series(
             recordings,
+            _frequencies(recordings, first),
             window_ms=first.window_ms or (2.0, 10.0),
             burst_threshold=self.burst_threshold,
             despite=self.despite,
@@ -369,6 +371,18 @@ class Recover:
         if told["lost_bytes"]:
             print(f"{told['lost_bytes']} bytes at the end of the log make no whole record and are lost")
         return {"recording": str(session.recording_file), **told}
+
+
+def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions | None:
+    """The frequencies that policies pick from, which may be some of the recordings'; None where they are not."""
+    from animat.neurons.conditions import ByFrequency
+
+    if not first.conditions or any(condition.unit != "Hz" for condition in first.conditions):
+        return None
+    picked = ByFrequency(tuple(condition.value for condition in first.conditions))
+    every = range(len(picked.values_hz))
+    # Where one lacks, the recordings' own conditions say better what is there instead.
+    return picked if all(set(every) <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None
 
 
 def _expect_no_fault(session: Session, folder: Path) -> None:
