@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import stand_in_maxlab
+from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
 from animat.cultures.cl1 import CL1_LIMITS, LEAD_US
-from animat.cultures.maxone import MAXONE_LIMITS
+from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.safety import SIMULATED_LIMITS, Limits
+from animat.mapping import Thresholds
+from animat.neurons.conditions import Condition
+from animat.recordings.array import MAXONE
+from animat.recordings.patterns import draw_patterns
 from animat.recordings.recording import Recording
+from animat.recordings.selection import Selection
+from animat.recordings.stimulus import BALANCED_PULSE
+from animat.robots import Navigation
 from stand_in_cl import install
 
-PAGE = (Path(__file__).parents[1] / "docs" / "hardware.md").read_text()
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE = (DOCS / "hardware.md").read_text()
+LOOP_PAGE = (DOCS / "closed-loop.md").read_text()
 
 
 def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,3 +59,52 @@ def test_the_limits_are_those_of_the_code(row: str, cl1: str, maxone: str) -> No
     cells = next(line for line in PAGE.splitlines() if line.startswith(f"| {row} |")).split("|")
     assert cl1 in cells[2]
     assert maxone in cells[3]
+
+
+@pytest.mark.parametrize(
+    ("row", "of"),
+    [
+        ("amplitude of a phase", lambda limits: f"{limits.amplitude:g} {limits.units[0]}"),
+        ("duration of a phase", lambda limits: f"{limits.phase_us[0]:g} us to {limits.phase_us[1] / 1000:g} ms"),
+        ("duration of a phase", lambda limits: f"steps of {limits.phase_step_us:g} us" * bool(limits.phase_step_us)),
+        ("charge of a phase", lambda limits: f"{limits.charge_per_phase:g} {limits.units[1]}"),
+        ("balance", lambda limits: "0" if limits.net_charge < 1e-5 else f"{limits.net_charge:g} {limits.units[1]}"),
+        ("phases of a pulse", lambda limits: f" {limits.phases_per_pulse:,}"),
+        ("phases of a pulse", lambda limits: "different signs" * limits.alternates),
+        ("electrodes of a stimulus", lambda limits: f" {limits.electrodes_at_once} "),
+        ("on one electrode", lambda limits: f" {limits.stimuli_per_electrode_s} in any second"),
+        ("on one electrode", lambda limits: f"{limits.interval_us / 1000:g} ms apart" * bool(limits.interval_us)),
+        ("in all", lambda limits: f" {limits.stimuli_per_s} in any second"),
+        ("in all", lambda limits: "apart" * bool(limits.gap_us)),
+        ("in a session", lambda limits: f" {limits.stimuli_per_session:,} "),
+    ],
+)
+def test_the_limits_at_the_rig_are_those_of_the_code(row: str, of: Callable[[Limits], str]) -> None:
+    cells = next(line for line in LOOP_PAGE.splitlines() if line.startswith(f"| {row}")).split("|")
+    for cell, limits in zip(cells[3:6], (CL1_LIMITS, MAXONE_LIMITS, SIMULATED_LIMITS), strict=True):
+        assert of(limits) in cell
+
+
+@pytest.mark.parametrize(("frequency_hz", "late_ms"), [(40.0, 0.0), (80.0, 2.6)])
+def test_at_80_hz_the_first_pulse_of_an_action_is_late_on_a_maxone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frequency_hz: float, late_ms: float
+) -> None:
+    rig = stand_in_maxlab.install(monkeypatch)
+    sites = np.array([(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)])
+    selection = Selection(MAXONE, np.arange(13_000, 13_050), sites, draw_patterns(MAXONE, sites, seed=1))
+    loop = Loop(
+        robot=Navigation(episode_limit=10),
+        mapping=Thresholds(1),
+        conditions=(Condition("f", frequency_hz, "Hz"),),
+        percentiles=np.linspace(0.0, 125.0, 11),
+        pulses=5,
+        pulse=BALANCED_PULSE,
+        pause_s=0.1,
+    )
+    with MaxOneCulture(selection, stream=stand_in_maxlab.Stream(rig), settle=False) as culture:
+        session = run_session(culture, loop, [Contender("f", "", OneCondition(0))], tmp_path, episodes=1)
+    first, *others = session.ticks
+    assert first.late_s == 0.0
+    assert [1000 * tick.late_s for tick in others] == pytest.approx([late_ms] * 9)
+    within_ms = 1000 * np.diff([tick.pulse_time_s for tick in session.ticks], axis=1)
+    np.testing.assert_allclose(within_ms, 1000 / frequency_hz)
