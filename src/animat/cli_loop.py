@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded
+from animat.writing import alone_in
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
@@ -105,7 +107,6 @@ class Run(Stimulating):
 
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
-        from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.mapping import N_PERCENTILES
@@ -132,9 +133,9 @@ class Run(Stimulating):
         if recordings:
             calibration = self._calibration(recordings, first, self.at_min)
             check_conditions(first, calibration)
-        # Last, as it makes the folder.
-        expect_no_session(self.out)
         with (
+            # Last, as it makes the folder.
+            _held_for_session(self.out),
             polite_kill_as_ctrl_c(),
             Bar("closed loop") as progress,
             self._culture(recordings, progress) as culture,
@@ -315,6 +316,7 @@ class Live(Stimulating):
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
+            alone_in(self.out),
             polite_kill_as_ctrl_c(),
             Bar("live") as progress,
             culture_of(
@@ -371,6 +373,18 @@ class Recover:
         if told["lost_bytes"]:
             print(f"{told['lost_bytes']} bytes at the end of the log make no whole record and are lost")
         return {"recording": str(session.recording_file), **told}
+
+
+@contextmanager
+def _held_for_session(folder: Path) -> Iterator[None]:
+    """Hold a folder that can take a new session; the error of one that cannot says what is there."""
+    from animat.closed_loop.session import expect_no_session
+
+    if folder.exists() and not folder.is_dir():
+        raise InvalidArgument(f"--out: expected a folder for the session, got a file: {folder}")
+    with alone_in(folder):
+        expect_no_session(folder)
+        yield
 
 
 def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument
+from animat.writing import alone_in
 
 if TYPE_CHECKING:
     from animat.progress import Progress
@@ -78,9 +79,10 @@ class Record:
                 "--order, --pulses, --presentations, --protocol: made-up recordings are blocked, with one pulse and "
                 "100 presentations; --culture virtual takes others"
             )
-        return write_made_up_series(
-            self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
-        )
+        with alone_in(self.out):
+            return write_made_up_series(
+                self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
+            )
 
     def _virtual(self, progress: Progress) -> list[Path]:
         from animat.cultures.series import record_virtual_series
@@ -97,7 +99,7 @@ class Record:
 
     def _living(self, progress: Progress) -> list[Path]:
         from animat.cultures.kinds import culture_of
-        from animat.cultures.living_series import record_living_series
+        from animat.cultures.living_series import record_in_held_folder
         from animat.cultures.series import check_interval
         from animat.recordings.reading import read_recordings
 
@@ -105,8 +107,12 @@ class Record:
         # What can be refused is refused before a culture is opened, whose patterns are not known until then.
         check_interval(self._protocol(), self.sessions, self.interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
-        with culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture:
-            series = record_living_series(
+        with (
+            # Held before a device is opened, which stops whatever another run has it do.
+            alone_in(self.out),
+            culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
+        ):
+            series = record_in_held_folder(
                 culture,
                 self._protocol(len(culture.patterns)),
                 self.out,

@@ -61,25 +61,50 @@ def record_living_series(
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
     check_interval(protocol, sessions, interval_min)
-    folder, progress = Path(folder), progress or Silent()
-    files = [folder / recording_name(session * interval_min) for session in range(sessions)]
-    missed_min = []
     # Seen before it is touched: somebody else's folder stays as it is.
-    _beginning_s(culture, protocol, files, 60 * interval_min)
+    _beginning_s(culture, protocol, _files(Path(folder), sessions, interval_min), 60 * interval_min)
     with alone_in(folder):
-        # And again now that nobody writes: another run may have ended in between.
-        zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
-        for session, file in enumerate(files):
-            due_s = zero_s + 60 * session * interval_min
-            if not file.exists():
-                if culture.now_s >= due_s + 60 * interval_min:
-                    missed_min.append(session * interval_min)
-                    continue
-                culture.rest(max(0.0, due_s - culture.now_s))
-                part = PartOfSeries(progress, session, sessions, file.name)
-                culture.record(protocol, seed * 10_000 + session, part).save(file)
-            progress.update(session + 1, sessions, file.name)
+        return record_in_held_folder(
+            culture, protocol, folder, sessions=sessions, interval_min=interval_min, seed=seed, progress=progress
+        )
+
+
+def record_in_held_folder(
+    culture: Culture,
+    protocol: Protocol,
+    folder: str | os.PathLike[str],
+    *,
+    sessions: int = 15,
+    interval_min: float = 10.0,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> LivingSeries:
+    """Do as `record_living_series` does, in a folder that the caller holds (`animat.writing.alone_in`).
+
+    To open a device is to do something to it: whoever opens one for a folder holds that before. Arguments and errors
+    are those of `record_living_series`.
+    """
+    check_interval(protocol, sessions, interval_min)
+    folder, progress = Path(folder), progress or Silent()
+    files = _files(folder, sessions, interval_min)
+    missed_min = []
+    # Now that nobody writes: another run may have ended just before the folder was held.
+    zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
+    for session, file in enumerate(files):
+        due_s = zero_s + 60 * session * interval_min
+        if not file.exists():
+            if culture.now_s >= due_s + 60 * interval_min:
+                missed_min.append(session * interval_min)
+                continue
+            culture.rest(max(0.0, due_s - culture.now_s))
+            part = PartOfSeries(progress, session, sessions, file.name)
+            culture.record(protocol, seed * 10_000 + session, part).save(file)
+        progress.update(session + 1, sessions, file.name)
     return LivingSeries([file for file in files if file.exists()], missed_min)
+
+
+def _files(folder: Path, sessions: int, interval_min: float) -> list[Path]:
+    return [folder / recording_name(session * interval_min) for session in range(sessions)]
 
 
 def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interval_s: float) -> float:

@@ -20,6 +20,7 @@ from animat.neurons.conditions import Condition
 from animat.recordings.protocol import Protocol
 from animat.recordings.schedule import make_schedule
 from animat.training.specification import Training
+from animat.writing import LOCK
 
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
@@ -92,7 +93,7 @@ def check_plan(
     Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **given)
     if folder.exists() and not folder.is_dir():
         raise InvalidArgument(f"--out: expected a folder for the live run, got a file: {folder}")
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists() and any(each.name != LOCK for each in folder.iterdir()):
         stands = what_stands(folder) or "one with files"
         raise Mismatch(f"{folder}: expected an empty folder for a live run, got {stands}: choose another")
 

@@ -1,0 +1,92 @@
+"""Commands that stimulate or record hold their folder from before a culture is opened until they end."""
+
+from __future__ import annotations
+
+import fcntl
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from animat.cli import main
+from animat.errors import DeviceFailed, Mismatch
+from animat.live.plan import Pace
+from animat.live.shadowing import live
+from animat.recordings.made_up import make_up_recording, write_made_up_series
+from animat.writing import LOCK, alone_in
+from fake_culture import FakeCulture
+from test_live import PROTOCOL, TRAINING
+from test_run_on_recordings import policy_of
+
+OPENING = ["record cl1", "record replay", "run", "run on recordings", "live"]
+
+
+def command(name: str, folder: Path) -> list[str]:
+    """A command that opens a culture for the folder `out`."""
+    policy_of(0).save(folder / "p0.safetensors")
+    made_up = folder / "made-up.nwb"
+    if not made_up.exists():
+        make_up_recording(1, channels=32).save(made_up)
+    return {
+        "record made-up": ["record", "--culture", "made-up", "--sessions", "1"],
+        "record cl1": ["record", "--culture", "cl1"],
+        "record replay": ["record", "--culture", "replay", "--recordings", str(made_up)],
+        "run": ["run", str(folder / "p0.safetensors")],
+        "run on recordings": ["run", str(folder / "p0.safetensors"), "--recordings", str(made_up)],
+        "live": ["live", "navigation"],
+    }[name] + ["--out", str(folder / "in" / "out")]
+
+
+@pytest.mark.parametrize("name", [*OPENING, "record made-up"])
+def test_a_second_run_is_refused_before_a_culture_is_opened(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: pytest.fail("a culture was made"))
+    with alone_in(tmp_path / "in" / "out"):
+        assert main(command(name, tmp_path)) == 1
+        assert "out: another run is at work in this folder; wait for it, or stop it" in capsys.readouterr().err
+        assert not list((tmp_path / "in" / "out").iterdir())
+
+
+@pytest.mark.parametrize("name", OPENING)
+def test_the_folder_is_held_while_a_culture_is_opened_and_taken_away_if_that_fails(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failing(*_: Any, **__: Any) -> Any:
+        with pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path / "in" / "out"):
+            pass
+        raise DeviceFailed("the device: it is off")
+
+    monkeypatch.setattr("animat.cultures.kinds.culture_of", failing)
+    assert main(command(name, tmp_path)) == 1
+    assert "the device: it is off" in capsys.readouterr().err
+    assert not (tmp_path / "in").exists()
+
+
+def test_a_made_up_series_is_written_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def noted(*given: Any, **more: Any) -> list[Path]:
+        with pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path / "in" / "out"):
+            pass
+        return write_made_up_series(*given, **more)
+
+    monkeypatch.setattr("animat.recordings.made_up.write_made_up_series", noted)
+    for _ in range(2):
+        assert main(command("record made-up", tmp_path)) == 0
+    assert [file.name for file in (tmp_path / "in" / "out").iterdir()] == ["recording_0000_min.nwb"]
+
+
+def test_a_live_run_takes_a_folder_in_which_only_a_file_to_be_locked_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flock = fcntl.flock
+
+    def files_only(descriptor: int, how: int) -> None:
+        if Path(f"/proc/self/fd/{descriptor}").resolve().is_dir():
+            raise OSError(9, "Bad file descriptor")
+        flock(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", files_only)
+    with alone_in(tmp_path / "live"), FakeCulture() as culture:
+        assert (tmp_path / "live" / LOCK).exists()
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=Pace(10, 10, 1e6), episodes=1)
+    assert len(found.recordings) == 1
