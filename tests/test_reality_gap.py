@@ -518,11 +518,11 @@ class TestCommand:
     def test_what_does_not_belong_together_is_told_before_a_culture_is_opened(
         self, folder: Path, series: list[Responses], capsys: pytest.CaptureFixture[str], never_opened: None
     ) -> None:
-        other = policy_of(3, series, conditions=tuple(reversed(series[0].conditions)))
+        other = policy_of(3, series, conditions=(Condition("90 Hz", 90.0, "Hz"), *series[0].conditions[1:]))
         other.save(folder / "other" / "q0.safetensors")
         given = ["--recordings", str(folder / "recordings"), "--out", str(folder / "new")]
         assert main(["run", str(folder / "other"), *given]) == 1
-        assert "conditions: expected 80 Hz" in capsys.readouterr().err
+        assert "conditions: expected 90 Hz" in capsys.readouterr().err
         other.save(folder / "policies" / "q0.safetensors")
         assert main(["run", str(folder / "policies"), *given]) == 1
         assert "q0: expected the same conditions as p0" in capsys.readouterr().err
