@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from animat.cultures.same_culture import other_culture
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
@@ -219,6 +220,34 @@ def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path]
     (other / STATE_FILE).write_bytes(b"damaged")
     with pytest.raises(InvalidFile, match=r"culture.state: expected the whole state"):
         record(other)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
+    told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = VirtualCulture.settings
+
+    def before(self: VirtualCulture) -> dict[str, str]:
+        # The first revision did not tell.
+        named = settings.__get__(self)
+        return {key: words for key, words in named.items() if told or key != "tissue_revision"}
+
+    with monkeypatch.context() as patched:
+        patched.setattr("animat.cultures.tissue.parameters.REVISION", 1)
+        patched.setattr(VirtualCulture, "settings", property(before))
+        (file,) = record(tmp_path, sessions=1)
+    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture .*\(tissue_revision 2\)"):
+        record(tmp_path, sessions=2)
+    with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
+        small_culture().restore_state(tmp_path / STATE_FILE)
+    with small_culture() as culture:
+        found = other_culture(read_recording(file), 0.0, culture)
+    assert found is not None
+    assert "of virtual culture 1 with another tissue_revision, and this is virtual culture 1" in found.sentence
+    file.unlink()
+    with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
+        record(tmp_path, sessions=2)
 
 
 def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:

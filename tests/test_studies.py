@@ -41,7 +41,7 @@ from animat.report.html import cell
 from animat.robots import Cartpole, Navigation
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
-from animat.studies.folder import sums_of
+from animat.studies.folder import describe_study, sums_of
 from animat.studies.identity import settle_identity
 from animat.studies.jobs import Job, Receipt, Report, Task, in_order, receipt_of
 from animat.studies.paper import PRINTED, paper_study
@@ -326,6 +326,18 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
         undisturbed.save(tmp_path / "killed")
         damage()
         assert record("killed") == undisturbed
+
+
+@pytest.mark.parametrize("kind", ["virtual", "made-up"])
+def test_a_study_of_a_virtual_culture_is_one_of_its_tissue_s_revision(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = replace(read_study(TINY), culture=Source(kind=kind))  # type: ignore[arg-type]
+    now = describe_study(study, {})
+    monkeypatch.setattr("animat.cultures.tissue.parameters.REVISION", 1)
+    before = describe_study(study, {})
+    assert (before["fingerprint"] != now["fingerprint"]) == (kind == "virtual")
+    assert ("virtual tissue" in now["versions"]) == (kind == "virtual")
 
 
 def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:

@@ -22,9 +22,13 @@ def other_culture(recording: Recording, start_min: float, culture: Culture) -> F
     if not isinstance(culture, VirtualCulture):
         return None
     now_min, told = culture.now_s / 60, recording.provenance
-    seed = told.get("seed") if told.get("source") == culture.settings["source"] else None
-    if seed != str(culture.seed):
-        of = "no virtual culture" if seed is None else f"virtual culture {seed}"
+    differ = [name for name, words in culture.settings.items() if told.get(name) != words]
+    if differ:
+        of = f"virtual culture {told.get('seed')}"
+        if "source" in differ:
+            of = "no virtual culture"
+        elif "seed" not in differ:
+            of += f" with another {' and '.join(differ)}"
         sentence = (
             f"the recordings are of {of}, and this is virtual culture {culture.seed}: another culture has other "
             "percentiles"

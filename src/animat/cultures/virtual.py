@@ -163,13 +163,14 @@ class VirtualCulture(Culture):
     @property
     def settings(self) -> dict[str, str]:
         """What decides everything that the culture does, known before it is opened."""
-        from animat.cultures.tissue import TissueParameters
+        from animat.cultures.tissue.parameters import REVISION, TissueParameters
 
         return {
             "source": "virtual culture: simulated by animat.cultures.virtual",
             "seed": str(self.seed),
             "scan_s": str(self._scan_s),
             "selection_rule": json.dumps(dataclasses.asdict(self._rule or SelectionRule())),
+            "tissue_revision": str(REVISION),
             "tissue_parameters": json.dumps(dataclasses.asdict(self._parameters or TissueParameters())),
         }
 

@@ -56,9 +56,11 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
     tissue = culture.tissue
     for name, value in culture.settings.items():
         if head["culture"].get(name) != value:
+            again = "remove it to begin anew, or use the same settings"
+            if name == "tissue_revision":
+                again = "that version of animat goes on with it, this one from the beginning (remove it)"
             raise Mismatch(
-                f"{path}: expected the state of this culture, got another's, which differs in {name}: remove it to "
-                "begin anew, or use the same settings"
+                f"{path}: expected the state of this culture, got another's, which differs in {name}: {again}"
             )
     try:
         fresh = tissue.snapshot()

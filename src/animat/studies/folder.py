@@ -33,6 +33,11 @@ def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
         sources: SHA-256 of each file of recordings, by its place.
     """
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    if study.culture.kind == "virtual":
+        from animat.cultures.tissue.parameters import REVISION
+
+        # Another one gives other spikes, also within one version of animat.
+        versions["virtual tissue"] = f"revision {REVISION}"
     told: dict[str, Any] = {
         "study": study.to_dict(),
         "sources": sources,

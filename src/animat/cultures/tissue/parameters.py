@@ -7,6 +7,11 @@ from math import isfinite
 
 from animat.errors import InvalidArgument
 
+REVISION = 2
+"""Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
+before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
+another revision are then refused, in place of being gone on with as if they were of this tissue."""
+
 
 @dataclass(frozen=True)
 class ShortTerm:
