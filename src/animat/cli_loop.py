@@ -121,7 +121,8 @@ class Run(Stimulating):
             raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        check_binning(self.bins, self.range_hz)
+        if self.simulator == "histogram":
+            check_binning(self.bins, self.range_hz)
         policies = load_policies(self.policies)
         first = check_policies(policies)
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
