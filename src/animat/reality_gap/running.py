@@ -92,8 +92,8 @@ def run_policies(
         findings += (Finding("other-calibration", "warning", sentence),)
     if follow and first.provenance.get("training", {}).get("percentiles") == "first":
         sentence = (
-            "the policies were trained on held percentiles, and in this loop they follow the culture: with --thresholds "
-            "held they are as in training"
+            "the policies were trained on held percentiles, and in this loop they follow the culture: with "
+            "--thresholds held they are as in training"
         )
         findings += (Finding("moving-percentiles", "warning", sentence),)
     age_min = culture.now_s / 60 - calibration.start_min
