@@ -278,6 +278,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     assert 106 <= covered <= 119
 
 
+@pytest.mark.oracle
 def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
     rng, widths = np.random.default_rng(3), []
     environment = Animat(Cartpole(), Thresholds(1), 5)

@@ -86,6 +86,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 # --- the folder -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.oracle
 def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     # Between the recordings, after the simulators, with a policy that no receipt tells of yet, among the figures.
