@@ -134,7 +134,7 @@ def test_one_pattern_can_be_repeated() -> None:
         ({"pulses": 0}, "pulses: expected at least 1"),
         ({"patterns": 0}, "patterns: expected 1 to"),
         ({"presentations": 0}, "presentations: expected 1 to"),
-        ({"pause_s": float("nan")}, "pause_s: expected finite seconds"),
+        ({"pause_s": float("nan")}, "pause_s: expected seconds from 0 to a day"),
     ],
 )
 def test_protocols_that_cannot_be_are_refused(settings: dict[str, Any], words: str) -> None:
@@ -178,8 +178,9 @@ NOT_PROTOCOLS = {
     '{"frequencies_hz": [1' + "0" * 400 + "]}": "frequencies_hz: expected a number",
     '{"frequencies_hz": [NaN]}': "frequencies_hz: expected some",
     '{"pause_s": null}': "pause_s: expected a number, got 'None'",
-    '{"pause_s": Infinity}': "pause_s: expected finite seconds",
-    '{"tail_s": -1}': "tail_s: expected finite seconds from 0",
+    '{"pause_s": Infinity}': "pause_s: expected seconds from 0 to a day",
+    '{"setup_s": 1e6}': "setup_s: expected seconds from 0 to a day",
+    '{"tail_s": -1}': "tail_s: expected seconds from 0 to a day",
     '{"pulse": []}': "phases: expected at least one",
     '{"pulse": {"duration_us": 1}}': "pulse: expected a list of phases",
     '{"pulse": [{"duration_us": 200}]}': "phase: expected either amplitude_mv or amplitude_ua",

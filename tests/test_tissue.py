@@ -290,6 +290,14 @@ def test_rest_takes_every_slow_variable_where_stepping_takes_it() -> None:
         np.testing.assert_array_equal(getattr(rested._state, name), getattr(stepped._state, name))
 
 
+def test_a_rest_may_be_longer_than_32_bits_of_steps() -> None:
+    tissue = Tissue(1, SILENT)
+    tissue.advance(0.1)
+    tissue.rest(7 * 86_400.0)
+    assert tissue.now_s == pytest.approx(604_800.1)
+    tissue.advance(0.1)
+
+
 def test_rest_leaves_the_noise_in_its_distribution() -> None:
     tissue = Tissue(1, dataclasses.replace(TissueParameters(), drive_spread_mv=0.0))
     tissue.rest(60.0)

@@ -104,7 +104,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
         raise InvalidFile(f"{path}: no such file") from error
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
         raise InvalidFile(
-            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else ({error}); "
-            "remove it to begin anew"
+            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else; "
+            "give another, or move it away to begin anew"
         ) from error
     return head, arrays

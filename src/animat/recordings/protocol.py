@@ -14,6 +14,7 @@ from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
 Order = Literal["blocked", "mixed"]
 
 _MOST_PULSES = 10_000_000
+_LONGEST_S = 86_400
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,10 @@ class Protocol:
             if not 1 <= getattr(self, name) <= 1_000_000:
                 raise InvalidArgument(f"{name}: expected 1 to 1,000,000, got {getattr(self, name)}")
         for name in ("setup_s", "pause_s", "tail_s"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InvalidArgument(f"{name}: expected finite seconds from 0, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) <= _LONGEST_S:
+                raise InvalidArgument(
+                    f"{name}: expected seconds from 0 to a day ({_LONGEST_S}), got {getattr(self, name)}"
+                )
             # A series knows its own protocol by its text, in which 14 is not 14.0.
             object.__setattr__(self, name, float(getattr(self, name)))
         # The order and the number of pulses are checked there.

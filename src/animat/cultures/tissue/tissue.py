@@ -178,7 +178,8 @@ class Tissue:
         mean_mv = self._wiring.drive_mv
         state.drive_mv[:] = mean_mv + (state.drive_mv - mean_mv) * kept + spread_mv * rng.standard_normal(len(mean_mv))
         state.v_mv[:] = np.minimum(np.float32(parameters.leak_mv) + state.drive_mv, np.float32(parameters.reset_mv))
-        state.refractory[:] = np.maximum(state.refractory - steps, 0)
+        # As 64 bits: a rest of five days is more steps than 32 hold.
+        state.refractory[:] = np.maximum(state.refractory.astype(np.int64) - steps, 0)
         for ring in (state.arriving_ampa, state.arriving_nmda, state.arriving_gaba):
             ring[:] = 0
         # x, u, availability and release are kept as of each neuron's last spike: moving the clock recovers them.
