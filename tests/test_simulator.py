@@ -66,7 +66,7 @@ def test_a_histogram_draws_a_bin_then_uniformly_inside_it() -> None:
         assert stats.kstest(draw(simulator, i), known.cdf).pvalue > 1e-4
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     # In eighths of a Hz and few, so that many are equal and percentiles fall upon them.
     eighths=st.lists(st.lists(st.integers(0, 40), min_size=1, max_size=40), min_size=3, max_size=3),
@@ -99,7 +99,7 @@ def test_percentiles_pool_the_non_burst_responses_of_all_conditions() -> None:
     np.testing.assert_allclose(simulator.percentiles, np.arange(0.0, 101.0, 10.0), atol=1e-5)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     values=st.lists(
         st.lists(st.floats(0, 200, allow_nan=False, width=32), min_size=1, max_size=30), min_size=1, max_size=5
