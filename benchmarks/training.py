@@ -153,24 +153,17 @@ def algorithm() -> Any:
 
 def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
     """(environment, settings, simulator, compiled-to-be chunk, learners-to-be), as a worker makes them."""
-    from functools import partial
-
-    import jax
-
     from animat.animat import Animat
     from animat.compilation import keep_compilations
     from animat.mapping import mapping_named
     from animat.neurons.made_up import made_up_simulator
     from animat.robots.cartpole import Cartpole
-    from animat.training.sac import begin, train_chunk
+    from animat.training.group import programs
 
     keep_compilations()
     simulator, settings = made_up_simulator(), algorithm()
     environment = Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions)
-    chunk = jax.jit(
-        jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)), donate_argnums=0
-    )
-    beginning = jax.jit(jax.vmap(partial(begin, environment, settings)))
+    beginning, chunk = programs(environment, settings)
     return environment, settings, simulator, chunk, beginning
 
 

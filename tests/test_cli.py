@@ -212,6 +212,22 @@ BAD = {
         ["evaluate", "{policies}", "--recordings", "{recordings}", "--at-min", "nan"],
         ["at_min"],
     ),
+    "a minute before the first recording": (
+        nothing,
+        ["evaluate", "{policies}", "--recordings", "{recordings}", "--at-min", "-20"],
+        ["at_min", "0 min", "-20"],
+    ),
+    "a finding of another name": (
+        nothing,
+        [*TRAIN, "{recordings}", "--despite", "dead-windows"],
+        ["despite", "dead-window,", "'dead-windows'"],
+    ),
+    "no workers, before recordings are read": (nothing, [*TRAIN, "{folder}/none", "--workers", "-2"], ["--workers"]),
+    "no iterations, before recordings are read": (
+        nothing,
+        ["train", "cartpole", "--iterations", "0", "--recordings", "{folder}/none"],
+        ["iterations"],
+    ),
     "bins without end": (nothing, [*TRAIN, "{recordings}", "--bins", "100000000"], ["bins", "10000"]),
     "zero episodes": (
         nothing,

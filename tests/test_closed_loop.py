@@ -394,7 +394,7 @@ def test_the_hand_made_rule_steers_the_right_way() -> None:
     turn_rad = (to_goal + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_array_equal(np.sign(steering(navigation, places)), np.sign(turn_rad))
     names = [c.name for c in controls(Cartpole(), ["a", "b"], strongest=1, weakest=0, policies={"p0": rule})]
-    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "hand-made"]
+    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "made by hand"]
 
 
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])

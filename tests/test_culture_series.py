@@ -184,7 +184,9 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
             yield
 
     monkeypatch.setattr("animat.cultures.series.alone_in", ended_in_between)
-    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture and protocol \(seed 2\)"):
+    with pytest.raises(
+        Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"
+    ):
         record(folder, seed=2)
 
 
@@ -208,7 +210,9 @@ def test_a_leftover_that_cannot_be_removed_stays(
 
 def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path], tmp_path: Path) -> None:
     folder = undisturbed[0].parent
-    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture and protocol \(seed 2\)"):
+    with pytest.raises(
+        Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"
+    ):
         record(folder, seed=2)
     with pytest.raises(Mismatch, match="protocol"):
         record(folder, protocol=Protocol((20.0, 80.0), patterns=5, presentations=9, setup_s=0.5, pause_s=0.2))
@@ -237,7 +241,8 @@ def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
         patched.setattr("animat.cultures.tissue.parameters.REVISION", 1)
         patched.setattr(VirtualCulture, "settings", property(before))
         (file,) = record(tmp_path, sessions=1)
-    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected .* same culture .*\(tissue_revision 2\)"):
+    there = "1" if told else "nothing"
+    with pytest.raises(Mismatch, match=rf"_0000_min.nwb: expected .*\(tissue_revision: {there} there, 2 now\)"):
         record(tmp_path, sessions=2)
     with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
         small_culture().restore_state(tmp_path / STATE_FILE)

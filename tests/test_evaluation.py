@@ -284,6 +284,8 @@ def test_what_does_not_belong_together_is_refused() -> None:
         evaluate({"a": policy}, None)
     with pytest.raises(InvalidArgument, match="at_min: expected a minute"):
         evaluate({"a": policy}, timeline, at_min=float("nan"))
+    with pytest.raises(InvalidArgument, match=r"from the first recording on, which started at 0 min, got -0\.1"):
+        evaluate({"a": policy}, timeline, at_min=-0.1)
     for seed in (-1, 2**32):
         with pytest.raises(InvalidArgument, match="seed: expected a whole number"):
             evaluate({"a": policy}, timeline, seed=seed)

@@ -63,6 +63,18 @@ def test_the_folder_is_held_while_a_culture_is_opened_and_taken_away_if_that_fai
     assert not (tmp_path / "in").exists()
 
 
+def test_a_session_that_still_runs_is_not_recovered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command("run on recordings", tmp_path), "--culture", "replay", "--episodes", "1"]) == 0
+    session = tmp_path / "in" / "out"
+    before = (session / "session.nwb").stat().st_mtime_ns
+    with alone_in(session):
+        assert main(["recover", str(session)]) == 1
+    assert "another run is at work" in capsys.readouterr().err
+    assert (session / "session.nwb").stat().st_mtime_ns == before
+    assert main(["recover", str(session)]) == 0
+    assert "session.nwb and ticks.csv: " in capsys.readouterr().out
+
+
 def test_a_made_up_series_is_written_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def noted(*given: Any, **more: Any) -> list[Path]:
         with pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path / "in" / "out"):

@@ -183,6 +183,10 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
     medians = [float(env.setup.simulator.percentiles[5]) for env in (first, second)]
     assert medians[0] == pytest.approx(38.7, abs=4)
     assert medians[1] == pytest.approx(38.7 * np.exp(-1), abs=2)
+    unsaid = gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path).unwrapped
+    assert float(unsaid.setup.simulator.percentiles[5]) == medians[0]
+    with pytest.raises(InvalidArgument, match="from the first recording on"):
+        gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path, at_min=-1)
     some = gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path, conditions="frequency:5,80")
     assert some.action_space.n == 2
 

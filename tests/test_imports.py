@@ -11,10 +11,11 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
-EVERYWHERE = {"errors", "writing", "progress", "compilation"}
+EVERYWHERE = {"differences", "errors", "writing", "progress", "compilation"}
 """What stands under the story and may be used by all of it."""
 
 MAY_IMPORT = {
+    "differences": set(),
     "errors": set(),
     "writing": {"errors"},
     "progress": set(),

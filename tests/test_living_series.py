@@ -102,7 +102,7 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
 
     monkeypatch.setattr("animat.cultures.living_series.alone_in", ended_in_between)
     with replay() as culture:
-        with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* another protocol"):
+        with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* got another \(protocol\."):
             record_living_series(culture, replace(SHORT, pulses=2), tmp_path / "series", sessions=2, interval_min=2.0)
         assert culture.delivered == 0
 
@@ -110,12 +110,12 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
 def test_nothing_is_mixed_or_written_over(tmp_path: Path) -> None:
     with replay() as culture:
         record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
-        with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* another protocol"):
+        with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* got another \(protocol\."):
             record_living_series(culture, replace(SHORT, pulses=2), tmp_path, sessions=2, interval_min=2.0)
     with replay() as culture, pytest.raises(Mismatch, match=r"clock, which is at 30\.00 min, got one at 30\.00 min"):
         record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
     with FakeCulture() as culture:
-        with pytest.raises(Mismatch, match="another source: choose another folder"):
+        with pytest.raises(Mismatch, match=r"got another \(source: .* there, .* now\): choose another folder"):
             record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
         with pytest.raises(InvalidArgument, match="sessions: expected at least 1"):
             record_living_series(culture, SHORT, tmp_path / "b", sessions=0)

@@ -159,7 +159,8 @@ def test_a_protocol_with_more_pulses_than_a_recording_can_have_is_refused() -> N
 PHASE = {"duration_us": 200, "amplitude_ua": -1}
 
 NOT_PROTOCOLS = {
-    "": "protocol: expected what Protocol.to_json writes, got ''",
+    "": "protocol: expected JSON, got a mistake in line 1, column 1",
+    '{"pulses": 1': "protocol: expected JSON, got a mistake in line 1, column 13",
     "[5, 10]": "protocol: expected what Protocol.to_json writes",
     "[" * 100_000: "protocol: expected what Protocol.to_json writes",
     '{"pulse_s": 1}': "protocol: expected settings among frequencies_hz, .*, got 'pulse_s'",

@@ -89,7 +89,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     gap, policies = run(tmp_path, series)
     rows = {row.name: row for row in gap.rows}
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
-    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "hand-made"]
+    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "made by hand"]
     assert gap.session.ending.by == "plan"
     assert gap.findings == Calibration.of_series(series).findings
 
@@ -402,7 +402,7 @@ class TestCommand:
         told = json.loads(printed.out.splitlines()[-1])
         assert len(told["rows"]) == 12
         assert told["session"]["ended_by"] == "plan"
-        assert "hand-made" in printed.out
+        assert "made by hand" in printed.out
         (folder / "session" / "session.nwb").unlink()
         assert main(["recover", str(folder / "session"), "--json"]) == 0
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == told["session"]["ticks"]
@@ -510,6 +510,7 @@ class TestCommand:
             (["--patience-s", "0"], "patience_s: expected above 0 s"),
             (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),
             (["--at-min", "nan"], "at_min"),
+            (["--at-min", "-1"], "at_min"),
             (["--bins", "0"], "bins"),
             (["--out", "/dev/null"], "expected a folder for the session, got a file"),
         ],

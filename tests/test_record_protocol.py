@@ -49,7 +49,7 @@ def test_a_culture_is_recorded_as_the_file_says(
     assert "clock" in capsys.readouterr().err
     (tmp_path / "mine.json").write_text(MINE.to_json().replace("40.0", "20.0"))
     assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 1
-    assert "another protocol" in capsys.readouterr().err
+    assert "got another (protocol.frequencies_hz[1]: 40.0 there, 20.0 now)" in capsys.readouterr().err
 
 
 def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path: Path) -> None:
@@ -77,7 +77,12 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
     ("text", "more", "words"),
     [
         (None, [], "no such file"),
-        ("frequencies_hz = [5]", [], "mine.json: protocol: expected what Protocol.to_json writes"),
+        ("[5]", [], "mine.json: protocol: expected what Protocol.to_json writes"),
+        (
+            '{"pulses": 2,\n"order" "mixed"}',
+            [],
+            "mine.json: protocol: expected JSON, got a mistake in line 2, column 9",
+        ),
         ('{"frequency_hz": [5]}', [], "mine.json: protocol: expected settings among frequencies_hz"),
         ('{"pulses": 0}', [], "mine.json: pulses: expected at least 1"),
         ('{"setup_s": 700}', ["--sessions", "2"], "interval_min: expected at least"),
@@ -103,6 +108,26 @@ def test_what_cannot_be_is_one_line_before_a_culture_is_opened(
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("animat: ") and words in line
     assert not (tmp_path / "out").exists()
+
+
+def test_more_patterns_than_a_virtual_culture_has_are_refused_before_its_array_is_scanned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Culture, "open", lambda self: pytest.fail("opened"))
+    (tmp_path / "mine.json").write_text('{"patterns": 101}')
+    out = tmp_path / "out"
+    assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(out)]) == 1
+    assert "patterns: expected at most the 100 that the culture's electrode selection has" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_pulses_faster_than_the_response_window_are_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.cultures.series.record_virtual_series", lambda *_, **__: [])
+    (tmp_path / "mine.json").write_text('{"frequencies_hz": [80, 100, 125, 500]}')
+    assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]) == 0
+    assert "warning: at 125 Hz, 500 Hz the next pulse comes before the response window ends" in capsys.readouterr().err
 
 
 def test_made_up_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

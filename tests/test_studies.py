@@ -37,7 +37,7 @@ from animat.neurons.timeline import fit_timeline
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.selection import SelectionRule
-from animat.report.html import cell
+from animat.report.html import cell, with_error
 from animat.robots import Cartpole, Navigation
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
@@ -642,11 +642,29 @@ def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:
         (float("nan"), "–"),
         (float("inf"), "∞"),
         (-float("inf"), "−∞"),
-        (2.5e6, "2.5e+06"),
+        (2.5e6, "2.50e+06"),
+        (22.96, "23.0"),
+        (116.9, "117"),
     ],
 )
 def test_cells_are_short(value: object, written: str) -> None:
     assert cell(value) == written
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "written"),
+    [
+        (-78.63, 1.128, "−78.6 ± 1.1"),
+        (104.2, 12.3, "104 ± 12"),
+        (22.4071, 0.00393, "22.407 ± 0.004"),
+        (119.98, 7.6e-6, "119.980 ± < 0.001"),
+        (120.0, 0.0, "120.0 ± 0.0"),
+        (3.0, None, "3 ± –"),
+        (3.0, float("nan"), "3 ± –"),
+    ],
+)
+def test_a_value_has_as_many_digits_as_its_error(value: float, error: float | None, written: str) -> None:
+    assert with_error(value, error).replace("\u00a0", " ") == written
 
 
 # --- the specification ----------------------------------------------------------------------------------------------
@@ -709,6 +727,7 @@ COMPARED = (
         ("[simulators]\nrange_hz = -5", "simulators.range_hz: expected a positive number, got -5"),
         ("[simulators]\nwindow_ms = [10, 2]", "simulators.window_ms: expected 0 <= start < end"),
         ("[simulators]\nburst_threshold = 7", "simulators.burst_threshold: expected a share of channels from 0 to 1"),
+        ("[simulators]\ndespite = ['drift']", "simulators.despite: expected findings among no-stimuli"),
         ("[simulators]\nconditions = 'bogus'", "simulators.conditions: expected one of all, frequency"),
         (COMPARED.format("nan"), "comparisons.at_min: expected finite minutes, got nan"),
         (COMPARED.format("500"), "comparisons.at_min: expected a minute of the recordings, from 0 to 140, got 500"),

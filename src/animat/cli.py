@@ -210,21 +210,12 @@ class Train(Fitting):
         from animat.mapping import mapping_named
         from animat.progress import Bar
         from animat.robots.registry import robot_named
-
-        robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
-        for caveat in robot.caveats():
-            print(f"warning: {caveat}", file=sys.stderr)
-        timeline = None if self.mapping == "none" else self.timeline(self.recordings)
-
-        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.despite:
-            raise UnusableData(
-                "--conditions: expected two or more for an agent to choose from, got one "
-                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
-                "(to go on in spite of it: --despite one-condition)"
-            )
         from animat.training.specification import Training
-        from animat.training.trainer import train
 
+        # What can be refused is refused before recordings are read, which can take a while.
+        if self.workers is not None and self.workers < 1:
+            raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
+        robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
         training = Training(
             robot=robot,
             mapping=None if self.mapping == "none" else mapping_named(self.mapping),
@@ -237,6 +228,18 @@ class Train(Fitting):
             delivery=self.delivery,
             commands=(-1.0, 1.0) if self.mapping == "none" and self.robot == "cartpole" else None,
         )
+        for caveat in robot.caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+        timeline = None if self.mapping == "none" else self.timeline(self.recordings)
+
+        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.despite:
+            raise UnusableData(
+                "--conditions: expected two or more for an agent to choose from, got one "
+                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                "(to go on in spite of it: --despite one-condition)"
+            )
+        from animat.training.trainer import train
+
         if timeline is not None:
             print(_control(timeline))
         with Bar("training") as progress:

@@ -77,7 +77,7 @@ class Run(Stimulating):
     episodes: int = 5
     """Of each policy and control, interleaved in random order"""
     controls: Literal["all", "random"] = "all"
-    """all: random, constant, silent, shuffled and hand-made; random: only that one"""
+    """all: random, constant, silent, shuffled and made by hand; random: only that one"""
     pulses: int | None = None
     """Pulses a presentation; default: as the policies' recordings had"""
     simulator: Literal["histogram", "empirical"] = "histogram"
@@ -177,11 +177,12 @@ class Run(Stimulating):
         known = recorded_culture(self.culture, recordings, self.recordings)
         state = self.state or (known.get("state") if self.culture_seed is None else None)
         seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
-        if state is not None:
-            print(f"the culture goes on from {state}", file=sys.stderr)
-        return culture_of(
+        culture = culture_of(
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
+        if state is not None:
+            print(f"the culture goes on from {state}", file=sys.stderr)
+        return culture
 
     def _presenting(
         self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration | None
@@ -368,7 +369,10 @@ class Recover:
 
         session = recover_session(self.session)
         told = session.to_dict()
-        print(f"{session.recording_file}: {told['ticks']} ticks, {told['pulses']} pulses; it ended: {told['ended']}")
+        print(
+            f"{session.recording_file} and {session.ticks_file.name}: {told['ticks']} ticks, {told['pulses']} pulses; "
+            f"it ended: {told['ended']}"
+        )
         if told["unanswered_pulses"]:
             print(told_unanswered(session))
         if told["lost_bytes"]:

@@ -62,12 +62,14 @@ class Record:
         asked = [f"--{name}" for name in ("order", "pulses", "presentations") if getattr(self, name) is not None]
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
+        if self.protocol is not None and self.culture != "made-up":
+            _say_too_fast(self._protocol())
         with Bar("recording") as progress:
             if self.culture == "made-up":
                 files = self._made_up(progress)
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
-        print(f"{len(files)} recordings in {self.out}")
+        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
         return {"recordings": [str(file) for file in files]}
 
     def _made_up(self, progress: Progress) -> list[Path]:
@@ -136,3 +138,16 @@ class Record:
             return read_protocol(self.protocol, usual)
         asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}
         return replace(usual, **{name: value for name, value in asked.items() if value is not None})
+
+
+def _say_too_fast(protocol: Protocol) -> None:
+    """Warn of frequencies whose pulses come before the response to the one before is over."""
+    from animat.neurons.windows import DEFAULT_WINDOW_MS
+
+    fast = [f"{hz:g} Hz" for hz in protocol.frequencies_hz if 1000 / hz < DEFAULT_WINDOW_MS[1]]
+    if fast:
+        print(
+            f"warning: at {', '.join(fast)} the next pulse comes before the response window ends at "
+            f"{DEFAULT_WINDOW_MS[1]:g} ms, so that responses hold its artefact: read them with a shorter --window-ms",
+            file=sys.stderr,
+        )

@@ -149,7 +149,9 @@ def controls(
         found.append(Contender("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
     if isinstance(robot, STEERED):
         rule = HandMadeRule(robot, strongest, weakest)
-        found.append(Contender("hand-made", f"lean right, push right: {labels[strongest]} or {labels[weakest]}", rule))
+        found.append(
+            Contender("made by hand", f"lean right, push right: {labels[strongest]} or {labels[weakest]}", rule)
+        )
     return found
 
 

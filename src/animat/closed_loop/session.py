@@ -19,6 +19,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
 from animat.robots.registry import robot_from_dict
+from animat.writing import alone_in
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
@@ -241,9 +242,12 @@ def recover_session(path: str | os.PathLike[str]) -> Session:
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
+        Mismatch: if the session still runs.
     """
-    session = read_session(path)
-    session.write()
+    # What is no session is told before its folder is held.
+    with alone_in(read_session(path).folder):
+        session = read_session(path)
+        session.write()
     return session
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from animat.cultures.base import Culture
-from animat.cultures.series import PartOfSeries, check_interval, recording_name
+from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
 from animat.errors import Mismatch
 from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
@@ -127,11 +127,11 @@ def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interv
 
 
 def _expect_of(file: Path, there: Recording, culture: Culture, protocol: Protocol) -> None:
-    for name, words in (("source", culture.provenance["source"]), ("protocol", protocol.to_json())):
-        if there.provenance.get(name) != words:
-            raise Mismatch(
-                f"{file}: expected a recording of this culture by this protocol, got one with another {name}: choose "
-                "another folder"
-            )
+    expected = {"source": culture.provenance["source"], "protocol": protocol.to_json()}
+    if difference := difference_from(expected, there):
+        raise Mismatch(
+            f"{file}: expected a recording of this culture by this protocol, got another ({difference}): choose "
+            "another folder"
+        )
     if there.channels.label.tolist() != culture.channels.label.tolist():
         raise Mismatch(f"{file}: expected a recording of this culture's channels, got others: choose another folder")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from animat.cultures.virtual import VirtualCulture
+from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
@@ -57,15 +60,15 @@ def record_virtual_series(
         The files, in the order of time.
 
     Raises:
-        InvalidArgument: for no sessions, or an interval shorter than a recording.
+        InvalidArgument: for no sessions, an interval shorter than a recording, or more patterns than the culture has.
         Mismatch: if a file of the series is there but from another culture, protocol or version, or another run is at
             work in the folder.
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
     """
-    check_interval(protocol, sessions, interval_min)
+    fresh = make_culture()
+    check_interval(protocol, sessions, interval_min, fresh.n_patterns)
     folder, progress = Path(folder), progress or Silent()
     files = [folder / recording_name(session * interval_min) for session in range(sessions)]
-    fresh = make_culture()
     # Seen before it is touched: somebody else's folder stays as it is.
     _expect_series(files, fresh, protocol, interval_min)
     with alone_in(folder):
@@ -163,14 +166,18 @@ def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int)
     return culture, 0
 
 
-def check_interval(protocol: Protocol, sessions: int, interval_min: float) -> None:
-    """Raise unless there are sessions, and each is over when the next one is due."""
+def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_patterns: int | None = None) -> None:
+    """Raise unless there are sessions, each is over when the next one is due, and there are patterns enough.
+
+    How many patterns a culture has is known of some before they are opened; of others it is None.
+    """
     if sessions < 1:
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
     if not 0 < interval_min < float("inf"):
         raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
     # How long a schedule takes does not depend on the electrodes: no culture need be opened to refuse.
-    takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), seed=0).duration_s / 60
+    patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
+    takes_min = make_schedule(protocol, patterns, seed=0).duration_s / 60
     if sessions > 1 and interval_min < takes_min:
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"
@@ -190,13 +197,11 @@ def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, s
         "protocol": protocol.to_json(),
         "protocol_seed": str(_seed(culture, session)),
     }
-    for name, words in expected.items():
-        got = there.provenance.get(name)
-        if got != words:
-            raise Mismatch(
-                f"{file}: expected a recording of the same culture and protocol ({name} {_short(words)}), got another "
-                f"({_short(got)}): remove it, or choose another folder"
-            )
+    if difference := difference_from(expected, there):
+        raise Mismatch(
+            f"{file}: expected a recording of the same culture and protocol, got another ({difference}): remove it, or "
+            "choose another folder"
+        )
     if abs(there.start_min * 60 - start_s) > 1e-6:
         raise Mismatch(f"{file}: expected a recording at {start_s / 60:g} min, got one at {there.start_min:g} min")
 
@@ -209,8 +214,21 @@ def _expect_equal(file: Path, again: Recording) -> None:
         )
 
 
-def _short(words: str | None) -> str:
-    return "nothing" if words is None else words if len(words) <= 60 else f"{words[:57]}..."
+def difference_from(expected: dict[str, str], recording: Recording) -> str:
+    """The first setting that a recording was not made with, as its provenance tells; nothing where there is none."""
+    for name, words in expected.items():
+        got = recording.provenance.get(name)
+        if got != words:
+            found = {} if got is None else {name: _parsed(got)}
+            return first_difference(found, {name: _parsed(words)}) or f"{name}, written otherwise"
+    return ""
+
+
+def _parsed(words: str) -> Any:
+    try:
+        return json.loads(words)
+    except ValueError:
+        return words
 
 
 class PartOfSeries:

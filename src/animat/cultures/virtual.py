@@ -136,6 +136,11 @@ class VirtualCulture(Culture):
         return self.selection.patterns
 
     @property
+    def n_patterns(self) -> int:
+        """How many patterns it has, known before it is opened."""
+        return (self._rule or SelectionRule()).patterns if self._selection is None else len(self._selection.patterns)
+
+    @property
     def device_limits(self) -> Limits:
         """`SIMULATED_LIMITS`."""
         return SIMULATED_LIMITS

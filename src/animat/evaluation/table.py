@@ -201,9 +201,7 @@ def evaluate(
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
         findings = _check(first, timeline)
-        if at_min is not None and np.isnan(at_min):
-            raise InvalidArgument("at_min: expected a minute on the culture's clock, got nan")
-        row = timeline.row_at(timeline.start_min[-1] if at_min is None else at_min)
+        row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
         simulator = timeline.at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))

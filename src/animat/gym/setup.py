@@ -59,7 +59,7 @@ def set_up(
     mapping: str | Mapping = "1-threshold",
     recordings: Paths | None = None,
     simulator: NeuronSimulator | None = None,
-    at_min: float = 0.0,
+    at_min: float | None = None,
     conditions: str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     kind: Kind = "histogram",
@@ -74,7 +74,8 @@ def set_up(
         recordings: files or folders of recordings of one culture to make the neurons' simulator of.
         simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions
             of `animat.neurons.made_up` answer.
-        at_min: which recording's simulator, in minutes on the culture's clock: the newest at that time.
+        at_min: which recording's simulator, in minutes on the culture's clock: the newest at that time; None: the
+            first.
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
         window_ms: when a response is read after its stimulus.
         kind: `histogram` (the paper) or `empirical`.
@@ -104,11 +105,12 @@ def set_up(
 
 
 def _simulator_of(
-    recordings: Paths, at_min: float, conditions: str | None, window_ms: tuple[float, float], kind: Kind
+    recordings: Paths, at_min: float | None, conditions: str | None, window_ms: tuple[float, float], kind: Kind
 ) -> tuple[NeuronSimulator, tuple[str, ...]]:
     by = None if conditions is None else conditions_named(conditions)
     timeline = fit_timeline(extract_series(read_recordings(recordings), by, window_ms), kind=kind)
     for finding in timeline.findings:
         if finding.severity == "warning":
             warnings.warn(finding.sentence, stacklevel=3)
-    return timeline.at(at_min), tuple(condition.label for condition in timeline.conditions)
+    row = 0 if at_min is None else timeline.row_asked_for(at_min)
+    return timeline.at(timeline.start_min[row]), tuple(condition.label for condition in timeline.conditions)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from animat.errors import UnusableData
+from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.conditions import Conditions
 from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.windows import DEFAULT_WINDOW_MS
 from animat.recordings.recording import Recording
+
+REFUSING = ("no-stimuli", "no-condition", "one-condition", "empty-condition", "dead-window")
+"""Names of the findings that make training pointless; a user may go on in spite of them."""
 
 
 def extract_series(
@@ -30,7 +33,9 @@ def extract_series(
 
     Raises:
         UnusableData: if a finding says that learning from a recording makes no sense, and is not in `despite`.
+        InvalidArgument: for a name in `despite` of no finding that refuses.
     """
+    check_despite(despite)
     series = []
     for recording in recordings:
         responses = extract_responses(recording, by, window_ms, burst_threshold)
@@ -42,3 +47,14 @@ def extract_series(
                 )
         series.append(responses)
     return series
+
+
+def check_despite(names: Sequence[str]) -> None:
+    """Raise unless all are names of findings that refuse: a misspelt one would be asked for in vain.
+
+    Raises:
+        InvalidArgument: naming the first that is not.
+    """
+    for name in names:
+        if name not in REFUSING:
+            raise InvalidArgument(f"despite: expected findings among {', '.join(REFUSING)}, got {name!r}")

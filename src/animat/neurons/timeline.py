@@ -48,6 +48,19 @@ class SimulatorTimeline:
         """The newest recording at a minute: the last one that started at or before it (before all: the first)."""
         return max(0, int(np.searchsorted(self.start_min, minute, side="right")) - 1)
 
+    def row_asked_for(self, minute: float) -> int:
+        """The same for a minute that a user named, who is told where no recording is as old as that.
+
+        Raises:
+            InvalidArgument: for a minute before the first recording, or none.
+        """
+        if not minute >= self.start_min[0]:
+            raise InvalidArgument(
+                f"at_min: expected a minute on the culture's clock from the first recording on, which started at "
+                f"{self.start_min[0]:g} min, got {minute:g}"
+            )
+        return self.row_at(minute)
+
     def at(self, minute: float) -> NeuronSimulator:
         """The simulator in use at a minute of the culture's clock."""
         row = self.row_at(minute)

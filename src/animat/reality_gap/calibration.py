@@ -9,7 +9,6 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import InvalidArgument
 from animat.neurons.conditions import Condition
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import Kind, NeuronSimulator, fit_simulator
@@ -80,9 +79,7 @@ class Calibration:
             at_min = float(timeline.start_min[-1] if policy is None else timeline.start_min[0])
             if trained.get("shadowing"):
                 at_min += trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"]
-        if np.isnan(at_min):
-            raise InvalidArgument("at_min: expected a minute on the culture's clock, got nan")
-        row = timeline.row_at(at_min)
+        row = timeline.row_asked_for(at_min)
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)

@@ -133,6 +133,10 @@ class Protocol:
         except (ValueError, RecursionError) as error:
             if isinstance(error, InvalidArgument):
                 raise
+            if isinstance(error, json.JSONDecodeError):
+                raise InvalidArgument(
+                    f"protocol: expected JSON, got a mistake in line {error.lineno}, column {error.colno} ({error.msg})"
+                ) from error
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}") from error
         if not isinstance(data, dict):
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")

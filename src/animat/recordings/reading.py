@@ -156,6 +156,11 @@ def _listed(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) ->
 def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
+    try:
+        # A folder that cannot be read looks empty to glob.
+        next(path.iterdir(), None)
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
     # Hidden files are unfinished ones.
     found = sorted({f for pattern in IN_FOLDERS for f in path.glob(pattern) if not f.name.startswith(".")})
     if not found:

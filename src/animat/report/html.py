@@ -64,6 +64,7 @@ class Table:
         note: under it.
         beside: the file that holds all digits, relative to the page.
         marked: rows that stand out, by index.
+        folded: shown when its title is clicked, as it is long and something else tells the same.
     """
 
     title: str
@@ -72,6 +73,7 @@ class Table:
     note: str = ""
     beside: str = ""
     marked: tuple[int, ...] = ()
+    folded: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,4 +133,15 @@ def cell(value: Any) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     whole = value == int(value) and abs(value) < 1e6
-    return (f"{int(value)}" if whole else f"{value:.3g}").replace("-", "−")
+    # With the zeros at the end: 23.0 beside 22.4.
+    return (f"{int(value)}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", "−")
+
+
+def with_error(value: float, error: float | None) -> str:
+    """A value and its error, to the second digit of the error but no more than three decimals."""
+    if error is None or not (math.isfinite(value) and math.isfinite(error)):
+        return f"{cell(value)}\u00a0±\u00a0{cell(error)}"
+    decimals = min(3, max(0, 1 - math.floor(math.log10(error)))) if error > 0 else 1
+    rounded = f"{error:.{decimals}f}"
+    told = rounded if error == 0 or float(rounded) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
+    return f"{value:.{decimals}f}\u00a0±\u00a0{told}".replace("-", "−")

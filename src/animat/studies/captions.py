@@ -65,7 +65,7 @@ ROBOT: dict[str, tuple[str, str]] = {
     ),
     "paths": (
         "episodes",
-        "One episode of each policy at the last recording. Blue: it arrived, or stayed up to the end; red: it did not.",
+        "One episode of each policy at the last recording. Blue: it arrived, or stayed up to the end; orange: not.",
     ),
     "frames": ("frames", "From the start of an episode to its end; the number under a frame is the iteration."),
 }

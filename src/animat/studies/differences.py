@@ -197,8 +197,8 @@ def explain(row: dict[str, Any]) -> str:
     room = (second - row["mean_first"]) / (second - random)
     if room <= 1 - AIM:
         return (
-            f"{limits}, and {row['first']} comes within {max(room, 0.0):.2f} of the way from random to it: no "
-            f"room is left."
+            f"{limits}, and {row['first']} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
+            "actions and that: no room is left."
         )
     score = row["score_second"]
     if score is not None and score >= AIM:

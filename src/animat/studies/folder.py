@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.formats.csv import stimuli_beside
 from animat.studies.jobs import sha256
@@ -141,9 +142,10 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     # A study that stopped at its first step left a specification and no more.
     begun = (path for path in folder.rglob("*") if not path.is_dir() and not _is_passing(path))
     if any(path.name not in (MANIFEST, SPECIFICATION) for path in begun):
+        difference = first_difference(found, manifest, ignoring=("fingerprint",))
         raise Mismatch(
-            f"{folder}: expected a folder of this study, got one of another ({_first_difference(found, manifest)}"
-            "); give another folder, or remove this one"
+            f"{folder}: expected a folder of this study, got one of another ({difference}); give another folder, or "
+            "remove this one"
         )
     return False
 
@@ -151,20 +153,3 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
 def _is_passing(path: Path) -> bool:
     """Whether a file is nobody's: half written by a killed run, or there to be locked."""
     return is_unfinished(path) or path.name == LOCK
-
-
-def _first_difference(found: Any, wanted: Any, name: str = "") -> str:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in sorted(set(found) | set(wanted)):
-            if key != "fingerprint" and found.get(key) != wanted.get(key):
-                return _first_difference(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
-    if isinstance(found, list) and isinstance(wanted, list) and len(found) == len(wanted):
-        for i, (one, other) in enumerate(zip(found, wanted, strict=True)):
-            if one != other:
-                return _first_difference(one, other, f"{name}[{i}]")
-    return f"{name}: {_short(found)} there, {_short(wanted)} now"
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

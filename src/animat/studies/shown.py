@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from animat.evaluation.optimum import bracket_findings
 from animat.neurons.fidelity import LARGEST_LOSS
-from animat.report.html import Table, cell
+from animat.report.html import Table, cell, with_error
 from animat.studies.limits import rough_kinds
 from animat.studies.places import limits_file, read_table, table_file
 from animat.studies.specification import Study
@@ -19,6 +19,7 @@ Columns: TypeAlias = list[tuple[str, "str | Callable[[dict[str, Any]], Any]"]]
 """Of a table that is shown: their names, and the key or a function of a row that gives the cell."""
 
 _MOST_LABELS = 12
+_MOST_ROWS = 40
 
 _SCORE_NOTE = (
     "Limit: the best possible return of any controller with the same neurons, mapping and robot, by dynamic "
@@ -199,8 +200,8 @@ def controls_shown(study: Study, folder: Path) -> Table:
                 ("score", "normalised_score"),
             ],
         ),
-        note="Trained policies stand beside their controls. ±: standard error over actors, of one actor over its "
-        "episodes."
+        note="Trained policies stand beside their controls, as in the figures above. ±: standard error over actors, of "
+        "one actor over its episodes. Limits are those of the culture as it answers, also beside silent and shuffled."
         + (
             " Without neurons, where any command can be chosen, none is held constant."
             if any(row["mapping"] == "none" for row in rows)
@@ -208,6 +209,7 @@ def controls_shown(study: Study, folder: Path) -> Table:
             else ""
         ),
         beside="tables/controls.csv",
+        folded=len(rows) > _MOST_ROWS,
     )
 
 
@@ -218,7 +220,7 @@ def _columns(rows: Sequence[dict[str, Any]], columns: Columns) -> tuple[tuple[st
 
 
 def _pair(value: str, error: str) -> Callable[[dict[str, Any]], str | None]:
-    return lambda row: None if row[value] is None else f"{cell(row[value])}\u00a0±\u00a0{cell(row[error])}"
+    return lambda row: None if row[value] is None else with_error(row[value], row[error])
 
 
 def _interval(value: str, low: str, high: str) -> Callable[[dict[str, Any]], str]:

@@ -133,6 +133,7 @@ class Simulators:
 
     def __post_init__(self) -> None:
         from animat.neurons.conditions import conditions_named
+        from animat.neurons.series import check_despite
         from animat.neurons.simulator import LARGEST_BINS
         from animat.neurons.windows import check_window
 
@@ -148,6 +149,7 @@ class Simulators:
             )
         try:
             check_window(self.window_ms)
+            check_despite(self.despite)
             if self.conditions:
                 conditions_named(self.conditions)
         except InvalidArgument as error:

@@ -13,11 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from animat.animat import Environment
+from animat.compilation import FAST_TO_COMPILE
 from animat.errors import InvalidFile
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.training.policy import Policy
-from animat.training.sac import Learner, begin, train_chunk
+from animat.training.sac import SAC, Learner, begin, train_chunk
 from animat.training.specification import CHUNKS, Training
 from animat.writing import written_whole
 
@@ -85,6 +87,16 @@ def untrained_policies(group: Group) -> list[Policy]:
     return SideBySide(group).policies()
 
 
+def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """`begin` and `train_chunk` for several policies side by side, to be compiled when they are first called."""
+    beginning = jax.vmap(partial(begin, environment, algorithm))
+    chunk = jax.vmap(partial(train_chunk, environment, algorithm), in_axes=(0, None, None, None))
+    return (
+        jax.jit(beginning, compiler_options=FAST_TO_COMPILE),
+        jax.jit(chunk, donate_argnums=0, compiler_options=FAST_TO_COMPILE),
+    )
+
+
 class SideBySide:
     """The policies of a group while they are trained: chunk after chunk, each with the simulator it is handed.
 
@@ -96,12 +108,9 @@ class SideBySide:
         training = group.training
         self._group = group
         self._environment = training.environment(0 if group.timeline is None else len(group.timeline.conditions))
-        self._chunk = jax.jit(
-            jax.vmap(partial(train_chunk, self._environment, training.algorithm), in_axes=(0, None, None, None)),
-            donate_argnums=0,
-        )
+        beginning, self._chunk = programs(self._environment, training.algorithm)
         keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
-        self._learners = jax.jit(jax.vmap(partial(begin, self._environment, training.algorithm)))(keys)
+        self._learners = beginning(keys)
         self._curve: list[np.ndarray] = []
 
     def train(self, index: int, simulator: NeuronSimulator | None) -> float:

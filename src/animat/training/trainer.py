@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from animat.differences import first_difference
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress, Silent
@@ -121,7 +122,7 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
         if fingerprint != manifest["fingerprint"]:
-            difference = _first_difference(found, manifest)
+            difference = first_difference(found, manifest, ignoring=("fingerprint", "sources")) or "other responses"
             raise Mismatch(
                 f"{folder}: expected a folder of this training, got one of another ({difference}); "
                 "give another folder, or remove this one"
@@ -132,15 +133,6 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     return False
-
-
-def _first_difference(found: Any, wanted: Any, name: str = "") -> str:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in sorted(set(found) | set(wanted)):
-            if key not in ("fingerprint", "sources") and found.get(key) != wanted.get(key):
-                return _first_difference(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
-        return "other responses"
-    return f"{name}: {found!r} there, {wanted!r} now"
 
 
 def _provenance(manifest: dict[str, Any], members: tuple[int, ...]) -> dict[str, Any]:

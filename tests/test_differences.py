@@ -1,0 +1,42 @@
+"""Differences: the first place is named, and nothing where there is none."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from animat.differences import first_difference
+
+plain = st.recursive(
+    st.none() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text("abc", min_size=1, max_size=2), inner),
+    max_leaves=8,
+)
+
+
+@pytest.mark.parametrize(
+    ("found", "wanted", "said"),
+    [
+        (1, 1, ""),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, "a.b[1]: 2 there, 3 now"),
+        ({"a": [1]}, {"a": [1, 2]}, "a: [1] there, [1, 2] now"),
+        ({"b": 1}, {"a": 2, "b": 1}, "a: nothing there, 2 now"),
+        ({"a": 1, "b": 1}, {"a": 2, "b": 2}, "a: 1 there, 2 now"),
+        ({"a": "x" * 99}, {"a": "y"}, f"a: '{'x' * 56}... there, 'y' now"),
+        ({"a": {"id": 1}, "b": 1}, {"a": {"id": 2}, "b": 2}, "b: 1 there, 2 now"),
+    ],
+)
+def test_the_first_place_is_named(found: Any, wanted: Any, said: str) -> None:
+    assert first_difference(found, wanted, ignoring=("id",)) == said
+
+
+@given(plain, plain)
+def test_there_is_one_where_two_differ_and_none_where_they_are_the_same(one: Any, other: Any) -> None:
+    assert first_difference(one, copy.deepcopy(one), "it") == ""
+    said = first_difference(one, other, "it")
+    assert bool(said) == (one != other)
+    assert not said or (said.startswith("it") and said.endswith(" now"))
