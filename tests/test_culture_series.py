@@ -184,9 +184,7 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
             yield
 
     monkeypatch.setattr("animat.cultures.series.alone_in", ended_in_between)
-    with pytest.raises(
-        Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"
-    ):
+    with pytest.raises(Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"):
         record(folder, seed=2)
 
 
@@ -210,9 +208,7 @@ def test_a_leftover_that_cannot_be_removed_stays(
 
 def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path], tmp_path: Path) -> None:
     folder = undisturbed[0].parent
-    with pytest.raises(
-        Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"
-    ):
+    with pytest.raises(Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"):
         record(folder, seed=2)
     with pytest.raises(Mismatch, match="protocol"):
         record(folder, protocol=Protocol((20.0, 80.0), patterns=5, presentations=9, setup_s=0.5, pause_s=0.2))
