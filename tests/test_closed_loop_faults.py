@@ -376,6 +376,32 @@ def test_ctrl_c_and_a_polite_kill(tmp_path: Path, number: signal.Signals) -> Non
     assert signal.getsignal(number) is before
 
 
+@pytest.mark.parametrize(
+    ("error", "by"), [(RuntimeError("the terminal is gone"), "crash"), (KeyboardInterrupt(), "person")]
+)
+def test_a_progress_that_fails_leaves_no_loop_behind(tmp_path: Path, error: BaseException, by: str) -> None:
+    def slowly(culture: FakeCulture, observed: Observed) -> Observed:
+        culture._at += 1
+        time.sleep(0.002)
+        return observed
+
+    class Failing:
+        """A progress that fails once the loop is under way."""
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if culture.pulses > 8:
+                raise error
+
+    with FakeCulture(fault=slowly, at=0) as culture:
+        with pytest.raises(type(error)):
+            run_session(culture, loop_of(robot=LONG), [RANDOM], tmp_path, progress=Failing())
+        assert not any(thread.name == "closed loop" for thread in threading.enumerate())
+        session = recover_session(tmp_path)
+        assert session.ending.by == by
+        assert str(error) in session.ending.sentence
+        assert_safe(session, culture, 8)
+
+
 @pytest.mark.parametrize("kind", ["pulses", "electrode", "session"])
 def test_the_budget_runs_out(tmp_path: Path, kind: str) -> None:
     limits = replace(SIMULATED_LIMITS, stimuli_per_session=30) if kind == "session" else None

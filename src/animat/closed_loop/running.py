@@ -59,7 +59,8 @@ def run_session(
     of the culture and not answered yet; and once this returns, or `recover_session` did its work, `session.nwb` is a
     recording like any other. Unless the plan was done
     or the budget spent, the culture is then stopped: it delivers nothing until it is closed and opened again.
-    `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included.
+    `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included. What `progress` raises is
+    raised, once the culture is stopped and the log is written.
 
     Args:
         culture: open; it stays open.
@@ -110,23 +111,32 @@ class _Supervisor:
 
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
-        driver = self._driver
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
         with told_instead(self._stop_for_a_person), _without_collector(), _switching_every(_SWITCH_S):
             thread.start()
-            ending = self._watch(thread)
+            try:
+                ending = self._watch(thread)
+            except BaseException as error:
+                # The caller's progress, or a fault of our own: a loop that nobody watches must not go on.
+                is_person = isinstance(error, KeyboardInterrupt)
+                told = "stopped by a person" if is_person else f"what watches the loop raised {in_words(error)}"
+                with contextlib.suppress(Exception):
+                    self._end_it(thread, Ending("person" if is_person else "crash", told))
+                raise
             if ending is not None:
-                # The loop did not end by itself: it is told to, and left alone if it does not.
-                driver.is_stopped = True
-                self._halt(ending)
-                thread.join(_GRACE_S)
-            elif self._ending is None:
-                ending = Ending("crash", "the loop's thread ended without a word")
-            else:
-                ending = self._ending
+                return self._end_it(thread, ending)
+            ending = self._ending or Ending("crash", "the loop's thread ended without a word")
             if ending.by not in ("plan", "budget"):
                 self._halt(ending)
             return self._finish(ending)
+
+    def _end_it(self, thread: threading.Thread, ending: Ending) -> Ending:
+        """End a loop that did not end by itself: it is told to, and left alone if it does not."""
+        self._driver.is_stopped = True
+        self._halt(ending)
+        thread.join(_GRACE_S)
+        self._halt(ending)
+        return self._finish(ending)
 
     def _drive(self) -> None:
         self._ending = self._driver.run()
