@@ -16,7 +16,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Protocol
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection
+from animat.recordings.selection import Selection, SelectionRule
 from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
 from cultures import FEW, small_culture
 
@@ -216,6 +216,67 @@ def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
         small_culture().restore_state(tmp_path / "other.npz")
     with pytest.raises(InvalidFile, match="no such file"):
         small_culture().restore_state(tmp_path / "none.state")
+
+
+class Pressing:
+    """A progress at which a person presses Ctrl-C, the first time that there is any."""
+
+    pressed = False
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        if not self.pressed:
+            self.pressed = True
+            raise KeyboardInterrupt
+
+
+def test_a_culture_whose_opening_was_broken_off_can_be_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with small_culture() as undisturbed:
+        recording = undisturbed.record(SHORT)
+    culture = small_culture(progress=Pressing())
+    with pytest.raises(KeyboardInterrupt):
+        culture.open()
+    with pytest.raises(InvalidArgument, match="expected one that was opened, got a new one"):
+        _ = culture.tissue
+    with culture:
+        assert culture.now_s == 0.0
+        assert culture.record(SHORT).equals(recording)
+    # The same in the warm-up, where there is no scan.
+    given = small_culture(selection=undisturbed.selection)
+    with monkeypatch.context() as patched:
+        patched.setattr("animat.cultures.virtual.WARM_UP_S", -1.0)
+        with pytest.raises(InvalidArgument):
+            given.open()
+    with given:
+        assert given.now_s == 0.0
+        assert np.array_equal(given.record(SHORT).spike_times_s, recording.spike_times_s)
+
+
+def test_a_culture_for_which_no_electrodes_were_found_stays_a_new_one() -> None:
+    culture = small_culture(rule=SelectionRule(signal_to_noise=1000.0))
+    for _ in range(2):
+        with pytest.raises(InvalidArgument, match="pass a signal-to-noise ratio of 1000"):
+            culture.open()
+
+
+def test_a_culture_that_another_s_state_was_given_to_is_what_it_was(tmp_path: Path) -> None:
+    with small_culture() as first:
+        first.advance(0.3)
+        first.save_state(tmp_path / "first.state")
+        recording = first.record(SHORT)
+    with small_culture(2) as other:
+        other.save_state(tmp_path / "other.state")
+        begun = other.record(SHORT)
+    culture = small_culture(2)
+    with pytest.raises(Mismatch, match="differs in seed"):
+        culture.restore_state(tmp_path / "first.state")
+    with culture:
+        assert culture.record(SHORT).equals(begun)
+    lived = small_culture()
+    lived.restore_state(tmp_path / "first.state")
+    with pytest.raises(Mismatch, match="differs in seed"):
+        lived.restore_state(tmp_path / "other.state")
+    with lived:
+        assert lived.record(SHORT).equals(recording)
 
 
 def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:

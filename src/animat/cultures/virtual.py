@@ -209,34 +209,39 @@ class VirtualCulture(Culture):
 
     def _open(self) -> None:
         if self._tissue is None:
-            self._grow()
-            tissue = self.tissue
+            tissue, visibility = self._grown()
             tissue.advance(WARM_UP_S)
             if self._selection is None:
                 before = tissue.snapshot()
-                self._scan = self._scan_array()
-                self._selection = select_electrodes(MAXONE, self._scan, self._rule, seed=self.seed)
+                scan = self._scan_array(tissue, visibility)
+                selection = select_electrodes(MAXONE, scan, self._rule, seed=self.seed)
                 tissue.restore(before)
+                self._scan, self._selection = scan, selection
             self._zero_ns = self._now_ns = round(tissue.now_s * NS)
+            # Only now: a culture whose opening was broken off before is new, and can be opened again.
+            self._have(tissue, visibility)
         self._look()
 
-    def _grow(self) -> None:
+    def _grown(self) -> tuple[Tissue, Visibility]:
+        """A new tissue, and what electrodes see of it."""
         from animat.cultures.tissue import Tissue
 
         tissue = Tissue(self.seed, self._parameters)
-        self._tissue = tissue
-        self._step_ns = round(tissue.parameters.step_ms * 1e6)
-        self._visibility = Visibility(self.seed, MAXONE, tissue.x_um, tissue.y_um, tissue.is_excitatory)
+        return tissue, Visibility(self.seed, MAXONE, tissue.x_um, tissue.y_um, tissue.is_excitatory)
 
-    def _scan_array(self) -> ScannedActivity:
+    def _have(self, tissue: Tissue, visibility: Visibility) -> None:
+        self._step_ns = round(tissue.parameters.step_ms * 1e6)
+        self._tissue, self._visibility = tissue, visibility
+
+    def _scan_array(self, tissue: Tissue, visibility: Visibility) -> ScannedActivity:
         """Spontaneous activity of the whole array, block after block."""
         blocks, found = MAXONE.scan_blocks(), []
         rng = np.random.default_rng([self.seed, 12])
-        neurons = len(self.tissue.x_um)
+        neurons = len(tissue.x_um)
         for number, block in enumerate(blocks):
-            spikes = self.tissue.advance(self._scan_s)
+            spikes = tissue.advance(self._scan_s)
             spikes_of = np.bincount(spikes.neuron, minlength=neurons)
-            found.append(self._visibility.measure(block, spikes_of, self._scan_s, rng))
+            found.append(visibility.measure(block, spikes_of, self._scan_s, rng))
             self._progress.update(0, 1, f"scanning the array: block {number + 1} of {len(blocks)}")
         return ScannedActivity.of_blocks(found)
 

@@ -52,8 +52,6 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
     from animat.cultures.tissue.tissue import Snapshot
 
     head, arrays = _read(Path(path))
-    culture._grow()
-    tissue = culture.tissue
     for name, value in culture.settings.items():
         if head["culture"].get(name) != value:
             again = "remove it to begin anew, or use the same settings"
@@ -62,6 +60,7 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
             raise Mismatch(
                 f"{path}: expected the state of this culture, got another's, which differs in {name}: {again}"
             )
+    tissue, visibility = culture._grown()
     try:
         fresh = tissue.snapshot()
         snapshot = Snapshot(
@@ -80,6 +79,8 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
             f"{path}: expected the state of a virtual culture of this version, got {error!r}: remove it to begin anew"
         ) from error
     tissue.restore(snapshot)
+    # Only now: a culture that could not be restored is what it was.
+    culture._have(tissue, visibility)
     culture._selection = selection
     culture._zero_ns, culture._now_ns = zero_ns, now_ns
     culture._held_ns, culture._held_neuron = held_ns, held_neuron
