@@ -25,11 +25,12 @@ from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS
-from animat.errors import InvalidFile, UnsafeStimulus
+from animat.errors import InvalidFile, UnsafeStimulus, UnusableData
 from animat.recordings.reading import read_recording
 from animat.robots import Navigation
 from fake_culture import FakeCulture, Fault
 from test_closed_loop import RANDOM, assert_read_alike, loop_of
+from test_run_on_recordings import policy_of
 
 LONG = Navigation(episode_limit=100_000, stride_m=1e-9)
 
@@ -467,6 +468,35 @@ def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> Non
     (tmp_path / "session.nwb").rmdir()
     assert recover_session(tmp_path).ticks == session.ticks
     assert_read_alike(tmp_path, loop_of())
+
+
+def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cultures = []
+
+    def made(*_: Any, **__: Any) -> FakeCulture:
+        cultures.append(FakeCulture())
+        return cultures[-1]
+
+    def dead(*_: Any, **__: Any) -> Any:
+        raise UnusableData("dead-window: nothing is answered")
+
+    policy_of(0).save(tmp_path / "p0.safetensors")
+    given = ["run", str(tmp_path / "p0.safetensors"), "--episodes", "1", "--out", str(tmp_path / "session")]
+    monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
+    with monkeypatch.context() as patched:
+        patched.setattr("animat.neurons.series.extract_series", dead)
+        assert main(given) == 1
+    assert "dead-window" in capsys.readouterr().err
+    recorded = tmp_path / "session" / "calibration.nwb"
+    before = recorded.read_bytes()
+    assert main([*given, "--despite", "dead-window"]) == 1
+    assert f"`--recordings {recorded}` to run by that" in capsys.readouterr().err
+    assert len(cultures) == 1
+    assert main([*given, "--recordings", str(recorded)]) == 0
+    assert "recorded first" not in capsys.readouterr().err
+    assert recorded.read_bytes() == before
 
 
 KILLED = """

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from animat.recordings.stimulus import Pulse
     from animat.training.policy import Policy
 
+CALIBRATION_FILE = "calibration.nwb"
+"""What `run` records first where no recordings are given, in the session's folder."""
+
 
 @dataclass(frozen=True)
 class Stimulating:
@@ -136,7 +139,7 @@ class Run(Stimulating):
             check_conditions(first, calibration)
         with (
             # Last, as it makes the folder.
-            _held_for_session(self.out),
+            _held_for_session(self.out, is_recording=not recordings),
             polite_kill_as_ctrl_c(),
             Bar("closed loop") as progress,
             self._culture(recordings, progress) as culture,
@@ -219,7 +222,7 @@ class Run(Stimulating):
         )
         print("no recordings were given: the culture is recorded first", file=sys.stderr)
         recording = record_within(account, culture, protocol, self.seed, progress)
-        recording.save(self.out / "calibration.nwb")
+        recording.save(self.out / CALIBRATION_FILE)
         return recording
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:
@@ -381,14 +384,23 @@ class Recover:
 
 
 @contextmanager
-def _held_for_session(folder: Path) -> Iterator[None]:
-    """Hold a folder that can take a new session; the error of one that cannot says what is there."""
+def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
+    """Hold a folder that can take a new session; the error of one that cannot says what is there.
+
+    Where the culture `is_recording` first, a recording of a run that failed must not be there: each costs a living
+    culture some thousand pulses.
+    """
     from animat.closed_loop.session import expect_no_session
 
     if folder.exists() and not folder.is_dir():
         raise InvalidArgument(f"--out: expected a folder for the session, got a file: {folder}")
     with alone_in(folder):
         expect_no_session(folder)
+        if is_recording and (there := folder / CALIBRATION_FILE).exists():
+            raise InvalidArgument(
+                f"{there}: the culture was recorded there already, for a session that did not begin; give "
+                f"`--recordings {there}` to run by that, or choose another folder"
+            )
         yield
 
 
