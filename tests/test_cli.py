@@ -201,6 +201,12 @@ BAD = {
     "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["window_ms"]),
     "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
     "unknown parameter": (nothing, [*TRAIN, "{recordings}", "--parameters", "wheels=3"], ["cartpole", "wheels"]),
+    "a parameter called name": (nothing, [*TRAIN, "{recordings}", "--parameters", "name=3"], ["cartpole", "'name'"]),
+    "no channels": (
+        arrays(spike_time_s=np.zeros(0), spike_channel=np.zeros(0, np.int64), channel_label=None),
+        ["inspect", "{folder}/bad.npz"],
+        ["bad.npz", "channels: expected at least one"],
+    ),
     "parameter without a number": (nothing, [*TRAIN, "{recordings}", "--parameters", "force_n"], ["--parameters"]),
     "a seed beyond 32 bits": (
         nothing,
@@ -319,8 +325,7 @@ def test_a_real_culture_trains_a_controller_of_two_conditions(
 
 LITTLE_ROOM = """
 import resource, signal, sys
-from animat.cli import _say_findings, main
-from animat.recordings.findings import Finding
+from animat.cli import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (8_192, 8_192))
 sys.exit(main())
@@ -353,3 +358,14 @@ def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture
         "warning: at 20 min: lost (and 2 more like it)",
         "warning: 12 only",
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "worst"),
+    [("few-samples", (29.0, 1.0, 12.0), 1.0), ("no-difference", (0.06, 0.01), 0.01), ("drift", (0.3, -0.6, 0.4), -0.6)],
+)
+def test_the_worst_of_several_warnings_is_told(
+    name: str, values: tuple[float, ...], worst: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _say_findings([Finding(name, "warning", f"it is {value}", value) for value in values])
+    assert capsys.readouterr().err.startswith(f"warning: it is {worst} (and ")

@@ -12,6 +12,7 @@ import pytest
 from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import Origin, convert_recording
+from animat.recordings.detection.settings import Detection
 from animat.recordings.reading import read_recording
 from rig_files import event_table, mapping_table, spike_table, write_cl1, write_maxwell
 from test_detection import noisy
@@ -63,6 +64,25 @@ def test_what_is_converted_is_what_was_read(kind: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(written, name), getattr(source, name))
     for name in ("time_s", "frequency_hz", "electrodes", "presentation"):
         np.testing.assert_array_equal(getattr(written.stimuli, name), getattr(source.stimuli, name))
+
+
+def test_what_the_file_says_of_the_subject_stays(tmp_path: Path) -> None:
+    path = rig_file("npz", tmp_path)
+    convert_recording(path, tmp_path / "unknown.nwb", Origin(subject_id="c1"))
+    convert_recording(path, tmp_path / "female.nwb", Origin(subject_id="c1", sex="F"))
+    convert_recording(tmp_path / "female.nwb", tmp_path / "renamed.nwb", Origin(subject_id="c2"))
+    found = [read_recording(tmp_path / f"{name}.nwb").provenance["sex"] for name in ("unknown", "female", "renamed")]
+    assert found == ["U", "F", "F"]
+
+
+def test_a_choice_that_would_be_ignored_is_refused(tmp_path: Path) -> None:
+    path = rig_file("maxwell", tmp_path)
+    with pytest.raises(InvalidArgument, match=r"stimuli_path: .* holds its own stimuli"):
+        convert_recording(path, tmp_path / "a.nwb", detection=Detection(), stimuli_path=tmp_path / "pulses.csv")
+    for choice in ({"part": "well000/rec0000"}, {"stimuli": "x"}):
+        with pytest.raises(InvalidArgument, match="stimuli, part: expected none for traces read with a reader"):
+            convert_recording(path, tmp_path / "a.nwb", reader="intan", **choice)
+    assert not (tmp_path / "a.nwb").exists()
 
 
 @pytest.mark.oracle

@@ -181,6 +181,53 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
         assert row.name in evaluation.to_text()
 
 
+def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() -> None:
+    """Held ones are the first recording's, whichever answers; the truth is a roll-out with them put in by hand."""
+    timeline = timeline_of()
+    moving = policy_of(timeline, seed=1)
+    held = replace(moving, provenance={"training": {"percentiles": "first"}, "simulators": {"recorded_at_min": [0.0]}})
+    found = evaluate({"a": held}, timeline, at_min=14.0, episodes=50, seed=3)
+    simulator = replace(timeline.at(14.0), percentiles=timeline.at(0.0).percentiles)
+    environment = Animat(Cartpole(), Thresholds(1), 3)
+    wanted = roll_out(environment, simulator, networks_of([held], greedy=True), 1, episodes=50, seed=3).returns
+    np.testing.assert_array_equal(found.rows[0].episodes.returns, wanted)
+    assert np.any(
+        wanted != evaluate({"a": moving}, timeline, at_min=14.0, episodes=50, seed=3).rows[0].episodes.returns
+    )
+    assert "recording at 10 min, percentiles held from 0 min: 1 policies" in found.to_text()
+    assert found.to_dict()["percentiles_held_from_min"] == 0.0 and not found.findings
+    elsewhere = replace(held, provenance={**held.provenance, "simulators": {"recorded_at_min": [-10.0, 0.0]}})
+    (finding,) = evaluate({"a": elsewhere}, timeline, episodes=5).findings
+    assert "held from the recording at -10 min, which is not the first of these" in finding.sentence
+    with pytest.raises(Mismatch, match="b: expected the same percentiles as a"):
+        evaluate({"a": moving, "b": held}, timeline)
+
+
+def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
+    """Whatever it chooses, what is delivered is drawn: as good as random actions, and no limit is its own."""
+    timeline = timeline_of()
+    chosen = policy_of(timeline, SHORT, seed=1)
+    control = replace(chosen, provenance={"training": {"delivery": "shuffled"}})
+    found = evaluate({"a": control}, timeline, episodes=200, seed=3, limit_resolution=0.25)
+    rows = {row.name: row for row in found.rows}
+    np.testing.assert_array_equal(rows["policies"].episodes.returns, rows["shuffled"].episodes.returns)
+    assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=200, seed=3).rows[0]
+                  .episodes.returns)  # fmt: skip
+    assert "as trained: what is delivered is drawn anew" in found.to_text()
+    assert found.score(rows["policies"]) is None and found.score(rows["random"]) == 0.0
+    assert "none for policies and silent and shuffled, whose limit is another" in found.to_text()
+
+
+def test_simulators_made_otherwise_than_in_training_are_told() -> None:
+    timeline = timeline_of()
+    trained = {"kind": "histogram", "bins": 40, "range_hz": None, "recorded_at_min": [0.0]}
+    policy = replace(policy_of(timeline), provenance={"simulators": trained})
+    (finding,) = evaluate({"a": policy}, timeline, episodes=5).findings
+    assert finding.name == "other-simulator" and finding.sentence.endswith("made otherwise: bins 40, here 20")
+    alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
+    assert not evaluate({"a": alike}, timeline, episodes=5).findings
+
+
 def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> None:
     timeline = timeline_of()
     evaluation = evaluate({"a": policy_of(timeline)}, timeline, at_min=14.0, episodes=50, seed=3)

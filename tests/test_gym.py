@@ -197,6 +197,11 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"mapping": "3-thresholds"}, "mapping: expected one of 1-threshold"),
         ({"pole_mass": 1.0}, "cartpole: expected parameters among .*, got 'pole_mass'"),
         ({"recordings": "r", "simulator": made_up_simulator()}, "recordings, simulator: expected one of them"),
+        ({"conditions": "frequency:5,80"}, "conditions: expected only with recordings"),
+        ({"at_min": 140, "simulator": made_up_simulator()}, "at_min: expected only with recordings"),
+        ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
+        ({"kind": "empirical"}, "kind: expected only with recordings"),
+        ({"name": 3.0}, "cartpole: expected parameters among .*, got 'name'"),
         ({"delivery": "late"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
     ],
 )

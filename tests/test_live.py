@@ -25,7 +25,7 @@ from animat.errors import (
     UnusableData,
 )
 from animat.live.exchange import Exchange
-from animat.live.plan import LOG_FILE, Pace, check_plan
+from animat.live.plan import LOG_FILE, Pace, check_plan, what_stands
 from animat.live.recording import record_within
 from animat.live.shadowing import Lived, live
 from animat.mapping import Thresholds
@@ -241,6 +241,38 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
     policies = load_policies(tmp_path / "live" / "policies")
     assert list(policies) == ["p0", "p1"]
     assert all(len(policy.learning_curve) for policy in policies.values())
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(KeyboardInterrupt(), "stopped by a person"), (RuntimeError("no dynamic program"), "RuntimeError: no dynamic")],
+)
+def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told(
+    error: BaseException, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr("animat.live.shadowing.run_policies", fail)
+    with FakeCulture() as culture:
+        with pytest.raises(type(error)):
+            live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK)
+        assert culture.is_stopped
+    written = lines(tmp_path / "live")
+    assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
+    assert told in written[-2]["sentence"]
+    assert f"ended before its time ({told}" in (what_stands(tmp_path / "live") or "")
+
+
+def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
+    def fail(culture: FakeCulture, observed: Observed) -> Observed:
+        raise DeviceFailed("gone")
+
+    # Three recordings, the pause, and a few ticks.
+    with FakeCulture(fault=fail, at=7) as culture:
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+    assert found.gap.session.ending.by == "culture"
+    assert "ended before its time (the culture raised DeviceFailed: gone)" in (what_stands(tmp_path / "live") or "")
 
 
 def test_policies_are_kept_while_they_are_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

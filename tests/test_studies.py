@@ -27,6 +27,7 @@ from scipy.stats import mannwhitneyu
 from animat.animat import Animat
 from animat.cli import main
 from animat.cultures.kinds import recorded_culture
+from animat.cultures.series import recording_name
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
@@ -43,8 +44,9 @@ from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
 from animat.studies.folder import describe_study, sums_of
 from animat.studies.identity import settle_identity
-from animat.studies.jobs import Job, Receipt, Report, Task, in_order, receipt_of
+from animat.studies.jobs import Job, Receipt, Report, Task, in_order, receipt_of, receipt_path
 from animat.studies.paper import PRINTED, paper_study
+from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
@@ -354,6 +356,23 @@ def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
         sums_of([both[0], both[0]], tmp_path)
     with pytest.raises(InvalidFile, match="no such file"):
         sums_of([tmp_path / "none.nwb"], tmp_path)
+
+
+def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path) -> None:
+    """`recording_0010_min` comes before `recording_02.5_min` by name."""
+    folder = tmp_path / "study"
+    for minute, channels in ((2.5, 24), (10.0, 16)):
+        made = make_up_recording(1, patterns=20, channels=channels)
+        replace(made, start_min=minute).save(folder / "recordings" / recording_name(minute))
+    study = Study(culture=Source("files", files=("recordings",)))
+    CulturePictures().run(study, folder, lambda share, words="": None)
+    assert sum(bool(row["channel"]) for row in rows(folder / "tables" / "culture-array.csv")) == 24
+
+
+def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
+    """Names of robots and conditions may hold dots, spaces and dashes."""
+    jobs = ["limit/cartpole/over-time", "limit/cartpole.over-time", "limit.cartpole/over-time"]
+    assert len({receipt_path(tmp_path, job) for job in jobs}) == 3
 
 
 def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
@@ -718,6 +737,11 @@ COMPARED = (
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
         ("[culture]\ninterval_min = inf", "culture.interval_min: expected a positive number"),
         ("[simulators]\nwindow_ms = [2]", "simulators.window_ms: expected 2 values"),
+        (
+            "[culture]\nkind = 'files'\nfiles = ['a.nwb']\npulses = 5",
+            "culture.pulses: expected only for a culture that",
+        ),
+        ("[[robots]]\nname = 'cartpole'\nparameters = { name = 1 }", "expected parameters among"),
         ("[algorithm]\nhiden = 8", "algorithm: expected settings among"),
         ("[algorithm]\nhidden = 'x'", "algorithm.hidden: expected a number"),
         ("[algorithm]\nhidden = 64.0", "algorithm.hidden: expected a whole number, got 64.0"),

@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,10 +31,11 @@ SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
 SHORT = Training(Cartpole(), Thresholds(1), policies=3, iterations=6_000, algorithm=SMALL)
 
 
-def timeline_of(minutes: tuple[float, ...] = (0.0, 10.0, 20.0), seed: int = 0) -> SimulatorTimeline:
+def timeline_of(minutes: tuple[float, ...] = (0.0, 10.0, 20.0), seed: int = 0, **fit: Any) -> SimulatorTimeline:
     rng = np.random.default_rng(seed)
     return fit_timeline(
-        [responses_of(*(rng.gamma(6.0, m / 6.0, 60) for m in (30, 40, 55)), start_min=minute) for minute in minutes]
+        [responses_of(*(rng.gamma(6.0, m / 6.0, 60) for m in (30, 40, 55)), start_min=minute) for minute in minutes],
+        **fit,
     )
 
 
@@ -169,10 +171,21 @@ def test_a_folder_of_another_training_is_refused_and_left_alone(tmp_path: Path) 
         train(replace(short, seed=9), timeline_of(), tmp_path)
     with pytest.raises(Mismatch, match="other responses"):
         train(short, timeline_of(seed=1), tmp_path)
+    for wanted, fit in (("bins: 20 there, 10 now", {"bins": 10}), ("range_hz: None there", {"range_hz": 120.0})):
+        with pytest.raises(Mismatch, match=rf"simulators\.{wanted}"):
+            train(short, timeline_of(**fit), tmp_path)
     assert bits(tmp_path) == before
     (tmp_path / "training.json").unlink()
     with pytest.raises(Mismatch, match=r"without a training\.json"):
         train(short, timeline_of(), tmp_path)
+
+
+def test_what_a_training_without_neurons_differs_in_is_told_by_name(tmp_path: Path) -> None:
+    baseline = replace(SHORT, iterations=1_000, policies=1, mapping=None, commands=(-1.0, 1.0))
+    train(baseline, None, tmp_path)
+    assert list(train(baseline, None, tmp_path)) == ["p0"]
+    with pytest.raises(Mismatch, match=r"training\.seed: 1 there, 9 now"):
+        train(replace(baseline, seed=9), None, tmp_path)
 
 
 def test_a_second_training_in_a_folder_at_work_is_refused(tmp_path: Path) -> None:
@@ -314,4 +327,8 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
     assert policy.presentation == timeline.presentation
     assert policy.robot == Cartpole()
     assert policy.provenance["training"]["seed"] == 1
+    assert (policy.percentiles, policy.delivery) == ("moving", "chosen")
+    told = policy.provenance["simulators"]
+    assert (told["kind"], told["bins"], told["range_hz"], told["window_ms"]) == ("histogram", 20, None, [2.0, 10.0])
+    assert told["recorded_at_min"] == [0.0, 10.0, 20.0] and len(told["burst_thresholds"]) == 3
     assert policy.provenance["versions"]["jax"] == jax.__version__

@@ -128,7 +128,10 @@ class Inspect(Responding):
         for number, file in enumerate(files):
             progress.update(steps * number, total, file.name)
             recording = read_recording(file, stimuli=self.stimuli, part=self.part)
-            inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
+            try:
+                inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
+            except UnusableData as error:
+                raise UnusableData(f"{file}: {error}") from error
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.limit is not None:
@@ -412,16 +415,22 @@ def _as_json(value: Any) -> Any:
 def _say_findings(findings: Sequence[Finding]) -> None:
     """Warnings go to standard error, so that they are seen and results stay readable; notes are for `inspect`.
 
-    What is found in several recordings is told once, where it is largest, with how many others there are.
+    What is found in several recordings is told once, where it is worst, with how many others there are.
     """
     warnings: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.severity != "note":
             warnings.setdefault(finding.name, []).append(finding)
     for alike in warnings.values():
-        worst = max(alike, key=lambda finding: finding.value or 0.0)
+        worst = max(alike, key=_gravity)
         others = f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else ""
         print(f"warning: {worst.sentence}{others}", file=sys.stderr)
+
+
+def _gravity(finding: Finding) -> float:
+    """What makes one of several findings of a name the worst: a number far from 0, or close to it where few is bad."""
+    value = abs(finding.value or 0.0)
+    return -value if finding.name in ("few-samples", "bursts-not-separable", "no-difference") else value
 
 
 def _control(timeline: SimulatorTimeline) -> str:

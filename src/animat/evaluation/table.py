@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,7 @@ class Evaluation:
         findings: where the policies' training and this simulator differ, and where the limit is not well known.
         limit: the best possible return of any controller; None where it was not asked for, or is not known.
         no_limit: why it is not known, though it was asked for.
+        held_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move along.
     """
 
     robot: str
@@ -84,6 +85,7 @@ class Evaluation:
     findings: tuple[Finding, ...]
     limit: Optimum | None = None
     no_limit: str | None = None
+    held_from_min: float | None = None
 
     def score(self, row: Row) -> float | None:
         """The normalised score of a row's mean return, (mean - random) / (limit - random).
@@ -105,6 +107,7 @@ class Evaluation:
             "robot": self.robot,
             "mapping": self.mapping,
             "recorded_at_min": self.recorded_at_min,
+            "percentiles_held_from_min": self.held_from_min,
             "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
             "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
             "limit": None if self.limit is None else self.limit.to_dict(),
@@ -116,6 +119,8 @@ class Evaluation:
         """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
         first = self.rows[0].episodes.returns
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
+        if self.held_from_min is not None:
+            on += f", percentiles held from {self.held_from_min:g} min"
         lines = [
             f"{self.robot}, {on}: {first.shape[0]} policies, {first.shape[1]} episodes each",
             f"  {'':16} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}"
@@ -138,7 +143,7 @@ class Evaluation:
             return [f"  no best possible return: {self.no_limit}"]
         if self.limit is None:
             return []
-        if self.score(self.rows[0]) is None:
+        if not self.rows[0].changed and self.score(self.rows[0]) is None:
             meaning = "no score, as the best possible return is not above that of random actions"
         else:
             meaning = "score: (mean return - random) / (best possible return - random)"
@@ -184,7 +189,7 @@ def evaluate(
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))
     for name, policy in policies.items():
-        for attribute in ("robot", "mapping", "conditions", "commands"):
+        for attribute in ("robot", "mapping", "conditions", "commands", "percentiles", "delivery"):
             if getattr(policy, attribute) != getattr(first, attribute):
                 raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; evaluate it alone")
     if robot is not None and robot.name != first.robot.name:
@@ -194,7 +199,7 @@ def evaluate(
     findings: tuple[Finding, ...] = ()
     simulator: NeuronSimulator | None = None
     environment: Environment[Any]
-    minute = None
+    minute, held_from_min = None, None
     if first.mapping is None:
         environment = WithoutNeurons(body, first.commands)
     else:
@@ -203,13 +208,18 @@ def evaluate(
         findings = _check(first, timeline)
         row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
-        simulator = timeline.at(minute)
+        held_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
+        simulator = (timeline if held_from_min is None else timeline.with_first_percentiles()).at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))
 
     networks = networks_of(list(policies.values()), greedy=greedy)
     n = len(policies)
+    # A policy that was trained as a control is one here too: what it chooses decides nothing.
+    trained_in, meaning = environment, "as trained"
+    if isinstance(environment, Animat) and first.delivery == "shuffled":
+        trained_in, meaning = replace(environment, delivery="shuffled"), "as trained: what is delivered is drawn anew"
     acting = [
-        Control("policies", "as trained", environment, simulator, networks, n),
+        Control("policies", meaning, trained_in, simulator, networks, n),
         *controls_of(environment, simulator, _action_labels(first), networks, n),
     ]
     if limit_resolution is not None and not 0 < limit_resolution < float("inf"):
@@ -239,6 +249,7 @@ def evaluate(
         (*findings, *(() if limit is None else limit.findings())),
         limit,
         no_limit,
+        held_from_min,
     )
 
 
@@ -255,6 +266,27 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
                 "other-window",
                 "warning",
                 f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}",
+            )
+        )
+    given, trained = timeline.fitted, policy.provenance.get("simulators") or {}
+    differing = [name for name in ("kind", "bins", "range_hz") if name in trained and trained[name] != given.get(name)]
+    if differing:
+        found.append(
+            Finding(
+                "other-simulator",
+                "warning",
+                "the policies were trained on simulators made otherwise: "
+                + ", ".join(f"{name} {trained[name]}, here {given.get(name)}" for name in differing),
+            )
+        )
+    first_min = next(iter(trained.get("recorded_at_min", ())), None)
+    if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
+        found.append(
+            Finding(
+                "other-percentiles",
+                "warning",
+                f"the policies' percentiles were held from the recording at {first_min:g} min, which is not the first "
+                f"of these: here they are held from {timeline.start_min[0]:g} min",
             )
         )
     if policy.presentation != timeline.presentation:

@@ -92,6 +92,11 @@ def set_up(
         warnings.warn(caveat, stacklevel=2)
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
+    if recordings is None:
+        reading = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, "histogram")}
+        for name, (got, usual) in (reading | {"window_ms": (tuple(window_ms), DEFAULT_WINDOW_MS)}).items():
+            if got != usual:
+                raise InvalidArgument(f"{name}: expected only with recordings, of which it says how they are read")
     if recordings is not None:
         simulator, labels = _simulator_of(recordings, at_min, conditions, window_ms, kind)
     elif simulator is not None:

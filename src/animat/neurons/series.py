@@ -38,7 +38,10 @@ def extract_series(
     check_despite(despite)
     series = []
     for recording in recordings:
-        responses = extract_responses(recording, by, window_ms, burst_threshold)
+        try:
+            responses = extract_responses(recording, by, window_ms, burst_threshold)
+        except UnusableData as error:
+            raise UnusableData(f"the recording at {recording.start_min:g} min: {error}") from error
         for finding in responses.findings:
             if finding.severity == "refuse" and finding.name not in despite:
                 raise UnusableData(

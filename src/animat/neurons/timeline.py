@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,8 @@ class SimulatorTimeline:
         window_ms: the response window.
         presentation: how stimuli were presented, None where it is not known.
         fidelities: what each simulator keeps of its responses.
+        fitted: how the simulators were made of responses, for whoever comes later: `kind`, `bins`, `range_hz`, and
+            `burst_thresholds`, the share of active channels above which a response was left out of each.
         findings: what was noticed in the recordings and in the fits, with the minute in front.
     """
 
@@ -40,6 +43,7 @@ class SimulatorTimeline:
     presentation: Presentation | None
     fidelities: tuple[Fidelity, ...]
     findings: tuple[Finding, ...]
+    fitted: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.start_min)
@@ -122,6 +126,12 @@ def fit_timeline(
         presentation=first.presentation,
         fidelities=fidelities,
         findings=findings,
+        fitted={
+            "kind": kind,
+            "bins": bins if kind == "histogram" else None,
+            "range_hz": range_hz if kind == "histogram" else None,
+            "burst_thresholds": [float(responses.threshold) for responses in ordered],
+        },
     )
 
 

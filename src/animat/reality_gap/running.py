@@ -90,7 +90,13 @@ def run_policies(
             f"{first.presentation or 'unknown'}"
         )
         findings += (Finding("other-calibration", "warning", sentence),)
-    if follow and first.provenance.get("training", {}).get("percentiles") == "first":
+    if first.delivery == "shuffled":
+        sentence = (
+            "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
+            "what they choose is delivered"
+        )
+        findings += (Finding("trained-as-control", "warning", sentence),)
+    if follow and first.percentiles == "first":
         sentence = (
             "the policies were trained on held percentiles, and in this loop they follow the culture: with "
             "--thresholds held they are as in training"

@@ -67,7 +67,7 @@ class ElectrodeArray:
         return (row * self.columns + column).astype(np.int64)
 
     def distance_um(
-        self, electrodes: Int64[np.ndarray, " electrodes"], others: Int64[np.ndarray, " others"]
+        self, electrodes: Int64[np.ndarray, " electrodes"] | int, others: Int64[np.ndarray, " others"] | int
     ) -> Float64[np.ndarray, "electrodes others"]:
         """The distance of every electrode to every other one given."""
         x_um, y_um = self.position_um(electrodes)

@@ -69,9 +69,8 @@ class Origin:
                 raise InvalidArgument(f"recorded_at: expected {expected}, got {self.recorded_at!r}") from error
 
     def words(self) -> Mapping[str, str]:
-        """What is given, as entries of `Recording.provenance`. A subject without a sex is of an unknown one."""
-        given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
-        return {"sex": "U", **given} if "subject_id" in given else given
+        """What is given, as entries of `Recording.provenance`."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
 
 def _range(age: str) -> tuple[str, ...]:
@@ -115,6 +114,13 @@ def convert_recording(
     if out.exists():
         # It may be the recording itself, or its stimuli; whatever it is, somebody made it.
         raise InvalidArgument(f"--out: expected a name that is not taken, got {out}, which exists; choose another")
+    if reader is not None and (stimuli is not None or part is not None):
+        raise InvalidArgument(f"stimuli, part: expected none for traces read with a reader, got {stimuli or part!r}")
+    if reader is None and detection is not None and stimuli_path is not None:
+        raise InvalidArgument(
+            f"stimuli_path: expected only beside CSV spikes or traces read with a reader, got {stimuli_path}, but "
+            f"{path} holds its own stimuli"
+        )
     if reader is not None:
         from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
         from animat.recordings.spikes_of_traces import with_spikes_of
@@ -128,7 +134,9 @@ def convert_recording(
     else:
         recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     words = {} if origin is None else origin.words()
+    # A subject without a sex is of an unknown one.
+    unsaid = {"sex": "U"} if "subject_id" in words else {}
     start_min = recording.start_min if start_min is None else start_min
-    recording = replace(recording, provenance={**recording.provenance, **words}, start_min=float(start_min))
+    recording = replace(recording, provenance={**unsaid, **recording.provenance, **words}, start_min=float(start_min))
     recording.save(out)
     return recording

@@ -14,7 +14,6 @@ Background spikes are placed everywhere except up to 10 ms after a stimulus: the
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -25,6 +24,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
+from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording, Stimuli
@@ -36,8 +36,6 @@ VOLLEY_STEP_S = 0.0012
 BURST_RATIO = (0.9, 1.0)
 PAUSE_S = 1.0
 SAMPLING_RATE_HZ = 20_000.0
-PITCH_UM = 17.5
-ARRAY = (220, 120)
 STIMULATION_ELECTRODES = 32
 PATTERN_ELECTRODES = 5
 PATTERN_SPACING_UM = 100.0
@@ -145,12 +143,11 @@ class MadeUpCulture:
     def _electrodes(self) -> tuple[Channels, Int64[np.ndarray, "patterns electrodes"]]:
         """The recording channels, and the electrodes of each pattern; the same in all recordings."""
         rng = np.random.default_rng([self.seed, 0])
-        columns, rows = ARRAY
-        shuffled = rng.permutation(columns * rows)
+        shuffled = rng.permutation(len(MAXONE))
         electrode, others = shuffled[: self.channels], shuffled[self.channels :]
         stimulating: list[int] = []
         for candidate in others.tolist():
-            if all(_distance_um(candidate, chosen) > PATTERN_SPACING_UM for chosen in stimulating):
+            if all(MAXONE.distance_um(candidate, chosen) > PATTERN_SPACING_UM for chosen in stimulating):
                 stimulating.append(candidate)
             if len(stimulating) == STIMULATION_ELECTRODES:
                 break
@@ -158,12 +155,8 @@ class MadeUpCulture:
         while len(patterns) < self.patterns:
             chosen = rng.choice(stimulating, PATTERN_ELECTRODES, replace=False)
             patterns[tuple(sorted(chosen.tolist()))] = None
-        channels = Channels(
-            label=np.arange(self.channels).astype(np.str_),
-            electrode=electrode,
-            x_um=(electrode % columns) * PITCH_UM,
-            y_um=(electrode // columns) * PITCH_UM,
-        )
+        x_um, y_um = MAXONE.position_um(electrode)
+        channels = Channels(label=np.arange(self.channels).astype(np.str_), electrode=electrode, x_um=x_um, y_um=y_um)
         return channels, np.array(list(patterns), dtype=np.int64)
 
     def _protocol(
@@ -287,11 +280,6 @@ def write_made_up_series(
 def _shuffles(rng: np.random.Generator, n: int, channels: int) -> Int64[np.ndarray, "n channels"]:
     """All channels in random order, n times."""
     return np.argsort(rng.random((n, channels)), axis=1)
-
-
-def _distance_um(electrode: int, other: int) -> float:
-    columns = ARRAY[0]
-    return PITCH_UM * math.hypot(electrode % columns - other % columns, electrode // columns - other // columns)
 
 
 def _expect(is_right: bool, name: str, expected: str, got: object) -> None:

@@ -16,7 +16,7 @@ ROBOTS: Mapping[str, type[Robot[Any]]] = MappingProxyType({robot.name: robot for
 """Every robot there is, by its name."""
 
 
-def robot_named(name: str, **parameters: float) -> Robot[Any]:
+def robot_named(name: str, /, **parameters: float) -> Robot[Any]:
     """The robot of this name, with these parameters in place of its defaults.
 
     Args:

@@ -104,7 +104,8 @@ class Receipt:
 
 def receipt_path(folder: Path, job: str) -> Path:
     """Where a job's receipt lies."""
-    return folder / "jobs" / f"{job.replace('/', '.')}.json"
+    # A sign that no name holds: of two jobs none may have the other's.
+    return folder / "jobs" / f"{job.replace('/', '+')}.json"
 
 
 def receipt_of(job: Job, study: str, folder: Path, outputs: Sequence[Path], inputs: dict[str, str]) -> Receipt:

@@ -12,7 +12,7 @@ import numpy as np
 
 from animat.neurons.psth import post_stimulus_histogram, spontaneous_rate
 from animat.neurons.timeline import SimulatorTimeline
-from animat.recordings.reading import list_recordings, read_recording
+from animat.recordings.reading import read_recordings
 from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.comparisons import Group, Pair, draw_comparisons
@@ -62,7 +62,7 @@ class CulturePictures(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         series = read_series(study, folder)
-        first = read_recording(list_recordings([folder / RECORDINGS])[0])
+        first = read_recordings(folder / RECORDINGS)[0]
         responses = series[0]
         to_ms = max(50.0, 2 * responses.window_ms[1])
         histogram = post_stimulus_histogram(first, -0.4 * to_ms, to_ms, 1.0 if to_ms <= 100 else 5.0)

@@ -109,6 +109,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "in_simulator": [kept.in_simulator.tolist() for kept in timeline.fidelities],
         "n_above_range": [kept.n_above_range for kept in timeline.fidelities],
         "findings": [asdict(finding) for finding in timeline.findings],
+        "fitted": timeline.fitted,
     }
     with written_whole(path) as beside:
         beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
@@ -138,6 +139,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             presentation=None if presentation is None else Presentation(**presentation),
             fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n) for a, b, n in kept),
             findings=tuple(Finding(**each) for each in told["findings"]),
+            fitted=told["fitted"],
         )
     except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:
         raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error

@@ -7,7 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from animat.errors import InvalidArgument
@@ -107,6 +107,12 @@ class Source:
         _seed("culture.seed", self.seed)
         _at_least("culture", self, sessions=1, pulses=1, presentations=2, channels=1)
         _positive("culture.interval_min", self.interval_min)
+        if self.kind == "files":
+            for each in fields(self):
+                if each.name not in ("kind", "files") and getattr(self, each.name) != each.default:
+                    raise InvalidArgument(
+                        f"culture.{each.name}: expected only for a culture that is recorded, got one of files"
+                    )
         if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
             raise InvalidArgument("culture.order: a made-up culture is recorded blocked with one pulse, got otherwise")
 

@@ -18,7 +18,7 @@ from animat.studies.specification import Body, Study, StudyCondition
 from animat.training.group import Group, train_group, untrained_policies
 from animat.training.sac import SAC
 from animat.training.specification import CHUNKS, Training
-from animat.training.trainer import MANIFEST, describe
+from animat.training.trainer import MANIFEST, describe, provenance_of
 from animat.writing import written_whole
 
 
@@ -36,8 +36,7 @@ class TrainGroup(Task):
         training = training_of(study, self.body, self.condition)
         manifest = describe(training, timeline)
         out = policies_folder(folder, self.body, self.condition)
-        provenance = {key: value for key, value in manifest.items() if key != "sources"}
-        group = Group(training, self.members, timeline, manifest["fingerprint"], provenance)
+        group = Group(training, self.members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / self.body.name / self.condition.slug / f"p{self.members[0]}.npz"
 
         def told(done: int, mean_return: float) -> None:

@@ -86,6 +86,21 @@ class Policy:
             return len(self.conditions)
         return None if self.commands is None else len(self.commands)
 
+    @property
+    def percentiles(self) -> str:
+        """In training, the mapping's percentiles were `"moving"` with the simulator, or those of the `"first"` held."""
+        return str(self._trained.get("percentiles", "moving"))
+
+    @property
+    def delivery(self) -> str:
+        """`"shuffled"` for the paper's control, trained with conditions drawn at random whatever it chose."""
+        return str(self._trained.get("delivery", "chosen"))
+
+    @property
+    def _trained(self) -> Dict[str, Any]:
+        told = self.provenance.get("training")
+        return told if isinstance(told, Dict) else {}
+
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
         """The network's outputs for an observation in the robot's own units."""
         hidden = observation / self.scales

@@ -11,8 +11,7 @@ average over the times at which a state comes up (critics that see more than the
 arXiv:1710.06542).
 
 Made for many small policies: everything of one policy is one pytree (`Learner`), so `jax.vmap` trains several side by
-side; a transition is one packed row; the random numbers of an iteration are one block; time limits bootstrap and
-terminations do not.
+side; a transition is one packed row; the random numbers of an iteration are one block.
 """
 
 from __future__ import annotations

@@ -31,6 +31,8 @@ from animat.writing import alone_in, clear_away, written_whole
 
 MANIFEST = "training.json"
 _UNFINISHED = ".unfinished"
+_NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
+"""Where a folder is another training's: they differ with the responses."""
 
 
 def train(
@@ -82,7 +84,7 @@ def train(
             with written_whole(folder / MANIFEST) as beside:
                 beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
         groups = [
-            Group(training, members, _on_host(timeline), manifest["fingerprint"], _provenance(manifest, members))
+            Group(training, members, _on_host(timeline), manifest["fingerprint"], provenance_of(manifest))
             for members in split_groups(training.policies)
         ]
         _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
@@ -96,15 +98,27 @@ def describe(training: Training, timeline: SimulatorTimeline | None, sources: Se
     """What decides how policies come out, as plain data, with a fingerprint over all of it."""
     manifest: dict[str, Any] = {
         "training": training.to_dict(),
-        "conditions": [] if timeline is None else [condition.label for condition in timeline.conditions],
-        "recorded_at_min": [] if timeline is None else timeline.start_min.tolist(),
+        "simulators": None if timeline is None else _described(timeline),
         "versions": {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")},
     }
+    # By way of JSON, in which a tuple and a list are the same.
+    manifest = json.loads(json.dumps(manifest))
     digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode())
     for leaf in jax.tree.leaves(_on_host(timeline).simulators if timeline else ()):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     # Names of files are told but do not decide: the same recordings in another place are the same.
     return manifest | {"sources": list(sources), "fingerprint": digest.hexdigest()}
+
+
+def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
+    """Where the simulators came from, as far as it is not the responses themselves."""
+    return {
+        **timeline.fitted,
+        "conditions": [condition.label for condition in timeline.conditions],
+        "window_ms": timeline.window_ms,
+        "presentation": None if timeline.presentation is None else str(timeline.presentation),
+        "recorded_at_min": timeline.start_min.tolist(),
+    }
 
 
 def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
@@ -122,7 +136,7 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
         if fingerprint != manifest["fingerprint"]:
-            difference = first_difference(found, manifest, ignoring=("fingerprint", "sources")) or "other responses"
+            difference = first_difference(found, manifest, ignoring=_NOT_TOLD) or "other responses"
             raise Mismatch(
                 f"{folder}: expected a folder of this training, got one of another ({difference}); "
                 "give another folder, or remove this one"
@@ -135,7 +149,8 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     return False
 
 
-def _provenance(manifest: dict[str, Any], members: tuple[int, ...]) -> dict[str, Any]:
+def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
+    """What of a training's description its policies carry: all that decides how they come out."""
     return {key: value for key, value in manifest.items() if key != "sources"}
 
 
