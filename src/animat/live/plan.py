@@ -131,7 +131,9 @@ def _ended(log: Path) -> str:
             break
     if not told or told[-1]["what"] != "end":
         return "was killed, or still goes on"
-    before = next((line for line in reversed(told[:-1]) if line["what"] in ("interrupted", "fault")), None)
-    if before is not None:
-        return f"ended before its time ({before.get('sentence', before['what'])})"
+    for line in reversed(told[:-1]):
+        if line["what"] in ("interrupted", "fault"):
+            return f"ended before its time ({line.get('sentence', line['what'])})"
+        if line["what"] == "closed loop" and line.get("ended_by") != "plan":
+            return f"ended before its time ({line.get('ended', 'in the closed loop')})"
     return "is done"

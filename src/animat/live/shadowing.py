@@ -144,7 +144,8 @@ def live(
         # A culture that failed or hangs is in the middle of something: the state after its last recording is whole.
         if gap.session.ending.by not in ("culture", "hang"):
             run.keep_state()
-    except BaseException:
+    except BaseException as error:
+        run.end_early(error)
         with suppress(InvalidFile):
             run.write("end", budget=run.account.to_dict())
         raise
@@ -181,26 +182,7 @@ class _Run:
         self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed)
 
     def shadow(self) -> dict[str, Policy]:
-        """Record and train to the end; returns the policies. Whatever ends it before, the culture is stopped."""
-        try:
-            return self._record_and_train()
-        except BaseException as error:
-            self._end_early(error)
-            raise
-
-    def _end_early(self, error: BaseException) -> None:
-        """Stimulate no more, and write down why, once."""
-        if self._ended_early:
-            return
-        self._ended_early = True
-        is_person = isinstance(error, KeyboardInterrupt)
-        told = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
-        with suppress(Exception):
-            self._culture.stop(told)
-        with suppress(InvalidFile):
-            self.write("interrupted" if is_person else "fault", sentence=told)
-
-    def _record_and_train(self) -> dict[str, Policy]:
+        """Record and train to the end; returns the policies."""
         exchange = Exchange(self.folder / ".exchange")
         timeline = self._record(0)
         if timeline is None:
@@ -212,7 +194,7 @@ class _Run:
             try:
                 self._shadow(exchange, trainers)
             except BaseException as error:
-                self._end_early(error)
+                self.end_early(error)
                 # The policies as they are are better than none.
                 with suppress(AnimatError):
                     trainers.finish()
@@ -225,6 +207,18 @@ class _Run:
         shutil.rmtree(exchange.folder, ignore_errors=True)
         policies = self.folder / POLICIES
         return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self._training.policies)}
+
+    def end_early(self, error: BaseException) -> None:
+        """Stimulate no more, and write down why, once."""
+        if self._ended_early:
+            return
+        self._ended_early = True
+        is_person = isinstance(error, KeyboardInterrupt)
+        told = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
+        with suppress(Exception):
+            self._culture.stop(told)
+        with suppress(InvalidFile):
+            self.write("interrupted" if is_person else "fault", sentence=told)
 
     def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
         published, in_budget = 0, True
