@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-import animat
 from animat.cli import _parse
+from animat.recordings.made_up import write_made_up_series
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -56,7 +56,19 @@ def test_the_code_for_gymnasium_runs(capsys: pytest.CaptureFixture[str]) -> None
     assert -1 <= command <= 1
 
 
-def test_the_names_in_the_python_example_are_public() -> None:
-    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
-    names = re.findall(r"from animat import (.*)", code)[0].split(", ")
-    assert set(names) <= set(animat.__all__)
+def test_the_examples_in_python_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The README's and, on the policies that it trains, that of docs/training.md; two short ones for ten long ones."""
+    monkeypatch.chdir(tmp_path)
+    write_made_up_series(1, tmp_path / "recordings", sessions=2, interval_min=50, patterns=30, channels=32)
+    example = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
+    shorter = example.replace("policies=10, iterations=800_000", "policies=2, iterations=6_400")
+    assert shorter != example
+    exec(compile(shorter, "README.md", "exec"), {})
+    assert capsys.readouterr().out.startswith(
+        "cartpole, 1-threshold, recording at 50 min: 2 policies, 100 episodes each"
+    )
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "training.md").read_text(), flags=re.DOTALL)
+    exec(compile(example, "training.md", "exec"), {})
+    assert capsys.readouterr().out.strip() in ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
