@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from animat.animat import Animat
-from animat.cli import _say_findings, main
+from animat.cli import main
+from animat.cli_responses import say_findings
 from animat.evaluation.optimum import Optimum, best_return
 from animat.mapping import Thresholds
 from animat.neurons.series import extract_series
@@ -353,7 +354,7 @@ def test_a_full_disk_while_training_leaves_what_was_there_whole(recordings: Path
 
 def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
     found = [Finding("binning", "warning", f"at {m} min: lost", m / 100) for m in (0, 20, 10)]
-    _say_findings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
+    say_findings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
     assert capsys.readouterr().err.splitlines() == [
         "warning: at 20 min: lost (and 2 more like it)",
         "warning: 12 only",
@@ -367,5 +368,5 @@ def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture
 def test_the_worst_of_several_warnings_is_told(
     name: str, values: tuple[float, ...], worst: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _say_findings([Finding(name, "warning", f"it is {value}", value) for value in values])
+    say_findings([Finding(name, "warning", f"it is {value}", value) for value in values])
     assert capsys.readouterr().err.startswith(f"warning: it is {worst} (and ")

@@ -1,0 +1,180 @@
+"""The commands that train policies on recordings and evaluate them."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from animat.cli_responses import Fitting, say_findings
+from animat.errors import InvalidArgument, Mismatch, UnusableData
+
+if TYPE_CHECKING:
+    from animat.neurons.timeline import SimulatorTimeline
+
+
+@dataclass(frozen=True)
+class Train(Fitting):
+    """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
+
+    robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
+    """The robot to drive"""
+    recordings: tuple[Path, ...] = ()
+    """Files or folders of recordings of one culture"""
+    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] = "1-threshold"
+    """From responses to motor commands; none: the baseline without neurons"""
+    policies: int = 10
+    """How many policies, each from its own random numbers"""
+    iterations: int | None = None
+    """Training iterations of each; default: the paper's, 800000 for cartpole and 500000 for navigation"""
+    seed: int = 1
+    """Decides every random draw"""
+    shadowing: Literal["on", "off"] = "on"
+    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout"""
+    duration_min: float = 60.0
+    """Minutes of the culture's clock that training stands for"""
+    percentiles: Literal["moving", "first"] = "moving"
+    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    delivery: Literal["chosen", "shuffled"] = "chosen"
+    """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
+    parameters: tuple[str, ...] = ()
+    """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
+    workers: int | None = None
+    """Processes, each on its own core; default: one a core"""
+    out: Path = Path("policies")
+    """Folder for the policies"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Train."""
+        from animat.mapping import mapping_named
+        from animat.progress import Bar
+        from animat.robots.registry import robot_named
+        from animat.training.specification import Training
+
+        # What can be refused is refused before recordings are read, which can take a while.
+        if self.workers is not None and self.workers < 1:
+            raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
+        robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
+        training = Training(
+            robot=robot,
+            mapping=None if self.mapping == "none" else mapping_named(self.mapping),
+            policies=self.policies,
+            iterations=robot.paper_iterations if self.iterations is None else self.iterations,
+            seed=self.seed,
+            shadowing=self.shadowing == "on",
+            duration_min=self.duration_min,
+            percentiles=self.percentiles,
+            delivery=self.delivery,
+            commands=(-1.0, 1.0) if self.mapping == "none" and self.robot == "cartpole" else None,
+        )
+        for caveat in robot.caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+        timeline = None if self.mapping == "none" else self.timeline(self.recordings)
+
+        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.despite:
+            raise UnusableData(
+                "--conditions: expected two or more for an agent to choose from, got one "
+                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                "(to go on in spite of it: --despite one-condition)"
+            )
+        from animat.training.trainer import train
+
+        if timeline is not None:
+            print(_control(timeline))
+        with Bar("training") as progress:
+            trained = train(
+                training,
+                timeline,
+                self.out,
+                workers=self.workers,
+                progress=progress,
+                sources=[str(path) for path in self.recordings],
+            )
+        last = {name: policy.learning_curve[-1, 2].item() for name, policy in trained.items()}
+        known = [mean for mean in last.values() if math.isfinite(mean)]
+        ended = f"{sum(known) / len(known):.1f}" if known else "not known, as no episode ended then"
+        print(f"{len(trained)} policies in {self.out}; mean return at the end of training, over policies: {ended}")
+        return {"policies": [str(self.out / f"{name}.safetensors") for name in trained], "last_returns": last}
+
+
+@dataclass(frozen=True)
+class Evaluate(Fitting):
+    """Run trained policies, and controls beside them, on the simulator of a recording."""
+
+    policies: Positional[Path] = Path("policies")
+    """A policy file or a folder of them"""
+    recordings: tuple[Path, ...] = ()
+    """Files or folders of recordings of one culture"""
+    at_min: float | None = None
+    """Minute on the culture's clock whose newest recording answers; default: the last recording"""
+    episodes: int = 100
+    """Episodes of each policy and control"""
+    robot: Literal["cartpole", "navigation"] | None = None
+    """The robot that is expected; default: the one the policies were trained on"""
+    drawn: bool = False
+    """Draw actions from the policy, as in training, instead of taking the most probable one"""
+    limit: bool = False
+    """Also compute the best return that any controller could get there, and scores beside it; takes seconds"""
+    seed: int = 1
+    """Decides every random draw"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Evaluate."""
+        from animat.compilation import keep_compilations
+        from animat.progress import Bar
+        from animat.training.policy import load_policies
+
+        if self.episodes < 1:
+            raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
+        policies = load_policies(self.policies)
+        for name, policy in policies.items():
+            if self.robot is not None and policy.robot.name != self.robot:
+                raise Mismatch(f"{name}: expected a policy for {self.robot}, got one for {policy.robot.name}")
+        through_neurons = any(policy.mapping is not None for policy in policies.values())
+        timeline = self.timeline(self.recordings) if through_neurons else None
+
+        from animat.evaluation.table import evaluate
+
+        keep_compilations()
+        with Bar("evaluating") as progress:
+            evaluation = evaluate(
+                policies,
+                timeline,
+                at_min=self.at_min,
+                episodes=self.episodes,
+                seed=self.seed,
+                greedy=not self.drawn,
+                limit_resolution=1.0 if self.limit else None,
+                progress=progress,
+            )
+        say_findings(evaluation.findings)
+        print(evaluation.to_text())
+        return evaluation.to_dict()
+
+
+def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
+    numbers = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
+    return numbers
+
+
+def _control(timeline: SimulatorTimeline) -> str:
+    """How much the conditions differ, which bounds what any controller can do."""
+    shares = timeline.fidelities[0].in_simulator
+    told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
+    said = next((f.sentence for f in timeline.findings if f.name == "difference"), None)
+    return f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}" + (f"\n{said}" if said else "")
