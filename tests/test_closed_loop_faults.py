@@ -69,10 +69,19 @@ def raising(error: Exception) -> Fault:
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (RuntimeError("the amplifier is on fire"), "the culture raised RuntimeError: the amplifier is on fire"),
-        (ConnectionResetError("gone"), "the connection to the culture is lost: ConnectionResetError: gone"),
-        (TimeoutError("no answer"), "the connection to the culture is lost"),
-        (KeyError("window"), "the culture raised KeyError"),
+        (
+            RuntimeError("the amplifier is on fire"),
+            "the culture raised DeviceFailed: fake: expected it to deliver, got RuntimeError: the amplifier is on fire",
+        ),
+        (
+            ConnectionResetError("gone"),
+            "the connection to the culture is lost: DeviceFailed: fake: expected it to deliver, got "
+            "ConnectionResetError: gone",
+        ),
+        (OSError("no route to host"), "the connection to the culture is lost"),
+        # As the CL1's SDK says that its loop was late.
+        (TimeoutError("no answer"), "the culture raised DeviceFailed: fake: expected it to deliver, got TimeoutError"),
+        (KeyError("window"), "the culture raised DeviceFailed: fake: expected it to deliver, got KeyError"),
     ],
 )
 def test_a_backend_that_raises_or_loses_its_connection(tmp_path: Path, error: Exception, words: str) -> None:
@@ -219,7 +228,7 @@ def test_a_culture_that_cannot_be_stopped_is_told(tmp_path: Path, how: str, monk
             session = run(tmp_path, culture)
         finally:
             released.set()
-        assert "the culture raised RuntimeError: smoke; BUT the culture" in session.ending.sentence
+        assert "got RuntimeError: smoke; BUT the culture" in session.ending.sentence
         assert "see to it that the device gives no more pulses" in session.ending.sentence
         # Whatever the device does: nothing passes the guard.
         with pytest.raises(UnsafeStimulus, match="stop"):
@@ -346,6 +355,41 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
         assert_safe(session, culture, 7)
     assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["unfinished"]
     assert not session.episodes[0].is_whole
+
+
+def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from animat.closed_loop import driver
+
+    released, steps = threading.Event(), [0]
+
+    class StuckBody(driver.Body):
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            step = self.step
+
+            def stuck(u: float) -> Any:
+                steps[0] += 1
+                if steps[0] == 7:
+                    released.wait(60)
+                return step(u)
+
+            self.step = stuck  # type: ignore[method-assign]
+
+    monkeypatch.setattr(driver, "Body", StuckBody)
+    monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
+    with FakeCulture() as culture:
+        try:
+            session = run(tmp_path, culture, patience_s=0.3)
+            assert session.ending.by == "hang"
+            assert "the robot did not answer 0.3 s after it should have" in session.ending.sentence
+            assert_safe(session, culture, 7)
+        finally:
+            released.set()
+        assert culture.pulses == session.to_dict()["pulses"] == 7
+    assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["unfinished"]
+    assert session.to_dict()["unanswered_pulses"] == 0
 
 
 @pytest.mark.parametrize(("action", "words"), [(None, "raised TypeError"), (5, "chose 5"), (-1, "chose -1")])

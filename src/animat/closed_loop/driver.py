@@ -81,6 +81,13 @@ class Driver:
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = 0.0
+        self._unmoved: tuple[Stretch, Sequence[Stimulus], dict[str, Any]] | None = None
+
+    @property
+    def unfinished(self) -> Record | None:
+        """What the culture answered while the robot has not moved by it: to be written down if it never does."""
+        unmoved = self._unmoved
+        return None if unmoved is None else _seen(*unmoved)
 
     def run(self) -> Ending:
         """Run all episodes; whatever goes wrong is an ending, never an exception."""
@@ -196,6 +203,7 @@ class Driver:
         if self._following is not None and stimuli and contender.calibrates and not is_burst:
             self._following.add(delivered, float(rate_hz[0]))
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
+        self._unmoved = stretch, stimuli, dict(tick)
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
@@ -204,7 +212,8 @@ class Driver:
         finally:
             # Whatever happens to the robot, what the culture did is written down.
             finished = Tick(**tick)
-            self._note(stretch, stimuli, vars(finished))
+            self.records.append(_seen(stretch, stimuli, vars(finished)))
+            self._unmoved = None
         return finished, again
 
     def _move(self, rate_hz: float, is_burst: bool, iteration: int) -> dict[str, Any]:
@@ -299,19 +308,13 @@ class Driver:
         )
         self._seen_until_s = offset_s + observed.duration_s
         if pause:
-            self._note(stretch, (), None)
+            self.records.append(_seen(stretch, (), None))
         if self._loop.real_time:
             until_s = self._wall_zero_s + (self._now_s() - self._zero_s)
             self._expect("the clock", max(0.0, until_s - self._clock.now_s()))
             self._clock.sleep_until(until_s)
         self._data_at_s = self._clock.now_s()
         return stretch
-
-    def _note(self, stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> None:
-        """Have what was seen written down."""
-        span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-        words = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
-        self.records.append(Record(words, stretch.spike_times_s, stretch.spike_channels))
 
     def _note_fault(self, ending: Ending, asked: Asked, **more: Any) -> None:
         """Have it written down that what was asked came to no answer that can be used."""
@@ -333,6 +336,13 @@ class Driver:
     def _on_samples(self, times_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
         # The same numbers that a recording of the session holds: only then are windows the same to the last bit.
         return np.asarray(np.rint(times_s * self._rate_hz) / self._rate_hz)
+
+
+def _seen(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
+    """What was seen, to be written down."""
+    span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
+    words = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
+    return Record(words, stretch.spike_times_s, stretch.spike_channels)
 
 
 def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:

@@ -105,7 +105,7 @@ class _Supervisor:
         self._log, self._progress, self._episodes = log, progress, episodes
         self._synced = time.monotonic()
         self._ending: Ending | None = None
-        self._noted = -1
+        self._noted = self._seen = -1
         self._not_halted: str | None = None
         self._left_out = culture.left_out
 
@@ -164,7 +164,8 @@ class _Supervisor:
         for number in range(len(records)):
             self._log.append(records[0])
             # Taken away only once it is written: a full disk loses none that could be written later.
-            records.popleft()
+            written = records.popleft().words
+            self._seen = written["stretch"] if written["kind"] == "seen" else self._seen
             if number % _BATCH == _BATCH - 1:
                 # A pause of 0 would keep the processor, and on one core the loop's thread could not go on.
                 time.sleep(_PAUSE_S)
@@ -183,7 +184,11 @@ class _Supervisor:
             sentence = f"{ending.sentence}; BUT {self._not_halted}: see to it that the device gives no more pulses"
             ending = replace(ending, sentence=sentence)
         try:
+            # Looked at first: a robot that comes back just now has its tick among those that are written.
+            unfinished = self._driver.unfinished
             self._write()
+            if unfinished is not None and unfinished.words["stretch"] > self._seen:
+                self._log.append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
             words = {"kind": "end", "by": ending.by, "sentence": ending.sentence, "left_out": left_out}
             self._log.append(Record(words))
