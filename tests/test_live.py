@@ -372,6 +372,8 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--pause-s", "-1"], "pause_s"),
         (["--budget-pulses", "-1"], "budget.pulses"),
         (["--culture", "replay"], "--recordings: expected some for a replay"),
+        (["--recordings", "x.nwb"], "--recordings: expected some for a replay and none for others, got 1 for virtual"),
+        (["--culture", "cl1", "--recordings", "x.nwb"], "--recordings: expected some for a replay and none for others"),
         (["--out", "{full}"], "expected an empty folder"),
         (["--out", "{full}/something"], "expected a folder for the live run, got a file"),
     ],

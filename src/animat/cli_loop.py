@@ -298,8 +298,11 @@ class Live(Stimulating):
         simulated = self.culture in ("virtual", "replay")
         if self.speed is not None and self.speed != 1 and not simulated:
             raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
-        if self.culture == "replay" and not self.recordings:
-            raise InvalidArgument("--recordings: expected some for a replay to answer from, got none")
+        if (self.culture == "replay") != bool(self.recordings):
+            raise InvalidArgument(
+                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
+                f"{self.culture}: a live run records the culture itself"
+            )
         default_speed = 30.0 if simulated else 1.0
         pace = Pace(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
         robot = robot_named(self.robot)
