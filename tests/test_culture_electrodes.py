@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.tissue import Pulse as TissuePulse
-from animat.cultures.tissue import Tissue
+from animat.cultures.tissue import Tissue, TissueParameters
+from animat.cultures.tissue.parameters import ShortTerm
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
 from animat.cultures.visibility import NOISE_UV
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
@@ -216,6 +219,25 @@ def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
         small_culture().restore_state(tmp_path / "other.npz")
     with pytest.raises(InvalidFile, match="no such file"):
         small_culture().restore_state(tmp_path / "none.state")
+
+
+def test_one_culture_is_told_in_one_text_however_its_numbers_are_written() -> None:
+    facilitated = ShortTerm(1, 750, 0)
+    whole = VirtualCulture(
+        1, parameters=TissueParameters(ampa_ms=3, i_to_any=facilitated), rule=SelectionRule(spacing_um=18), scan_s=20
+    )
+    with_fractions = VirtualCulture(
+        1, parameters=TissueParameters(ampa_ms=3.0, i_to_any=ShortTerm(1.0, 750.0)), rule=SelectionRule(), scan_s=20.0
+    )
+    assert whole.settings == with_fractions.settings
+    # What recordings that are there say of the culture of every default.
+    told = VirtualCulture(1).settings
+    assert told["scan_s"] == "20.0"
+    rule, parameters = told["selection_rule"], told["tissue_parameters"]
+    assert rule == json.dumps(asdict(SelectionRule()))
+    assert '"recording_sites": 1024, "signal_to_noise": 6.0, "spacing_um": 18.0, "stimulation_sites": 32' in rule
+    assert parameters == json.dumps(asdict(TissueParameters()))
+    assert parameters.startswith('{"neurons": 1200, "excitatory_share": 0.8, "width_um": 3850.0')
 
 
 class Pressing:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -23,8 +23,12 @@ from animat.recordings.selection import Selection, SelectionRule, select_electro
 from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse, Stimulus
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from animat.cultures.tissue import Pulse as TissuePulse
     from animat.cultures.tissue import Tissue, TissueParameters
+
+Settings = TypeVar("Settings", bound="DataclassInstance")
 
 NS = 1_000_000_000
 WARM_UP_S = 5.0
@@ -74,7 +78,8 @@ class VirtualCulture(Culture):
         if not 0 < scan_s <= 3600:
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s a block, got {scan_s}")
         self.seed = seed
-        self._parameters, self._rule, self._scan_s = parameters, rule, scan_s
+        self._parameters = None if parameters is None else _with_floats(parameters)
+        self._rule, self._scan_s = None if rule is None else _with_floats(rule), float(scan_s)
         self._progress = progress or Silent()
         self._selection = selection
         self._scan: ScannedActivity | None = None
@@ -315,6 +320,18 @@ class VirtualCulture(Culture):
     def _close(self) -> None:
         # The tissue lives on: a culture that is opened again is where it was.
         pass
+
+
+def _with_floats(settings: Settings) -> Settings:
+    """The same settings with 18 as 18.0 where a fraction may stand: one culture is then told in one text."""
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if field.type in (float, "float"):
+            changed[field.name] = float(value)
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            changed[field.name] = _with_floats(value)
+    return dataclasses.replace(settings, **changed)
 
 
 def _strength(pulse: Pulse) -> float:
