@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.closed_loop.session import recover_session
 from animat.cultures.budget import Account, Budget
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
@@ -262,6 +263,24 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
     assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
     assert told in written[-2]["sentence"]
     assert f"ended before its time ({told}" in (what_stands(tmp_path / "live") or "")
+
+
+def test_a_session_of_a_live_run_that_still_runs_is_not_recovered(tmp_path: Path) -> None:
+    refused = []
+
+    def meanwhile(culture: FakeCulture, observed: Observed) -> Observed:
+        try:
+            recover_session(tmp_path / "live" / "session")
+        except Mismatch as error:
+            refused.append(str(error))
+        return observed
+
+    with FakeCulture(fault=meanwhile, at=7) as culture:
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+    assert found.gap.session.ending.by == "plan"
+    assert len(refused) == 1
+    assert "another run is at work" in refused[0]
+    assert recover_session(tmp_path / "live" / "session").ticks == found.gap.session.ticks
 
 
 def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
 from animat.training.specification import Training
 from animat.training.trainer import describe
+from animat.writing import alone_in
 
 _POLL_S = 0.1
 
@@ -126,20 +127,22 @@ def live(
         calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
         if training.percentiles == "first":
             calibration = calibration.holding(pooled_percentiles(run.used[0]))
-        gap = run_policies(
-            policies,
-            culture,
-            calibration,
-            run.folder / SESSION,
-            episodes=episodes,
-            with_controls=with_controls,
-            seed=training.seed,
-            account=run.account,
-            progress=progress,
-            pulse=protocol.pulse,
-            patterns=protocol.patterns,
-            **settings,
-        )
+        # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
+        with alone_in(run.folder / SESSION):
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                run.folder / SESSION,
+                episodes=episodes,
+                with_controls=with_controls,
+                seed=training.seed,
+                account=run.account,
+                progress=progress,
+                pulse=protocol.pulse,
+                patterns=protocol.patterns,
+                **settings,
+            )
         run.write("closed loop", **gap.session.to_dict())
         # A culture that failed or hangs is in the middle of something: the state after its last recording is whole.
         if gap.session.ending.by not in ("culture", "hang"):
