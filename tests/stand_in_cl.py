@@ -47,10 +47,16 @@ class Neurons:
         self.in_loop = False
         self.drop: set[int] = set()
         self.fail: Exception | None = None
+        self.is_gone = False
         self.interrupted = 0
         self.stream: list[tuple[int, Any]] = []
 
+    def _answer(self) -> None:
+        if self.is_gone:
+            raise ConnectionResetError("the device is gone")
+
     def timestamp(self) -> int:
+        self._answer()
         return self.now + (self.late_frames if self.in_loop else 0)
 
     def get_frames_per_second(self) -> int:
@@ -60,6 +66,7 @@ class Neurons:
         return 64
 
     def read(self, count: int, start: int) -> None:
+        self._answer()
         self.now = start + count
 
     def create_stim_plan(self) -> Any:
@@ -77,6 +84,7 @@ class Neurons:
         return SimpleNamespace(stim=stim, run=run)
 
     def interrupt(self, channels: ChannelSet) -> None:
+        self._answer()
         self.interrupted += 1
         self.queue = [pulse for pulse in self.queue if pulse[1] not in channels]
 
@@ -91,6 +99,7 @@ class Neurons:
         step, going = 25_000 // ticks_per_s, [True]
         stop = SimpleNamespace(stop=lambda: going.clear())
         while going:
+            self._answer()
             if self.fail is not None:
                 raise self.fail
             first, last = self.now, self.now + step
@@ -113,10 +122,11 @@ def install(patch: pytest.MonkeyPatch) -> Neurons:
 
     @contextmanager
     def opened(**_: bool) -> Iterator[Neurons]:
+        neurons._answer()
         yield neurons
 
     module.open, module.ChannelSet, module.StimDesign = opened, ChannelSet, StimDesign
     module.is_simulator = lambda: True
-    module.get_system_attributes = lambda: {"system_id": "stand-in", "chip_id": "none"}
+    module.get_system_attributes = lambda: neurons._answer() or {"system_id": "stand-in", "chip_id": "none"}
     patch.setitem(sys.modules, "cl", module)
     return neurons

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from animat.errors import DeviceFailed
+
 LSB_MV = 2.981901
 
 
@@ -48,7 +50,13 @@ class Rig:
     sent: list[str] = field(default_factory=list)
     busy_until: int = 0
     dead: bool = False
+    is_gone: bool = False
     on_send: Any = None
+
+    def answer(self) -> None:
+        """Nothing can be asked of a server that is not there."""
+        if self.is_gone:
+            raise ConnectionRefusedError("no server is there")
 
     def run(self, commands: list[Any]) -> None:
         """Execute a sequence on the device's clock."""
@@ -105,6 +113,8 @@ class Stream:
         return self.rig.now
 
     def wait(self, frame: int) -> None:
+        if self.rig.is_gone:
+            raise DeviceFailed("MaxOne: expected frames, got none any more")
         self.rig.now = max(self.rig.now, frame)
 
     def forget(self, before: int) -> None:
@@ -209,6 +219,7 @@ def install(patch: pytest.MonkeyPatch) -> Rig:
             rig.sequences[self.token].append(command)
 
         def send(self) -> None:
+            rig.answer()
             rig.sent.append(self.token)
             if rig.on_send is not None:
                 rig.on_send()
@@ -219,6 +230,7 @@ def install(patch: pytest.MonkeyPatch) -> Rig:
                 rig.sequences.pop(self.token, None)
 
     def send(command: Any) -> str:
+        rig.answer()
         if command.kind == "unit":
             rig.units[command.number] = dict(command.state)
         elif command.kind == "core":
@@ -239,6 +251,6 @@ def install(patch: pytest.MonkeyPatch) -> Rig:
     module.send, module.DAC, module.DelaySamples = send, dac, delay
     module.Event = lambda well, type_, number, text: SimpleNamespace(kind="event", text=text)
     module.query_DAC_lsb_mV = lambda: rig.lsb_mv
-    module.initialize = module.offset = module.clear_events = lambda: None
+    module.initialize = module.offset = module.clear_events = rig.answer
     patch.setitem(sys.modules, "maxlab", module)
     return rig

@@ -36,6 +36,10 @@ class TestCL1(CultureContract):
         sys.modules["cl"].neurons.__init__()
         return CL1Culture()
 
+    def lose(self, culture: Culture) -> bool:
+        sys.modules["cl"].neurons.is_gone = True
+        return True
+
 
 @pytest.mark.parametrize(
     ("channel", "what"), [(0, "ground"), (4, "reference"), (7, "ground"), (56, "ground"), (63, "ground")]
@@ -140,6 +144,23 @@ def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) ->
         assert "\n" not in str(failed.value)
         assert neurons.interrupted > before
         neurons.fail = None
+
+
+def test_what_could_not_be_interrupted_is_told(neurons: Neurons, monkeypatch: pytest.MonkeyPatch) -> None:
+    with CL1Culture() as culture:
+        with monkeypatch.context() as patch:
+            patch.setattr(neurons, "interrupt", lambda _: [][0])
+            neurons.fail = TimeoutError("Loop fell behind")
+            with pytest.raises(
+                DeviceFailed, match=r"fell behind: and it could not be interrupted \(IndexError.* no more"
+            ):
+                culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.1)
+        neurons.fail = None
+        neurons.is_gone = True
+        for ask in (lambda: culture.now_s, lambda: culture.provenance):
+            with pytest.raises(DeviceFailed, match="got ConnectionResetError: the device is gone"):
+                ask()
+        neurons.is_gone = False
 
 
 def test_an_emergency_stop_half_way_delivers_nothing_more(neurons: Neurons) -> None:

@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +51,12 @@ class TestMaxOne(CultureContract):
         self.patch = monkeypatch
 
     def make_culture(self) -> Culture:
-        return culture_on(install(self.patch))
+        self.rig = install(self.patch)
+        return culture_on(self.rig)
+
+    def lose(self, culture: Culture) -> bool:
+        self.rig.is_gone = True
+        return True
 
 
 def test_stimulation_electrodes_that_were_not_routed_are_refused_by_name(rig: Rig) -> None:
@@ -183,6 +189,20 @@ def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
     assert len(rig.delivered) == 5
 
 
+def test_power_that_stays_on_is_told(rig: Rig) -> None:
+    def refuse(command: Any) -> str:
+        return "Error" if command.kind == "core" else str(send(command))
+
+    module = sys.modules["maxlab"]
+    send, culture = module.send, culture_on(rig).open()
+    module.send = refuse
+    for act in (culture.stop, culture.close):
+        with pytest.raises(DeviceFailed, match="expected stimulation power to be switched off, got 'Error'"):
+            act()
+    # What else can be done is done.
+    assert not any(unit["power"] or unit["connected"] for unit in rig.units.values())
+
+
 def test_whatever_goes_wrong_meanwhile_takes_the_power(rig: Rig) -> None:
     for wrong in (KeyboardInterrupt, DeviceFailed):
         with culture_on(rig) as culture:
@@ -245,6 +265,12 @@ def test_a_device_that_does_not_answer_is_one_line(rig: Rig, monkeypatch: pytest
     with pytest.raises(DeviceFailed, match="expected stimulation power to be switched on, got 'Error'"):
         culture_on(rig).open()
     rig.dead = False
+    rig.is_gone = True
+    with pytest.raises(DeviceFailed, match=r"got ConnectionRefusedError: .* is MaxLab Live's server running") as failed:
+        culture_on(rig).open()
+    # What could not be done about it is in the notes: that the power is on, for one, which is not known.
+    assert any("expected it to close, got ConnectionRefusedError" in note for note in failed.value.__notes__)
+    rig.is_gone = False
     for told in ("", None, "nan", "-1"):
         rig.lsb_mv = told
         with pytest.raises(DeviceFailed, match="expected the converter's step"):

@@ -456,6 +456,23 @@ class TestCommand:
         assert culture.deliveries <= 2
         assert signal.getsignal(signal.SIGTERM) is before
 
+    def test_a_culture_that_cannot_be_closed_costs_no_table(
+        self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        class Gone(FakeCulture):
+            def _close(self) -> None:
+                raise ConnectionResetError("the device is gone")
+
+        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: Gone())
+        given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--episodes", "1"]
+        assert main(["run", *given, "--controls", "random", "--out", str(folder / "new")]) == 1
+        printed = capsys.readouterr()
+        assert printed.err.strip().splitlines()[-1] == (
+            "animat: fake: expected it to close, got ConnectionResetError: the device is gone"
+        )
+        assert "random" in printed.out
+        assert "is its recording" in printed.out
+
     def test_other_electrodes_than_in_the_recordings_are_told(
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:

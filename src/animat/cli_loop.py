@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from animat.closed_loop.session import Session
     from animat.cultures.base import Culture
     from animat.cultures.budget import Account
+    from animat.live.shadowing import Lived
     from animat.neurons.conditions import Conditions
     from animat.progress import Progress
-    from animat.reality_gap import Calibration
+    from animat.reality_gap import Calibration, RealityGap
     from animat.recordings.findings import Finding
     from animat.recordings.recording import Recording
     from animat.recordings.stimulus import Pulse
@@ -138,6 +139,7 @@ class Run(Stimulating):
             calibration = self._calibration(recordings, first, self.at_min)
             check_conditions(first, calibration)
         with (
+            ExitStack() as told,
             # Last, as it makes the folder.
             _held_for_session(self.out, is_recording=not recordings),
             polite_kill_as_ctrl_c(),
@@ -165,12 +167,16 @@ class Run(Stimulating):
                 patterns=patterns,
                 **settings,
             )
+            # It is told even where the culture cannot be closed then.
+            told.callback(self._tell, gap)
+        return gap.to_dict()
+
+    def _tell(self, gap: RealityGap) -> None:
         _say(gap.findings)
         print(gap.to_text())
         if gap.session.recording_file.is_file():
             print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
         _expect_no_fault(gap.session, self.out)
-        return gap.to_dict()
 
     def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
         from animat.cultures.kinds import culture_of, recorded_culture
@@ -324,6 +330,7 @@ class Live(Stimulating):
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
+            ExitStack() as told,
             alone_in(self.out),
             polite_kill_as_ctrl_c(),
             Bar("live") as progress,
@@ -344,6 +351,11 @@ class Live(Stimulating):
                 progress=progress,
                 **settings,
             )
+            # It is told even where the culture cannot be closed then.
+            told.callback(self._tell, lived)
+        return lived.to_dict()
+
+    def _tell(self, lived: Lived) -> None:
         print(
             f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
             f"({lived.wall_s:.0f} s of ours); {lived.iterations:,} iterations of each policy, never stopped; "
@@ -357,7 +369,6 @@ class Live(Stimulating):
         _say(lived.gap.findings)
         print(lived.gap.to_text())
         _expect_no_fault(lived.gap.session, self.out)
-        return lived.to_dict()
 
 
 @dataclass(frozen=True)

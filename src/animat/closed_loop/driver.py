@@ -352,5 +352,12 @@ def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
         return Ending("budget", str(error))
     if isinstance(error, UnsafeStimulus) and culture.is_stopped:
         return Ending("culture", f"the culture was stopped: {error}")
-    lost = "the connection to the culture is lost: " if isinstance(error, OSError) else "the culture raised "
+    lost = "the connection to the culture is lost: " if _is_lost(error) else "the culture raised "
     return Ending("culture", lost + in_words(error))
+
+
+def _is_lost(error: BaseException | None) -> bool:
+    """Whether an error is of a connection, or caused by one; a device that was too slow is still there."""
+    if error is None:
+        return False
+    return (isinstance(error, OSError) and not isinstance(error, TimeoutError)) or _is_lost(error.__cause__)

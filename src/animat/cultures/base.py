@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 from jaxtyping import Int64
 
+from animat.cultures.failing import as_device_failure
 from animat.cultures.history import History
 from animat.cultures.observed import Observed, Spikes, assembled, stimulus_table
 from animat.cultures.safety import Admitted, Guard, Limits
@@ -129,25 +130,32 @@ class Culture(abc.ABC):
 
         Raises:
             InvalidArgument: if it is open already, or its limits are looser than the device's.
+            DeviceFailed: if it cannot be opened; it is then closed.
         """
         if self._guard is not None:
             raise InvalidArgument("culture: expected a closed one to open, got one that is open")
         if self._asked_limits is not None:
             self._asked_limits.check_within(self.device_limits)
         try:
-            self._open()
-            self._guard = Guard(self.limits, self.stimulation_electrodes, self._history, self.now_s)
-        except BaseException:
-            self._close()
+            with as_device_failure(self.name, "open"):
+                self._open()
+                self._guard = Guard(self.limits, self.stimulation_electrodes, self._history, self.now_s)
+        except BaseException as error:
+            self._close_after(error)
             raise
         return self
 
     @final
     def close(self) -> None:
-        """Leave the device safe and let go of it; a closed culture stays closed."""
+        """Leave the device safe and let go of it; a closed culture stays closed.
+
+        Raises:
+            DeviceFailed: if the device does not say that it is safe; it is closed all the same.
+        """
         if self._guard is not None:
             self._guard = None
-            self._close()
+            with as_device_failure(self.name, "close"):
+                self._close()
 
     @final
     def __enter__(self) -> Self:
@@ -157,7 +165,11 @@ class Culture(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        elif self._guard is not None:
+            self._guard = None
+            self._close_after(error)
 
     @property
     @final
@@ -185,10 +197,15 @@ class Culture(abc.ABC):
 
     @final
     def stop(self, reason: str = "asked for") -> None:
-        """Emergency stop: deliver nothing more until the culture is closed and opened again. Safe from any thread."""
+        """Emergency stop: deliver nothing more until the culture is closed and opened again. Safe from any thread.
+
+        Raises:
+            DeviceFailed: if the device does not say that it stopped; whatever is asked for from now on is refused.
+        """
         if self._guard is not None:
             self._guard.stop(reason)
-        self._halt()
+        with as_device_failure(self.name, "stop"):
+            self._halt()
 
     @final
     def deliver(self, stimuli: Sequence[Stimulus], duration_s: float) -> Observed:
@@ -201,6 +218,7 @@ class Culture(abc.ABC):
         Raises:
             UnsafeStimulus: naming the limit that one of them exceeds; nothing is then delivered, and no time passes.
             InvalidArgument: for a culture that is not open, or stimuli outside this stretch of time.
+            DeviceFailed: if the device fails meanwhile; whether what was asked for was delivered is then not known.
         """
         guard = self._opened()
         _check_duration("duration_s", duration_s)
@@ -209,7 +227,8 @@ class Culture(abc.ABC):
             raise InvalidArgument(
                 f"stimuli: expected times before the delivery ends ({duration_s:g} s), got {outside[0].time_s:g} s"
             )
-        return self._deliver(guard.admit(stimuli, self.now_s), duration_s)
+        with as_device_failure(self.name, "deliver"):
+            return self._deliver(guard.admit(stimuli, self.now_s), duration_s)
 
     @final
     def advance(self, duration_s: float) -> Spikes:
@@ -222,10 +241,12 @@ class Culture(abc.ABC):
 
         Raises:
             InvalidArgument: for a culture that is not open, or a negative time.
+            DeviceFailed: if the device fails meanwhile.
         """
         self._opened()
         _check_duration("duration_s", duration_s)
-        self._rest(duration_s)
+        with as_device_failure(self.name, "rest"):
+            self._rest(duration_s)
 
     @final
     def stimulate(
@@ -242,7 +263,7 @@ class Culture(abc.ABC):
             Spikes with start <= time < end, counted from the pulse.
 
         Raises:
-            UnsafeStimulus, InvalidArgument: as `deliver` does.
+            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
         start_ms, end_ms = window_ms
         if not 0 <= start_ms < end_ms < float("inf"):
@@ -267,7 +288,7 @@ class Culture(abc.ABC):
             presentation: how it is presented.
 
         Raises:
-            UnsafeStimulus, InvalidArgument: as `deliver` does.
+            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
         if not stimuli:
             raise InvalidArgument("stimuli: expected at least one in a presentation, got none")
@@ -303,7 +324,7 @@ class Culture(abc.ABC):
             progress: told after each block.
 
         Raises:
-            UnsafeStimulus, InvalidArgument: as `deliver` does.
+            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
         schedule = self.schedule(protocol, seed)
         progress = progress or Silent()
@@ -326,6 +347,14 @@ class Culture(abc.ABC):
             start_min=start_min,
             provenance=provenance,
         )
+
+    def _close_after(self, error: BaseException) -> None:
+        """Close because of an error, which goes on; that closing failed too is a note of it."""
+        try:
+            with as_device_failure(self.name, "close"):
+                self._close()
+        except Exception as failed:
+            error.add_note(f"and then: {failed}")
 
     def _rehearse(self, schedule: Schedule) -> None:
         """Put the whole schedule before the guard, blocks at their times, delivering nothing."""

@@ -16,6 +16,7 @@ from jaxtyping import Int64
 
 from animat.cultures.base import Culture
 from animat.cultures.cl1_delivery import Delivery
+from animat.cultures.failing import as_device_failure, in_words
 from animat.cultures.history import History
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace
@@ -154,7 +155,9 @@ class CL1Culture(Culture):
     @property
     def now_s(self) -> float:
         """The device's clock: begins when the device is started, not when it is opened."""
-        return float(self._opened_neurons().timestamp() / FRAMES_PER_S)
+        neurons = self._opened_neurons()
+        with as_device_failure("CL1", "tell its time"):
+            return float(neurons.timestamp() / FRAMES_PER_S)
 
     @property
     def sampling_rate_hz(self) -> float:
@@ -166,11 +169,12 @@ class CL1Culture(Culture):
         """The device by its own names, the SDK's version, and whether it is a simulator."""
         self._opened_neurons()
         assert self._cl is not None
-        told = self._cl.get_system_attributes()
+        with as_device_failure("CL1", "say what it is"):
+            told = self._cl.get_system_attributes()
+            kind = "the SDK's simulator" if self._cl.is_simulator() else "device"
         named = {
             name: str(told[name]) for name in ("system_id", "chip_id", "cell_batch_id", "project_id") if name in told
         }
-        kind = "the SDK's simulator" if self._cl.is_simulator() else "device"
         return {
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
@@ -204,7 +208,7 @@ class CL1Culture(Culture):
             raise
         except Exception as error:
             raise DeviceFailed(
-                f"CL1: expected a device to open, got {_line(error)}: is another program using it?"
+                f"CL1: expected a device to open, got {in_words(error)}: is another program using it?"
             ) from error
         self._delivery = Delivery(
             self._cl,
@@ -218,7 +222,6 @@ class CL1Culture(Culture):
         )
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
-        neurons = self._opened_neurons()
         if duration_s == 0:
             return Observed(self.now_s, 0.0, Spikes(np.empty(0), np.empty(0, np.int64)), np.empty(0))
         assert self._delivery is not None
@@ -227,13 +230,15 @@ class CL1Culture(Culture):
                 admitted.stimuli, duration_s, is_halted=self._halted.is_set
             )
         except BaseException as error:
-            self._interrupt()
+            told = "what had not begun was interrupted"
+            try:
+                self._interrupt()
+            except Exception as failed:
+                told = f"and it could not be interrupted ({in_words(failed)}): see to it that it gives no more pulses"
+                error.add_note(told)
             if isinstance(error, AnimatError) or not isinstance(error, Exception):
                 raise
-            raise DeviceFailed(
-                f"CL1: expected a loop over {duration_s:g} s, got {_line(error)} at frame {neurons.timestamp()}: what "
-                "had not begun was interrupted"
-            ) from error
+            raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got {in_words(error)}: {told}") from error
         row = _ROW_OF[channel]
         self.spikes_not_on_electrodes += int(np.count_nonzero(row == UNKNOWN))
         frame, row = frame[row != UNKNOWN], row[row != UNKNOWN]
@@ -249,14 +254,11 @@ class CL1Culture(Culture):
         neurons = self._opened_neurons()
         now = int(neurons.timestamp())
         until = now + int(np.ceil(duration_s * FRAMES_PER_S))
-        try:
-            # In pieces of a second, well under the five that the SDK holds.
-            while now < until:
-                piece = min(FRAMES_PER_S, until - now)
-                neurons.read(piece, now)
-                now += piece
-        except Exception as error:
-            raise DeviceFailed(f"CL1: expected {duration_s:g} s to pass, got {_line(error)}") from error
+        # In pieces of a second, well under the five that the SDK holds.
+        while now < until:
+            piece = min(FRAMES_PER_S, until - now)
+            neurons.read(piece, now)
+            now += piece
 
     def _halt(self) -> None:
         # First of all: whoever is about to hand over a pulse looks at it with the lock held.
@@ -346,8 +348,3 @@ def _channel_table(pitch_um: float | None) -> Channels:
     return Channels(
         label=channel.astype(np.str_), electrode=channel, x_um=(channel // 8) * pitch, y_um=(channel % 8) * pitch
     )
-
-
-def _line(error: BaseException) -> str:
-    """An error of the SDK in one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from animat.cultures.base import Culture
-from animat.errors import AnimatError, InvalidArgument, UnsafeStimulus
+from animat.errors import AnimatError, DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.protocol import Protocol
 from animat.recordings.recording import UNKNOWN
 from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
@@ -36,6 +36,10 @@ class CultureContract(abc.ABC):
     @abc.abstractmethod
     def make_culture(self) -> Culture:
         """A new culture, closed."""
+
+    def lose(self, culture: Culture) -> bool:
+        """Have the device of a culture be gone from now on, and say whether there is one; open or closed."""
+        return False
 
     @property
     def protocol(self) -> Protocol:
@@ -139,6 +143,46 @@ class CultureContract(abc.ABC):
             _expect(UnsafeStimulus, lambda: culture.record(self.protocol))
             culture.advance(0.01)
             assert culture.delivered == 0
+
+    def test_a_device_that_is_gone_is_told_as_one_that_failed(self) -> None:
+        culture = self.make_culture()
+        if not self.lose(culture):
+            return
+        _expect(DeviceFailed, culture.open)
+        assert not culture.is_open
+        acts: tuple[Callable[[Culture, Stimulus], object], ...] = (
+            lambda culture, _: culture.advance(0.1),
+            lambda culture, _: culture.rest(0.1),
+            lambda culture, stimulus: culture.deliver([stimulus], 0.1),
+            lambda culture, _: culture.record(self.protocol),
+            lambda culture, _: culture.stop(),
+        )
+        for act in acts:
+            culture = self.make_culture().open()
+            stimulus = self.stimulus(culture)
+            self.lose(culture)
+            error = _expect(DeviceFailed, lambda: act(culture, stimulus))  # noqa: B023
+            assert "\n" not in str(error)
+            _expect(DeviceFailed, culture.close)
+            assert not culture.is_open
+
+    def test_a_close_that_fails_is_told_and_takes_the_place_of_no_error(self) -> None:
+        def fail() -> None:
+            raise OSError("no route to host")
+
+        def use(culture: Culture) -> None:
+            with culture:
+                raise KeyError("of the user")
+
+        culture = self.make_culture().open()
+        close, culture._close = culture._close, fail  # type: ignore[method-assign]
+        assert "no route to host" in str(_expect(DeviceFailed, culture.close))
+        assert not culture.is_open
+        close()
+        error = _expect(KeyError, lambda: use(culture))
+        assert any("no route to host" in note for note in error.__notes__)
+        assert not culture.is_open
+        close()
 
     def test_limits_can_be_tightened_and_never_loosened(self) -> None:
         culture = self.make_culture()

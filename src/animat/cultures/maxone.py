@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
 from types import ModuleType
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
+from animat.cultures.failing import in_words
 from animat.cultures.history import History
 from animat.cultures.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
 from animat.cultures.maxone_stream import SpikeStream, ZmqSpikes
@@ -172,8 +174,7 @@ class MaxOneCulture(Culture):
         self.spikes_not_recorded = 0
         try:
             mx.initialize()
-            if (reply := mx.send(mx.Core().enable_stimulation_power(True))) != "Ok":
-                raise DeviceFailed(f"MaxOne: expected stimulation power to be switched on, got {reply!r}")
+            self._switch_power(True)
             self._wait("waitInit")
             self._lsb_mv = _step_mv(mx.query_DAC_lsb_mV())
             if self._asked_limits is not None:
@@ -187,8 +188,7 @@ class MaxOneCulture(Culture):
             raise
         except Exception as error:
             raise DeviceFailed(
-                f"MaxOne: expected a device to open, got {type(error).__name__}: {' '.join(str(error).split())}: is "
-                "MaxLab Live's server running?"
+                f"MaxOne: expected a device to open, got {in_words(error)}: is MaxLab Live's server running?"
             ) from error
         frame = self._stream.frame()
         if self._last_frame < 0:
@@ -201,9 +201,15 @@ class MaxOneCulture(Culture):
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         try:
             return self._sent(admitted, duration_s)
-        except BaseException:
+        except BaseException as error:
             # A sequence that is under way goes on by itself: without power nothing comes of it.
-            self._halt()
+            try:
+                self._halt()
+            except Exception as failed:
+                error.add_note(
+                    f"and the power could not be switched off ({in_words(failed)}): see to it that it gives no more "
+                    "pulses"
+                )
             raise
 
     def _sent(self, admitted: Admitted, duration_s: float) -> Observed:
@@ -260,27 +266,37 @@ class MaxOneCulture(Culture):
 
     def _halt(self) -> None:
         self._halted.set()
-        mx = self._mx
-        if mx is not None:
-            mx.send(mx.Core().enable_stimulation_power(False))
+        self._switch_power(False)
 
     def _close(self) -> None:
         self._halted.set()
-        mx, wiring, stream = self._mx, self._wiring, self._stream
-        try:
-            if mx is not None:
-                mx.send(mx.Core().enable_stimulation_power(False))
-                for unit in wiring.unit_of.values() if wiring else ():
-                    mx.send(mx.StimulationUnit(unit).power_up(False).connect(False))
-                if self._sequences is not None:
-                    self._sequences.delete()
-        finally:
-            if stream is not None:
-                # A stream that heard nothing has none.
-                self._last_frame = stream.frame() if stream.frame() >= 0 else self._last_frame
-                stream.stop()
-            # What it was wired as stays readable; `device_limits` too, for the next opening.
-            self._mx = self._stream = self._sequences = self._pace = None
+        mx, wiring = self._mx, self._wiring
+        # Whatever fails, all of the rest is tried; the last one is the first.
+        with ExitStack() as steps:
+            steps.callback(self._let_go)
+            if self._sequences is not None:
+                steps.callback(self._sequences.delete)
+            if mx is not None and wiring is not None:
+                for unit in wiring.unit_of.values():
+                    steps.callback(mx.send, mx.StimulationUnit(unit).power_up(False).connect(False))
+            steps.callback(self._switch_power, False)
+
+    def _let_go(self) -> None:
+        stream = self._stream
+        # What it was wired as stays readable; `device_limits` too, for the next opening.
+        self._mx = self._stream = self._sequences = self._pace = None
+        if stream is not None:
+            # A stream that heard nothing has none.
+            self._last_frame = stream.frame() if stream.frame() >= 0 else self._last_frame
+            stream.stop()
+
+    def _switch_power(self, on: bool) -> None:
+        """Of all stimulation units, where there is a device."""
+        mx = self._mx
+        if mx is not None and (reply := mx.send(mx.Core().enable_stimulation_power(on))) != "Ok":
+            raise DeviceFailed(
+                f"MaxOne: expected stimulation power to be switched {'on' if on else 'off'}, got {reply!r}"
+            )
 
     def _wait(self, what: str) -> None:
         """As long as the vendor says, by the name it has in `maxlab.Timing`."""
