@@ -405,8 +405,8 @@ def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> Non
         assert_safe(session, culture, 0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_and_a_polite_kill(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_ctrl_c_a_polite_kill_and_a_terminal_that_is_gone(tmp_path: Path, number: signal.Signals) -> None:
     def press(culture: FakeCulture, observed: Observed) -> Observed:
         os.kill(os.getpid(), number)
         time.sleep(0.3)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -15,10 +18,12 @@ import pytest
 import stand_in_cl
 import stand_in_maxlab
 from animat.cli import main
+from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
 from animat.cultures.base import Culture
 from animat.cultures.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.living_series import record_living_series
 from animat.cultures.maxone import MaxOneCulture
+from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.errors import DeviceFailed, InvalidArgument, Mismatch
 from animat.recordings.array import MAXONE
@@ -181,3 +186,33 @@ def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixt
         error = capsys.readouterr().err.strip()
         assert "\n" not in error
         assert error.startswith("animat: --recordings" if wrong is command else "animat: --selection")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_kill_while_it_is_recorded_closes_the_culture(
+    tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(culture: FakeCulture, observed: Observed) -> Observed:
+        os.kill(os.getpid(), number)
+        time.sleep(0.2)
+        return observed
+
+    culture = FakeCulture(fault=kill, at=1)
+    monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
+    before = signal.getsignal(number)
+    given = ["--culture", "maxone", "--selection", "x.json", "--presentations", "2", "--out", str(tmp_path)]
+    assert main(["record", *given]) == 130
+    assert not culture.is_open
+    assert culture.deliveries == 2
+    assert signal.getsignal(number) is before
+
+
+def test_a_hang_up_that_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with polite_kill_as_ctrl_c():
+            os.kill(os.getpid(), signal.SIGHUP)
+            time.sleep(0.01)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)

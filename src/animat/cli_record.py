@@ -100,6 +100,7 @@ class Record:
         )
 
     def _living(self, progress: Progress) -> list[Path]:
+        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.cultures.kinds import culture_of
         from animat.cultures.living_series import record_in_held_folder
         from animat.cultures.series import check_interval
@@ -112,6 +113,7 @@ class Record:
         with (
             # Held before a device is opened, which stops whatever another run has it do.
             alone_in(self.out),
+            polite_kill_as_ctrl_c(),
             culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
         ):
             series = record_in_held_folder(

@@ -1,4 +1,4 @@
-"""Ctrl-C and a polite kill: whoever asks for an end must not leave a culture as it is."""
+"""Ctrl-C, a polite kill and a terminal that is gone: whoever asks for an end must not leave a culture as it is."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-ASKING = (signal.SIGINT, signal.SIGTERM)
+# A hang-up comes where the terminal goes (an ssh session that breaks off); not every system has it.
+_KILLS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+ASKING = (signal.SIGINT, *_KILLS)
 
 
 @contextmanager
 def told_instead(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` for Ctrl-C and SIGTERM, in place of raising somewhere; nothing outside of the main thread."""
+    """Call `stop` for Ctrl-C, SIGTERM and SIGHUP, in place of raising somewhere; nothing outside of the main thread."""
     with _handled(ASKING, lambda *_: stop()):
         yield
 
 
 @contextmanager
 def polite_kill_as_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt as Ctrl-C does: what is open is then closed, and not left as it is."""
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does: what is open is then closed, not left as it is."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with _handled((signal.SIGTERM,), interrupt):
+    with _handled(_KILLS, interrupt):
         yield
 
 
@@ -34,6 +36,8 @@ def _handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    # `nohup` has a hang-up ignored: it stays so.
+    numbers = tuple(n for n in numbers if n.name != "SIGHUP" or signal.getsignal(n) != signal.SIG_IGN)
     before = [signal.signal(number, handler) for number in numbers]
     try:
         yield
