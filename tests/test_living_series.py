@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -162,6 +163,58 @@ def test_devices_are_recorded_by_the_same_calls(
     assert series.files[:2] == first.files
     assert [r.start_min - zero_s / 60 for r in read_recordings(tmp_path)] == pytest.approx([0, 0.5, 1.0], abs=0.01)
     assert len(pulses_s()) == 3 * 10
+
+
+def test_another_chip_or_other_patterns_of_a_cl1_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    culture, pulses_s = cl1(monkeypatch)
+    protocol = replace(SHORT, pulse=CL1_PULSE)
+    with culture:
+        record_living_series(culture, protocol, tmp_path, sessions=1, interval_min=0.5)
+    with CL1Culture(culture.patterns) as given:
+        record_living_series(given, protocol, tmp_path / "given", sessions=1, interval_min=0.5)
+    chip = {"system_id": "stand-in", "chip_id": "another"}
+    for other, folder, words in (
+        (CL1Culture(seed=2), tmp_path, r"pattern_seed: 0 there, 2 now"),
+        (CL1Culture(culture.patterns[10:]), tmp_path / "given", r"patterns, got others \(\d+ of them\)"),
+        (CL1Culture(), tmp_path, r"chip_id: 'none' there, 'another' now"),
+    ):
+        if "chip_id" in words:
+            monkeypatch.setattr(sys.modules["cl"], "get_system_attributes", lambda: chip)
+        with other, pytest.raises(Mismatch, match=words):
+            record_living_series(other, protocol, folder, sessions=2, interval_min=0.5)
+    assert len(pulses_s()) == 2 * 10
+
+
+def test_other_electrodes_of_a_maxone_are_refused_and_other_units_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture, _ = maxone(monkeypatch)
+    assert isinstance(culture, MaxOneCulture)
+    protocol = replace(SHORT, pulse=BALANCED_PULSE)
+    with culture:
+        record_living_series(culture, protocol, tmp_path, sessions=1, interval_min=0.5)
+        units = culture.provenance["stimulation_units"]
+    rig, chosen = culture._given_stream.rig, culture.selection  # type: ignore[union-attr]
+    again = Selection(MAXONE, chosen.recording, chosen.stimulation[::-1], chosen.patterns)
+    with MaxOneCulture(again, stream=stand_in_maxlab.Stream(rig), settle=False) as rewired:
+        assert rewired.provenance["stimulation_units"] != units
+        rewired.rest(20.0)
+        record_living_series(rewired, protocol, tmp_path, sessions=2, interval_min=0.5)
+    moved = Selection(MAXONE, chosen.recording + 1, chosen.stimulation, chosen.patterns)
+    with MaxOneCulture(moved, stream=stand_in_maxlab.Stream(rig), settle=False) as other:
+        assert other.channels.label.tolist() == culture.channels.label.tolist()
+        with pytest.raises(Mismatch, match=r"channels, got others \(electrodes differ\)"):
+            record_living_series(other, protocol, tmp_path, sessions=3, interval_min=0.5)
+
+
+def test_a_replay_of_other_recordings_is_refused(tmp_path: Path) -> None:
+    with replay() as culture:
+        record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+        now_s = culture.now_s
+    with ReplayCulture([make_up_recording(2, channels=32, start_min=30.0)], seed=3) as other:
+        other.rest(now_s - other.now_s)
+        with pytest.raises(Mismatch, match="replayed seed: 1 there, 2 now"):
+            record_living_series(other, SHORT, tmp_path, sessions=2, interval_min=2.0)
 
 
 def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

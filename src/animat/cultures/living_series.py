@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from animat.cultures.base import Culture
+from animat.cultures.same_patterns import other_patterns
 from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
 from animat.errors import Mismatch
 from animat.progress import Progress, Silent
@@ -14,6 +15,10 @@ from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.writing import alone_in
+
+
+_MAY_DIFFER = ("stimulation_units",)
+"""What a device tells of itself that can be otherwise when it is opened anew, and makes no other culture of it."""
 
 
 class LivingSeries(NamedTuple):
@@ -127,11 +132,20 @@ def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interv
 
 
 def _expect_of(file: Path, there: Recording, culture: Culture, protocol: Protocol) -> None:
-    expected = {"source": culture.provenance["source"], "protocol": protocol.to_json()}
-    if difference := difference_from(expected, there):
+    told = {name: words for name, words in culture.provenance.items() if name not in _MAY_DIFFER}
+    if difference := difference_from({**told, "protocol": protocol.to_json()}, there):
         raise Mismatch(
             f"{file}: expected a recording of this culture by this protocol, got another ({difference}): choose "
             "another folder"
         )
-    if there.channels.label.tolist() != culture.channels.label.tolist():
-        raise Mismatch(f"{file}: expected a recording of this culture's channels, got others: choose another folder")
+    for name in ("label", "electrode"):
+        if getattr(there.channels, name).tolist() != getattr(culture.channels, name).tolist():
+            raise Mismatch(
+                f"{file}: expected a recording of this culture's channels, got others ({name}s differ): choose another "
+                "folder"
+            )
+    if (strange := other_patterns(there, culture)) is not None:
+        raise Mismatch(
+            f"{file}: expected a recording by this culture's patterns, got others ({strange.value:g} of them): choose "
+            "another folder"
+        )
