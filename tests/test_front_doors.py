@@ -226,7 +226,10 @@ def go_through(kind: str, number: int, seed: int, patch: pytest.MonkeyPatch) -> 
             else:
                 done += 1
                 asked += sum(len(s.electrodes) for s in request if door.acts(s.pulse))
-            if count % 4 == 0:
+            # In turns in a hurry, against the limits on rates, and at leisure, so that much is delivered too.
+            if count // 100 % 2:
+                door.let_pass(float(requests.rng.choice([0.001, 0.01, 0.04])))
+            elif count % 4 == 0:
                 door.let_pass(float(requests.rng.choice([0.0, 0.001, 0.004, 0.01, 0.05])))
             if count % 20_000 == 19_999 or count == number - 1:
                 new = door.out()
@@ -248,7 +251,7 @@ def patch() -> Iterator[pytest.MonkeyPatch]:
 def test_nothing_outside_the_limits_is_delivered(kind: str, patch: pytest.MonkeyPatch) -> None:
     done, refused, found = go_through(kind, 3_000, 0, patch)
     assert found == []
-    assert min(done, refused) > 200
+    assert min(done, refused) > 800
 
 
 @pytest.mark.oracle
@@ -257,7 +260,7 @@ def test_of_a_million_requests_none_outside_the_limits_is_delivered(kind: str, p
     done, refused, found = go_through(kind, 1_000_000, 1, patch)
     assert found == []
     assert done + refused == 1_000_000
-    assert min(done, refused) > 50_000
+    assert min(done, refused) > 250_000
 
 
 def test_the_oracle_finds_each_breach() -> None:
