@@ -427,3 +427,41 @@ def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None
     assert not exchange.is_finished
     exchange.finish()
     assert exchange.is_finished
+
+
+def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cultures = []
+
+    def made(*_: Any, **__: Any) -> FakeCulture:
+        # The second one fails in its third tick: after two recordings and the pause.
+        fault = {"fault": gone, "at": 5} if cultures else {}
+        cultures.append(FakeCulture(**fault))
+        return cultures[-1]
+
+    def gone(culture: FakeCulture, observed: Observed) -> Observed:
+        raise DeviceFailed("gone")
+
+    monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
+    given = ["live", "navigation", "--policies", "2", "--pulses", "1", "--presentations", "40", "--speed", "1e6"]
+    given += ["--interval-min", "5", "--duration-min", "10", "--episodes", "1", "--json"]
+    assert main([*given, "--out", str(tmp_path / "done")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    told = json.loads(printed[-1])
+    assert printed[0].startswith("2 recordings in 10 min of the culture's clock (")
+    assert printed[0].endswith("1 swaps of simulators:")
+    assert f"{told['iterations']:,} iterations of each policy, never stopped" in printed[0]
+    assert "policies p0 to p1 after" in printed[1]
+    assert "the recording at 5.2 min" in printed[1]
+    assert any(line.split()[:1] == ["random"] for line in printed)
+    assert told["closed_loop"]["session"]["ended_by"] == "plan"
+    assert all(Path(file).is_file() for file in told["recordings"])
+    assert told["policies"] == list(load_policies(tmp_path / "done" / "policies"))
+    assert (tmp_path / "done" / "session" / "session.nwb").is_file()
+    assert not cultures[0].is_open
+    # Everything is told of one that fails in the loop too, and then it is an error.
+    assert main([*given, "--out", str(tmp_path / "failed")]) == 1
+    printed_too = capsys.readouterr()
+    assert "the session ended before its plan was done: the culture raised DeviceFailed: gone" in printed_too.err
+    assert printed_too.out.startswith("2 recordings in 10 min")
