@@ -280,7 +280,8 @@ class Culture(abc.ABC):
     ) -> Recording:
         """Deliver the stimuli of a presentation and record up to `until_ms` after the last one.
 
-        What a closed loop does each time: the short recording is read by the same extraction of responses as any other.
+        For trying out by hand: the short recording is read by the same extraction of responses as any other. A closed
+        loop calls `deliver`, and its session is one recording.
 
         Args:
             stimuli: at least one, in the order of time, counted from now.
