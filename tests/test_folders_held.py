@@ -10,7 +10,7 @@ import pytest
 
 from animat.cli import main
 from animat.errors import DeviceFailed, Mismatch
-from animat.live.plan import Pace
+from animat.live.plan import Timetable
 from animat.live.shadowing import live
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.writing import LOCK, alone_in
@@ -100,5 +100,5 @@ def test_a_live_run_takes_a_folder_in_which_only_a_file_to_be_locked_is(
     monkeypatch.setattr(fcntl, "flock", files_only)
     with alone_in(tmp_path / "live"), FakeCulture() as culture:
         assert (tmp_path / "live" / LOCK).exists()
-        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=Pace(10, 10, 1e6), episodes=1)
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=Timetable(10, 10, 1e6), episodes=1)
     assert len(found.recordings) == 1

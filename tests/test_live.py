@@ -26,7 +26,7 @@ from animat.errors import (
     UnusableData,
 )
 from animat.live.exchange import Exchange
-from animat.live.plan import LOG_FILE, Pace, check_plan, what_stands
+from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
 from animat.live.shadowing import Lived, live
 from animat.mapping import Thresholds
@@ -47,7 +47,7 @@ SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
 TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iterations=6000, seed=3, algorithm=SMALL)
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
 PULSES = 5 * 40 * 2
-QUICK = Pace(interval_min=10, duration_min=30, speed=1e6)
+QUICK = Timetable(interval_min=10, duration_min=30, speed=1e6)
 
 
 def lines(folder: Path) -> list[dict[str, Any]]:
@@ -58,7 +58,7 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lived, Path, int]:
     folder = tmp_path_factory.mktemp("live") / "live"
     with FakeCulture() as culture:
-        found = live(TRAINING, culture, PROTOCOL, folder, pace=QUICK, episodes=3)
+        found = live(TRAINING, culture, PROTOCOL, folder, timetable=QUICK, episodes=3)
         return found, folder, culture.delivered
 
 
@@ -132,7 +132,7 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
 
     monkeypatch.setattr(VirtualCulture, "save_state", noted)
     with small_culture() as culture:
-        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
         lived_s = culture.now_s
     recordings = read_recordings(found.recordings)
     # After each recording, in case the run is killed, and after the loop.
@@ -149,7 +149,7 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
 def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Path) -> None:
     account = Account(Budget(pulses=2 * PULSES + 100))
     with FakeCulture() as culture:
-        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1, account=account)
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1, account=account)
         assert culture.delivered == account.pulses <= 2 * PULSES + 100
     assert len(found.recordings) == 2
     assert len(found.swaps) == 1
@@ -189,7 +189,7 @@ def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("animat.live.shadowing.extract_series", extract)
-            found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+            found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert len(found.recordings) == 3
     assert len(found.swaps) == 1
     assert [line["sentence"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
@@ -211,7 +211,7 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
                 culture,
                 PROTOCOL,
                 tmp_path / "live",
-                pace=Pace(interval_min=10, duration_min=1000, speed=1e4),
+                timetable=Timetable(interval_min=10, duration_min=1000, speed=1e4),
                 progress=Pressing(),
             )
         assert culture.is_stopped
@@ -231,7 +231,7 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
 
     with FakeCulture(fault=fail, at=1) as culture:
         with pytest.raises(DeviceFailed, match="gone"):
-            live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK)
+            live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK)
         assert culture.is_stopped
         assert culture.after_halt == 0
         # The second recording was handed over: nobody knows what came of it.
@@ -257,7 +257,7 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
     monkeypatch.setattr("animat.live.shadowing.run_policies", fail)
     with FakeCulture() as culture:
         with pytest.raises(type(error)):
-            live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK)
+            live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK)
         assert culture.is_stopped
     written = lines(tmp_path / "live")
     assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
@@ -276,7 +276,7 @@ def test_a_session_of_a_live_run_that_still_runs_is_not_recovered(tmp_path: Path
         return observed
 
     with FakeCulture(fault=meanwhile, at=7) as culture:
-        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert found.gap.session.ending.by == "plan"
     assert len(refused) == 1
     assert "another run is at work" in refused[0]
@@ -289,7 +289,7 @@ def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
 
     # Three recordings, the pause, and a few ticks.
     with FakeCulture(fault=fail, at=7) as culture:
-        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=QUICK, episodes=1)
+        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert found.gap.session.ending.by == "culture"
     assert "ended before its time (the culture raised DeviceFailed: gone)" in (what_stands(tmp_path / "live") or "")
 
@@ -306,8 +306,8 @@ def test_policies_are_kept_while_they_are_trained(tmp_path: Path, monkeypatch: p
                 raise KeyboardInterrupt
 
     with FakeCulture() as culture, pytest.raises(KeyboardInterrupt):
-        pace = Pace(interval_min=10, duration_min=100_000, speed=1e4)
-        live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=pace, progress=Looking())
+        timetable = Timetable(interval_min=10, duration_min=100_000, speed=1e4)
+        live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=timetable, progress=Looking())
 
 
 def test_a_killed_run_says_what_stands_there_and_what_can_be_done_with_it(tmp_path: Path) -> None:
@@ -346,7 +346,7 @@ def test_a_training_that_fails_ends_the_run_with_its_recordings_kept(tmp_path: P
     with FakeCulture() as culture, pytest.MonkeyPatch.context() as patch:
         patch.setattr(Exchange, "publish", lambda *_: None)
         with pytest.raises(AnimatError, match="expected a simulator in the exchange"):
-            live(impossible, culture, PROTOCOL, tmp_path / "live", pace=QUICK)
+            live(impossible, culture, PROTOCOL, tmp_path / "live", timetable=QUICK)
     assert len(read_recordings([tmp_path / "live" / "recordings"])) == 1
 
 
@@ -363,14 +363,14 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
             with pytest.raises(InvalidArgument, match=words):
                 live(TRAINING, culture, PROTOCOL, tmp_path / "live", **wrong)
         with pytest.raises(InvalidArgument, match="interval_min: expected at least"):
-            live(TRAINING, culture, PROTOCOL, tmp_path / "live", pace=Pace(interval_min=0.1))
+            live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=Timetable(interval_min=0.1))
         (tmp_path / "full").mkdir()
         (tmp_path / "full" / "something").touch()
         with pytest.raises(Mismatch, match="an empty folder"):
             live(TRAINING, culture, PROTOCOL, tmp_path / "full")
-        for pace in ({"speed": 0.0}, {"interval_min": -1.0}, {"duration_min": float("nan")}):
-            with pytest.raises(InvalidArgument, match=next(iter(pace))):
-                Pace(**pace)
+        for timetable in ({"speed": 0.0}, {"interval_min": -1.0}, {"duration_min": float("nan")}):
+            with pytest.raises(InvalidArgument, match=next(iter(timetable))):
+                Timetable(**timetable)
         assert culture.delivered == 0
         assert not (tmp_path / "live").exists()
 

@@ -292,7 +292,7 @@ class Live(Stimulating):
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.cultures.kinds import culture_of, pulse_for
-        from animat.live.plan import Pace, check_plan
+        from animat.live.plan import Timetable, check_plan
         from animat.live.shadowing import live
         from animat.mapping import mapping_named
         from animat.progress import Bar
@@ -310,7 +310,7 @@ class Live(Stimulating):
                 f"{self.culture}: a live run records the culture itself"
             )
         default_speed = 30.0 if simulated else 1.0
-        pace = Pace(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
+        timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
         robot = robot_named(self.robot)
         training = Training(
             robot,
@@ -325,7 +325,7 @@ class Live(Stimulating):
             order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
         )
         settings = {**self._of_the_loop(), "follow": self.thresholds == "follow"}
-        check_plan(training, protocol, self.out, pace, self.episodes, settings)
+        check_plan(training, protocol, self.out, timetable, self.episodes, settings)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed
@@ -343,7 +343,7 @@ class Live(Stimulating):
                 culture,
                 replace(protocol, patterns=min(100, len(culture.patterns))),
                 self.out,
-                pace=pace,
+                timetable=timetable,
                 episodes=self.episodes,
                 with_controls=self.controls == "all",
                 kind=self.simulator,

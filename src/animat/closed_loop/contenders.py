@@ -12,7 +12,8 @@ from jaxtyping import Float
 from animat.robots.base import Robot
 from animat.robots.steering import STEERED, steering
 
-Delivery = Literal["chosen", "shuffled", "silent"]
+LoopDelivery = Literal["chosen", "shuffled", "silent"]
+"""What the culture is given; a training (`animat.animat.Delivery`) has no silence."""
 
 
 class Controller(Protocol):
@@ -110,7 +111,7 @@ class Contender:
     name: str
     meaning: str
     controller: Controller
-    delivery: Delivery = "chosen"
+    delivery: LoopDelivery = "chosen"
     calibrates: bool = True
 
     def acting(self, turn: int) -> Controller:

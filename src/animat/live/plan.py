@@ -28,7 +28,7 @@ _NOT_OF_THE_LOOP = ("follow", "greedy")
 
 
 @dataclass(frozen=True)
-class Pace:
+class Timetable:
     """When the culture is recorded.
 
     Attributes:
@@ -56,7 +56,12 @@ class Pace:
 
 
 def check_plan(
-    training: Training, protocol: Protocol, folder: Path, pace: Pace, episodes: int, settings: Mapping[str, Any]
+    training: Training,
+    protocol: Protocol,
+    folder: Path,
+    timetable: Timetable,
+    episodes: int,
+    settings: Mapping[str, Any],
 ) -> None:
     """Raise for what would only come out when the culture is open, or after an hour of training.
 
@@ -64,7 +69,7 @@ def check_plan(
         training: what is trained.
         protocol: of every recording.
         folder: for all that comes of it.
-        pace: when the culture is recorded.
+        timetable: when the culture is recorded.
         episodes: of each policy in closed loop.
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
@@ -77,9 +82,10 @@ def check_plan(
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
     # How long it takes does not depend on which electrodes are pulsed.
     takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), 0).duration_s / 60
-    if takes_min > pace.interval_min:
+    if takes_min > timetable.interval_min:
         raise InvalidArgument(
-            f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {pace.interval_min:g}"
+            f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, "
+            f"got {timetable.interval_min:g}"
         )
     if episodes < 1:
         raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")

@@ -22,7 +22,7 @@ from animat.cultures.series import STATE_FILE, recording_name
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.exchange import Exchange
-from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Pace, check_plan
+from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan
 from animat.live.recording import record_within
 from animat.live.trainers import Trainers
 from animat.neurons.responses import Responses
@@ -81,7 +81,7 @@ def live(
     protocol: Protocol,
     folder: str | os.PathLike[str],
     *,
-    pace: Pace | None = None,
+    timetable: Timetable | None = None,
     episodes: int = 5,
     with_controls: bool = False,
     kind: Kind = "histogram",
@@ -101,11 +101,11 @@ def live(
     (`culture.state`): `animat run` goes on from it.
 
     Args:
-        training: robot, mapping, policies, seed, algorithm; its duration is set to the pace's.
+        training: robot, mapping, policies, seed, algorithm; its duration is set to the timetable's.
         culture: open.
         protocol: of every recording.
         folder: for `recordings/`, `policies/`, `session/` and `live.log`, a line of JSON each time something happened.
-        pace: when to record.
+        timetable: when to record.
         episodes: of each policy in closed loop.
         with_controls: all of them between the policies' episodes; if not, only the random one.
         kind: of simulator.
@@ -119,9 +119,9 @@ def live(
         AnimatError: if a process that trains fails, or the culture does: the culture is then stopped, and recordings
             and policies are kept as they are.
     """
-    pace = pace or Pace()
-    check_plan(training, protocol, Path(folder), pace, episodes, settings)
-    run = _Run(training, culture, protocol, Path(folder), pace, kind, account or Account(), progress)
+    timetable = timetable or Timetable()
+    check_plan(training, protocol, Path(folder), timetable, episodes, settings)
+    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account or Account(), progress)
     try:
         policies = run.shadow()
         calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
@@ -163,7 +163,7 @@ class _Run:
         culture: Culture,
         protocol: Protocol,
         folder: Path,
-        pace: Pace,
+        timetable: Timetable,
         kind: Kind,
         account: Account,
         progress: Progress | None,
@@ -173,8 +173,8 @@ class _Run:
         self.used: list[Responses] = []
         self.swaps: list[dict[str, Any]] = []
         self.iterations, self.culture_min, self.wall_s = 0, 0.0, 0.0
-        self._training = replace(training, duration_min=pace.duration_min, shadowing=True)
-        self._culture, self._protocol, self._pace, self._kind = culture, protocol, pace, kind
+        self._training = replace(training, duration_min=timetable.duration_min, shadowing=True)
+        self._culture, self._protocol, self._timetable, self._kind = culture, protocol, timetable, kind
         self._progress = progress or Silent()
         self._zero_s, self._wall_zero_s = culture.now_s, time.monotonic()
         self._known_s, self._ended_early = self._zero_s, False
@@ -225,9 +225,9 @@ class _Run:
 
     def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
         published, in_budget = 0, True
-        for number in range(1, self._pace.recordings + 1):
-            self._wait(number * self._pace.interval_min, trainers, published)
-            if number == self._pace.recordings or not in_budget:
+        for number in range(1, self._timetable.recordings + 1):
+            self._wait(number * self._timetable.interval_min, trainers, published)
+            if number == self._timetable.recordings or not in_budget:
                 continue
             try:
                 timeline = self._record(number)
@@ -241,14 +241,14 @@ class _Run:
 
     def _wait(self, minute: float, trainers: Trainers, number: int) -> None:
         """Let the culture's clock come to a minute of the run, training going on."""
-        minute = min(minute, self._pace.duration_min)
-        due_s = self._wall_zero_s + 60 * minute / self._pace.speed
+        minute = min(minute, self._timetable.duration_min)
+        due_s = self._wall_zero_s + 60 * minute / self._timetable.speed
         while time.monotonic() < due_s or not trainers.all_use(number):
             self._note(trainers.swaps(_POLL_S))
-            passed_min = (time.monotonic() - self._wall_zero_s) * self._pace.speed / 60
+            passed_min = (time.monotonic() - self._wall_zero_s) * self._timetable.speed / 60
             told = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
             note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{told}"
-            self._progress.update(min(passed_min, minute), self._pace.duration_min, note)
+            self._progress.update(min(passed_min, minute), self._timetable.duration_min, note)
         self._culture.rest(max(0.0, self._zero_s + 60 * minute - self._culture.now_s))
 
     def _record(self, number: int) -> SimulatorTimeline | None:
