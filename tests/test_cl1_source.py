@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.cultures.cl1_source import BEFORE, NOT_ELECTRODES, SAMPLES, SimulatedCL1
+from animat.cultures.cl1 import NO_STIMULATION
+from animat.cultures.cl1_source import BEFORE, SAMPLES, SimulatedCL1
 from animat.errors import InvalidArgument
 
 
@@ -63,15 +64,15 @@ def test_it_answers_pulses_and_only_cathodic_charge_counts() -> None:
 
     quiet, loud = answers([]), answers(STIMULI)
     assert loud > quiet
-    assert answers([event(701, channel) for channel in NOT_ELECTRODES]) == quiet
+    assert answers([event(701, channel) for channel in NO_STIMULATION]) == quiet
     anodic = SimpleNamespace(timestamp=701, channel=9, phase_durations_us=(160,), phase_currents_uA=(2.0,))
     assert answers([anodic]) == quiet
 
 
 def test_spikes_are_in_the_frames_on_their_channel_and_ground_is_silent() -> None:
     frames, spikes, shapes = read([WHOLE])
-    assert not np.any(frames[:, list(NOT_ELECTRODES)])
-    assert not {channel for _, channel in spikes} & set(NOT_ELECTRODES)
+    assert not np.any(frames[:, list(NO_STIMULATION)])
+    assert not {channel for _, channel in spikes} & set(NO_STIMULATION)
     assert shapes.shape == (len(spikes), SAMPLES)
     assert np.all(np.argmin(shapes, axis=1) == BEFORE)
     # 60 uV is the smallest spike, five standard deviations of the noise less is below 48 uV, which is 246 units.

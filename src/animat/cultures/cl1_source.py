@@ -13,14 +13,13 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int16
 
+from animat.cultures.cl1 import CHANNELS, FRAMES_PER_S, NO_STIMULATION
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
+from animat.cultures.virtual import WARM_UP_S
+from animat.cultures.visibility import amplitudes_at_soma_uv
 from animat.errors import InvalidArgument
 
-CHANNELS = 64
-FRAMES_PER_S = 25_000
-NOT_ELECTRODES = (0, 4, 7, 56, 63)
 FACTORY = "animat.cultures.cl1_source:simulated_culture"
-WARM_UP_S = 5.0
 UV_PER_UNIT = 0.195
 BLOCK_FRAMES = 1024
 SAMPLES = 75
@@ -94,11 +93,9 @@ class SimulatedCL1:
         channel = np.arange(CHANNELS)
         self.x_um = width_um / 2 + (channel // 8 - 3.5) * pitch_um
         self.y_um = height_um / 2 + (channel % 8 - 3.5) * pitch_um
-        self._is_electrode = ~np.isin(channel, NOT_ELECTRODES)
+        self._is_electrode = ~np.isin(channel, list(NO_STIMULATION))
         self._sees = self._neurons_seen(reach_um)
-        amplitude_uv = np.clip(
-            110 * np.random.default_rng([seed, 11]).lognormal(0.0, 0.4, len(self._tissue.x_um)), 60, 300
-        )
+        amplitude_uv = amplitudes_at_soma_uv(np.random.default_rng([seed, 11]), len(self._tissue.x_um))
         self._shapes = _waveform()[None, :] * amplitude_uv[:, None].astype(np.float32)
         self._tissue.advance(WARM_UP_S)
         # The first pulse on an electrode finds what it reaches, and compiles: the SDK waits for 100 ms and no longer.

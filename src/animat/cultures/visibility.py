@@ -55,7 +55,7 @@ class Visibility:
         rng = np.random.default_rng([seed, 11])
         n = len(x_um)
         self.array = array
-        self.amplitude_uv = np.clip(110.0 * rng.lognormal(0.0, 0.4, n), 60.0, 300.0)
+        self.amplitude_uv = amplitudes_at_soma_uv(rng, n)
         draw = rng.standard_normal((2, n))
         self.trough_to_peak_ms = np.clip(
             np.where(is_excitatory, 0.45 + 0.06 * draw[0], 0.25 + 0.05 * draw[0]), 0.12, 0.8
@@ -125,3 +125,8 @@ class Visibility:
         neuron = np.nonzero(seen)[0]
         order = np.lexsort((neuron, electrode))
         return Pairs(electrode[order], neuron[order], distance_um[seen][order])
+
+
+def amplitudes_at_soma_uv(rng: np.random.Generator, neurons: int) -> Float64[np.ndarray, " neurons"]:
+    """Size of each neuron's spikes on an electrode at its soma: log-normal about 110 uV, between 60 and 300 uV."""
+    return np.clip(110.0 * rng.lognormal(0.0, 0.4, neurons), 60.0, 300.0)
