@@ -80,7 +80,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[int, SimulatorTim
 def test_policies_are_as_good_as_the_limit_allows(
     robot: Cartpole | Navigation, mapping: str, recorded: dict[int, SimulatorTimeline], tmp_path: Path
 ) -> None:
-    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (limit - random)."""
+    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (limit - random).
+
+    None of the cultures makes up for another by more than the 0.01 that other seeds of training move a score.
+    """
     scores = []
     for seed, timeline in recorded.items():
         length = robot.paper_iterations
@@ -94,3 +97,4 @@ def test_policies_are_as_good_as_the_limit_allows(
         limit = best_return(environment, simulator, episodes=0).value
         scores.append((trained - random) / (limit - random))
     assert np.mean(scores) >= 0.97, scores
+    assert min(scores) >= 0.96, scores
