@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.cl1_delivery import Delivery
+from animat.cultures.cl1_delivery import FRAMES_PER_S, LEAD_US, Delivery
 from animat.cultures.failing import as_device_failure, in_words
 from animat.cultures.history import History
 from animat.cultures.observed import Observed, Spikes
@@ -32,9 +32,6 @@ NO_STIMULATION = {0: "ground", 4: "reference", 7: "ground", 56: "ground", 63: "g
 """Channels that are no stimulation electrodes, and what they are. The SDK says nothing of a stimulus on them: version
 1.0.0 leaves the ground channels out in silence, and its simulator does as if the reference could stimulate."""
 SITES = tuple(channel for channel in range(CHANNELS) if channel not in NO_STIMULATION)
-FRAMES_PER_S = 25_000
-LEAD_US = 80
-"""The shortest time from a command to its pulse."""
 HAND_OVER_S = 0.5
 """How long a stop waits for a pulse that is being handed over."""
 STIMULUS_STREAM = "animat_stimuli"

@@ -17,8 +17,8 @@ from animat.recordings.stimulus import Pulse, Stimulus
 
 FRAMES_PER_S = 25_000
 LEAD_US = 80
-LEAD_FRAMES = 2
-"""80 us from the command to the pulse."""
+"""The shortest time from a command to its pulse."""
+LEAD_FRAMES = LEAD_US * FRAMES_PER_S // 1_000_000
 AHEAD_FRAMES = 2_500
 """Pulses are handed to the device up to 100 ms before their time: the computer may fall behind by as much, and no
 more than that has to be taken back when all is stopped."""

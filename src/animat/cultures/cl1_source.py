@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int16
 
-from animat.cultures.cl1 import CHANNELS, FRAMES_PER_S, NO_STIMULATION
+from animat.cultures.cl1 import CHANNELS, NO_STIMULATION
+from animat.cultures.cl1_delivery import FRAMES_PER_S
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
 from animat.cultures.virtual import WARM_UP_S
 from animat.cultures.visibility import amplitudes_at_soma_uv
