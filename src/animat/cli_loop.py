@@ -404,10 +404,9 @@ def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
     Where the culture `is_recording` first, a recording of a run that failed must not be there: each costs a living
     culture some thousand pulses.
     """
-    from animat.closed_loop.session import expect_no_session
+    from animat.closed_loop.session import expect_no_file, expect_no_session
 
-    if folder.exists() and not folder.is_dir():
-        raise InvalidArgument(f"--out: expected a folder for the session, got a file: {folder}")
+    expect_no_file(folder, "the session")
     with alone_in(folder):
         expect_no_session(folder)
         if is_recording and (there := folder / CALIBRATION_FILE).exists():

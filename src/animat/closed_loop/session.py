@@ -212,6 +212,12 @@ def read_session(path: str | os.PathLike[str]) -> Session:
     return Session(file.parent, log, ending)
 
 
+def expect_no_file(folder: Path, what: str) -> None:
+    """Raise InvalidArgument if a file is in the place of a folder for something."""
+    if folder.exists() and not folder.is_dir():
+        raise InvalidArgument(f"{folder}: expected a folder for {what}, got a file")
+
+
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
     """Raise unless a folder can take a new session; says what can be done with one that is there. Makes the folder.
 
@@ -220,8 +226,7 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
         InvalidFile: if the folder cannot be made or written to.
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InvalidArgument(f"{folder}: expected a folder for the session, got a file")
+    expect_no_file(folder, "the session")
     if (folder / LOG_FILE).exists():
         told = (
             ""

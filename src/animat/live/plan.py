@@ -13,7 +13,7 @@ import numpy as np
 
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import LOG_FILE as SESSION_LOG
-from animat.closed_loop.session import RECORDING_FILE
+from animat.closed_loop.session import RECORDING_FILE, expect_no_file
 from animat.errors import InvalidArgument, Mismatch
 from animat.mapping import N_PERCENTILES
 from animat.neurons.conditions import Condition
@@ -97,8 +97,7 @@ def check_plan(
         "patterns": protocol.patterns,
     } | of_the_loop
     Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **given)
-    if folder.exists() and not folder.is_dir():
-        raise InvalidArgument(f"--out: expected a folder for the live run, got a file: {folder}")
+    expect_no_file(folder, "the live run")
     if folder.exists() and any(each.name != LOCK for each in folder.iterdir()):
         stands = what_stands(folder) or "one with files"
         raise Mismatch(f"{folder}: expected an empty folder for a live run, got {stands}: choose another")
