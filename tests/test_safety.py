@@ -284,7 +284,7 @@ def test_an_emergency_stop_refuses_everything_until_a_new_session() -> None:
 
 def test_only_a_guard_admits() -> None:
     with pytest.raises(InvalidArgument, match="expected to be made by a Guard"):
-        Admitted([one()], by=None)
+        Admitted([one()], 0.0, by=None)
 
 
 def test_limits_that_cannot_be_are_refused() -> None:

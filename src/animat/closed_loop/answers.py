@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 from jaxtyping import Float64
 
@@ -13,6 +15,7 @@ def wrong_with(
     *,
     asked_s: Float64[np.ndarray, " stimuli"],
     duration_s: float,
+    since_s: float,
     from_s: float,
     sample_s: float,
     n_channels: int,
@@ -21,8 +24,9 @@ def wrong_with(
 
     Args:
         observed: the answer.
-        asked_s: times of the stimuli, counted from when they were asked for: none can begin before.
-        duration_s: that was asked for.
+        asked_s: times of the stimuli, counted from `since_s`: none can begin before.
+        duration_s: that was asked for: it is seen up to then at least.
+        since_s: when it was asked for, on the culture's clock.
         from_s: the soonest time on the culture's clock that it can begin at.
         sample_s: of the culture; times may be rounded to whole ones.
         n_channels: of the culture.
@@ -34,16 +38,19 @@ def wrong_with(
             return f"the culture answered {len(times_s)} spike times for {len(channel)} channels"
         if pulses_s.shape != asked_s.shape:
             return f"the culture answered {pulses_s.shape} stimulus times for {len(asked_s)} stimuli"
-        if not (np.isfinite(start_s) and np.isfinite(seen_s) and seen_s >= duration_s - 1e-6):
-            return f"the culture answered a stretch of {seen_s} s from {start_s} s where {duration_s} s were asked"
         if start_s < from_s - 1.5 * sample_s:
             return f"the culture's clock went back to {start_s} s"
+        if not (isfinite(start_s) and isfinite(seen_s) and start_s + seen_s >= since_s + duration_s - 1e-6):
+            asked = f"{duration_s} s from {since_s} s"
+            return f"the culture answered a stretch of {seen_s} s from {start_s} s where {asked} were asked"
         for name, given_s in (("spike", times_s), ("stimulus", pulses_s)):
             # Not (a <= b): a NaN fails it too.
             if len(given_s) and not (given_s[0] >= -1e-9 and given_s[-1] <= seen_s + 1e-9):
                 return f"the culture answered {name} times outside of the {seen_s:g} s that were seen"
             if not bool((given_s[1:] >= given_s[:-1]).all()):
                 return f"the culture answered {name} times that are no rising numbers"
+        # From when the answer starts.
+        asked_s = asked_s - (start_s - since_s)
         if bool((pulses_s < asked_s - 1.5 * sample_s).any()):
             early_ms = 1000 * float((asked_s - pulses_s).max())
             return f"the culture answered that a stimulus came {early_ms:.3g} ms before it was asked for"

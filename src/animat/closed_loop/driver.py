@@ -109,7 +109,7 @@ class Driver:
         self._begun[contender.name] += 1
         observation = self._body.reset()
         self._last_command = 0.0
-        self._see((), loop.pause_s, pause=True)
+        self._see((), loop.pause_s, self._now_s(), pause=True)
         if self._following is not None and self._following.seen:
             # Between episodes only: within one the robot's world stays as it is, and no tick pays for it.
             self._percentiles = self._following.percentiles()
@@ -152,7 +152,7 @@ class Driver:
         loop = self._loop
         frequency_hz = loop.conditions[delivered].value
         due_s = self._last_pulse_s + 1 / frequency_hz
-        times_s = self._times(due_s, frequency_hz)
+        since_s, times_s = self._times(due_s, frequency_hz)
         stimuli: list[Stimulus] = []
         if contender.delivery != "silent":
             stimuli = [
@@ -162,7 +162,7 @@ class Driver:
         # Two samples more than the window: no spike at its very end can then be seen only in the next stretch.
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
         decided_s = self._clock.now_s() - self._data_at_s
-        stretch = self._see(stimuli, duration_s)
+        stretch = self._see(stimuli, duration_s, since_s)
         pulse_time_s = stretch.stimulus_time_s
         if not stimuli:
             pulse_time_s = self._on_samples(stretch.asked_at_s + times_s)
@@ -238,15 +238,18 @@ class Driver:
             "truncated": iteration + 1 >= loop.robot.episode_limit and not moved.terminated,
         }
 
-    def _times(self, due_s: float, frequency_hz: float) -> Float64[np.ndarray, " pulses"]:
-        """When the pulses of a presentation come, counted from now; its first one is due at a time of the culture's."""
+    def _times(self, due_s: float, frequency_hz: float) -> tuple[float, Float64[np.ndarray, " pulses"]]:
+        """The culture's clock, and when the pulses of a presentation come after that; the first one is due at `due_s`.
+
+        All that it takes to ask for them from here on is counted: they come when they are due, not later by that.
+        """
         now_s = self._now_s()
         first_s = max(due_s - now_s, 0.0)
         if self._loop.real_time:
             # A culture that is held back to real time stands still meanwhile: what is missed has to be made up.
             behind_s = self._clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
             first_s = max(first_s, behind_s)
-        return on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
+        return now_s, on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
 
     def _deal(self) -> list[int]:
         """A pattern for each pulse, all different where there are enough, from a deck that is shuffled when empty."""
@@ -258,8 +261,8 @@ class Driver:
             hand.append(self._deck.pop(place))
         return hand
 
-    def _see(self, stimuli: Sequence[Stimulus], duration_s: float, pause: bool = False) -> Stretch:
-        """Deliver, watch, and check what came back; a pause is written down here."""
+    def _see(self, stimuli: Sequence[Stimulus], duration_s: float, since_s: float, pause: bool = False) -> Stretch:
+        """Deliver, watch, and check what came back; times count from `since_s`; a pause is written down here."""
         if self.is_stopped:
             raise Stop(Ending("person", "stopped by a person"))
         culture, account = self._culture, self._account
@@ -267,14 +270,14 @@ class Driver:
             account.check(stimuli)
         except BudgetSpent as spent:
             raise Stop(Ending("budget", str(spent))) from spent
-        asked = Asked(self._stretches, self._now_s() - self._zero_s, tuple(stimuli))
+        asked = Asked(self._stretches, since_s - self._zero_s, tuple(stimuli))
         self._stretches += 1
         # Spent from now on: whether pulses that are never answered came is not known.
         account.spend(stimuli)
         before, self.under_way = culture.delivered, asked
         self._expect("the culture", duration_s)
         try:
-            observed = culture.deliver(stimuli, duration_s)
+            observed = culture.deliver(stimuli, duration_s, since_s=since_s)
         except Exception as error:
             is_admitted = culture.delivered > before
             if not is_admitted:
@@ -287,6 +290,7 @@ class Driver:
             observed,
             asked_s=np.array([stimulus.time_s for stimulus in stimuli], np.float64),
             duration_s=duration_s,
+            since_s=since_s,
             from_s=self._zero_s + self._seen_until_s,
             sample_s=1 / self._rate_hz,
             n_channels=len(self._channels),

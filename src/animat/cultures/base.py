@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from inspect import getattr_static
 from types import TracebackType
 from typing import Any, ClassVar, Self, final
@@ -105,7 +106,7 @@ class Culture(abc.ABC):
 
     @abc.abstractmethod
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
-        """Deliver stimuli, let `duration_s` pass from now, and say what was seen."""
+        """Deliver stimuli at their times after `admitted.now_s`, let `duration_s` pass, and say what was seen."""
 
     @abc.abstractmethod
     def _rest(self, duration_s: float) -> None:
@@ -208,16 +209,22 @@ class Culture(abc.ABC):
             self._halt()
 
     @final
-    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float) -> Observed:
+    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float, *, since_s: float | None = None) -> Observed:
         """Deliver stimuli within the next `duration_s` and observe all channels meanwhile.
 
+        A living culture's clock goes on while a program decides what to ask for. Who counted times from a reading of it
+        hands that over as `since_s`: what has passed since then is taken off, and stimuli come when they are due and
+        not later by that. Where the first one's time is past, it comes now and the others as long after it as asked.
+
         Args:
-            stimuli: in the order of time, counted from now.
+            stimuli: in the order of time, counted from now, or from `since_s`.
             duration_s: how long, zero or more; all stimuli begin within.
+            since_s: a reading of `now_s`; None: now.
 
         Raises:
             UnsafeStimulus: naming the limit that one of them exceeds; nothing is then delivered, and no time passes.
-            InvalidArgument: for a culture that is not open, or stimuli outside this stretch of time.
+            InvalidArgument: for a culture that is not open, stimuli outside this stretch of time, or a `since_s` that
+                the clock has not come to.
             DeviceFailed: if the device fails meanwhile; whether what was asked for was delivered is then not known.
         """
         guard = self._opened()
@@ -228,7 +235,10 @@ class Culture(abc.ABC):
                 f"stimuli: expected times before the delivery ends ({duration_s:g} s), got {outside[0].time_s:g} s"
             )
         with as_device_failure(self.name, "deliver"):
-            return self._deliver(guard.admit(stimuli, self.now_s), duration_s)
+            now_s = self.now_s
+            if since_s is not None and since_s != now_s:
+                stimuli, duration_s = _counted_from(now_s, stimuli, duration_s, since_s)
+            return self._deliver(guard.admit(stimuli, now_s), duration_s)
 
     @final
     def advance(self, duration_s: float) -> Spikes:
@@ -389,3 +399,14 @@ _FINAL = tuple(
 def _check_duration(name: str, duration_s: float) -> None:
     if not 0 <= duration_s < float("inf"):
         raise InvalidArgument(f"{name}: expected finite seconds from 0, got {duration_s}")
+
+
+def _counted_from(
+    now_s: float, stimuli: Sequence[Stimulus], duration_s: float, since_s: float
+) -> tuple[list[Stimulus], float]:
+    """Stimuli and a duration that were counted from a time before, counted from now; what is past begins now."""
+    if not since_s <= now_s:
+        raise InvalidArgument(f"since_s: expected a reading of the clock, which is at {now_s:g} s, got {since_s}")
+    # All by as much, so that times between stimuli are as they were asked for. What is before 0 is for the guard.
+    passed_s = min(now_s - since_s, max(0.0, stimuli[0].time_s) if stimuli else duration_s)
+    return [replace(each, time_s=each.time_s - passed_s) for each in stimuli], duration_s - passed_s

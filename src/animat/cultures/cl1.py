@@ -224,7 +224,10 @@ class CL1Culture(Culture):
         assert self._delivery is not None
         try:
             start, stop, frame, channel, begun = self._delivery.run(
-                admitted.stimuli, duration_s, is_halted=self._halted.is_set
+                admitted.stimuli,
+                duration_s,
+                since=round(admitted.now_s * FRAMES_PER_S),
+                is_halted=self._halted.is_set,
             )
         except BaseException as error:
             told = "what had not begun was interrupted"

@@ -60,8 +60,14 @@ class Delivery:
         self._keep, self._lock = keep, lock
         self._designs: dict[Pulse, Any] = {}
 
-    def run(self, stimuli: Sequence[Stimulus], duration_s: float, *, is_halted: Callable[[], bool]) -> Ran:
+    def run(self, stimuli: Sequence[Stimulus], duration_s: float, *, since: int, is_halted: Callable[[], bool]) -> Ran:
         """Deliver, and read until `duration_s` after the start, and as much longer as the stimuli began late.
+
+        Args:
+            stimuli: in the order of time.
+            duration_s: of reading, which starts when the loop does.
+            since: frame that times of stimuli count from: no later than the start.
+            is_halted: whether to hand over nothing more.
 
         Returns:
             First frame, frame after the last, frames and channels of the spikes, and the frame each stimulus began at.
@@ -69,7 +75,7 @@ class Delivery:
         Raises:
             DeviceFailed: if it was stopped half way, or a pulse never came.
         """
-        waiting, asked = deque(stimuli), [round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
+        waiting, asked = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
         handed: list[int] = []
         frames, channels, reported = [], [], defaultdict[int, deque[int]](deque)
         late, start, stop = 0, None, 0
@@ -83,12 +89,12 @@ class Delivery:
             for pulse in sorted(found.stims, key=lambda pulse: pulse.timestamp):
                 reported[pulse.channel].append(pulse.timestamp)
             self._check_going(is_halted, len(handed), len(stimuli))
-            while waiting and start + asked[len(handed)] + late < stop + AHEAD_FRAMES:
+            while waiting and asked[len(handed)] + late < stop + AHEAD_FRAMES:
                 # A stop from another thread comes before a hand-over, which then is none, or after, and takes it back.
                 with self._lock:
                     self._check_going(is_halted, len(handed), len(stimuli))
-                    frame = self._hand_over(waiting.popleft(), start + asked[len(handed)] + late)
-                late = frame - start - asked[len(handed)]
+                    frame = self._hand_over(waiting.popleft(), asked[len(handed)] + late)
+                late = frame - asked[len(handed)]
                 handed.append(frame)
             end = start + int(np.ceil(duration_s * FRAMES_PER_S)) + late
             if not waiting and stop >= max(end, handed[-1] + 1 if handed else 0):

@@ -99,15 +99,39 @@ class CultureContract(abc.ABC):
     def test_a_stimulus_is_delivered_when_it_was_asked_for(self) -> None:
         with self.make_culture() as culture:
             stimuli = [self.stimulus(culture, 0.01), self.stimulus(culture, 0.11)]
+            before_s = culture.now_s
             observed = culture.deliver(stimuli, 0.2)
             assert observed.stimulus_time_s.shape == (2,)
-            assert np.all(observed.stimulus_time_s >= np.array([0.01, 0.11]) - 1e-9)
+            began_s = observed.start_s + observed.stimulus_time_s
+            assert np.all(began_s >= before_s + np.array([0.01, 0.11]) - 1e-9)
             assert observed.stimulus_time_s[1] <= observed.duration_s
             assert culture.delivered == 2
             recording = culture.present([self.stimulus(culture)], until_ms=12.0)
             assert recording.duration_s >= recording.stimuli.time_s[-1] + 0.012 - 1e-9
             if not np.isnan(self.frequencies_hz[0]):
                 assert recording.stimuli.frequency_hz.tolist() == [self.frequencies_hz[0]]
+
+    def test_times_can_be_counted_from_a_reading_of_its_clock(self) -> None:
+        with self.make_culture() as culture:
+            since_s = culture.now_s
+            culture.rest(0.03)
+            times_s = np.array([0.1, 0.2])
+            observed = culture.deliver([self.stimulus(culture, t) for t in times_s.tolist()], 0.3, since_s=since_s)
+            late_s = observed.start_s + observed.stimulus_time_s - (since_s + times_s)
+            assert np.all(late_s >= -1e-9)
+            assert observed.start_s + observed.duration_s >= since_s + 0.3 - 1e-9
+            if self.is_repeatable:
+                # Other programs do not make its time pass: no more is late than a sample's rounding.
+                assert np.all(late_s <= 1 / culture.sampling_rate_hz + 1e-9)
+            # The first one's time is past, and the other's too: it comes as long after the first as was asked for.
+            again = culture.deliver([self.stimulus(culture, t) for t in times_s.tolist()], 0.3, since_s=since_s)
+            assert again.start_s >= observed.start_s + observed.duration_s - 1e-9
+            assert again.stimulus_time_s[1] - again.stimulus_time_s[0] >= 0.1 - 1e-9
+            assert culture.delivered == 4
+            assert culture.deliver((), 0.3, since_s=since_s).duration_s <= 0.1
+            ahead_s = culture.now_s + 60.0
+            _expect(InvalidArgument, lambda: culture.deliver((), 0.1, since_s=ahead_s))
+            _expect(InvalidArgument, lambda: culture.deliver((), 0.1, since_s=float("nan")))
 
     def test_outside_its_limits_nothing_is_delivered_and_no_time_passes(self) -> None:
         with self.make_culture() as culture:

@@ -16,7 +16,6 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.writing import alone_in
 
-
 _MAY_DIFFER = ("stimulation_units",)
 """What a device tells of itself that can be otherwise when it is opened anew, and makes no other culture of it."""
 

@@ -217,14 +217,14 @@ class MaxOneCulture(Culture):
         stream, sequences, pace = self._streaming(), self._sequences, self._pace
         assert sequences is not None and pace is not None
         halted = self._halted
+        # Spikes are kept by the stream: it starts when stimuli were asked for, however long sequences take to make.
+        start, late = self._zero_frame + round(admitted.now_s * FRAMES_PER_S), 0
         groups = _groups(admitted.stimuli, self._sequence_s)
         made = [sequences.of(group) for group in groups]
-        start, late = stream.frame(), 0
         begun: list[int] = []
         for group, sequence in zip(groups, made, strict=True):
             asked = start + round(group[0].time_s * FRAMES_PER_S) + late
             relative = from_zero(group)
-            stream.wait(asked - INITIAL_DELAY)
             soonest = max(asked, stream.frame() + INITIAL_DELAY)
             soonest = round(pace.soonest(relative, soonest / FRAMES_PER_S) * FRAMES_PER_S)
             stream.wait(soonest - INITIAL_DELAY)

@@ -146,15 +146,16 @@ class Admitted:
     """Stimuli that passed a guard: the only thing a backend is given to deliver, and only a guard makes them.
 
     Attributes:
-        stimuli: in the order of time, counted from the start of the delivery.
+        stimuli: in the order of time, counted from `now_s`.
+        now_s: the culture's clock when they were admitted; a clock that runs is past that when a backend sees them.
     """
 
-    __slots__ = ("stimuli",)
+    __slots__ = ("now_s", "stimuli")
 
-    def __init__(self, stimuli: Sequence[Stimulus], *, by: object) -> None:
+    def __init__(self, stimuli: Sequence[Stimulus], now_s: float, *, by: object) -> None:
         if by is not _MAY_ADMIT:
             raise InvalidArgument("Admitted: expected to be made by a Guard, which checks stimuli; use Culture.deliver")
-        self.stimuli = tuple(stimuli)
+        self.stimuli, self.now_s = tuple(stimuli), now_s
 
 
 class Guard:
@@ -218,7 +219,7 @@ class Guard:
         events = self._examine(stimuli, now_s)
         self._history.add(events, round(now_s * NS))
         self._delivered += len(events)
-        return Admitted(stimuli, by=_MAY_ADMIT)
+        return Admitted(stimuli, now_s, by=_MAY_ADMIT)
 
     def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> list[Event]:
         limits = self.limits

@@ -1,0 +1,95 @@
+"""A closed loop on devices whose clock goes on while the program works: pulses come when they are due all the same."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stand_in_cl
+import stand_in_maxlab
+from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.closed_loop.session import Session
+from animat.cultures.base import Culture
+from animat.cultures.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.maxone import MaxOneCulture
+from animat.mapping import Thresholds
+from animat.neurons.conditions import Condition
+from animat.recordings.array import MAXONE
+from animat.recordings.patterns import draw_patterns
+from animat.recordings.selection import Selection
+from animat.recordings.stimulus import BALANCED_PULSE, Pulse
+from animat.robots import Navigation
+
+HZ = (5.0, 20.0)
+
+
+def loop_at(tmp_path: Path, culture: Culture, pulse: Pulse, chosen: int) -> Session:
+    loop = Loop(
+        robot=Navigation(episode_limit=10),
+        mapping=Thresholds(9),
+        conditions=tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ),
+        percentiles=np.linspace(0.0, 125.0, 11),
+        pulses=5,
+        pulse=pulse,
+        pause_s=0.1,
+        on_late="stop",
+    )
+    with culture:
+        return run_session(culture, loop, [Contender("one", "", OneCondition(chosen))], tmp_path, episodes=2)
+
+
+def assert_in_time(session: Session, chosen: int, frame_s: float) -> None:
+    assert session.ending.by == "plan", session.ending.sentence
+    ticks = session.ticks
+    assert len(ticks) == 20
+    assert [tick.late_s for tick in ticks] == [0.0] * 20
+    for episode in (0, 1):
+        times_s = np.concatenate([tick.pulse_time_s for tick in ticks if tick.episode == episode])
+        np.testing.assert_allclose(np.diff(times_s), 1 / HZ[chosen], atol=1.5 * frame_s)
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_a_cl1_is_in_time(tmp_path: Path, chosen: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    neurons = stand_in_cl.install(monkeypatch)
+    read = neurons.timestamp
+
+    def running() -> int:
+        frame = read()
+        # 3 ms go by until somebody does something with it.
+        neurons.now += 0 if neurons.in_loop else 75
+        return frame
+
+    monkeypatch.setattr(neurons, "timestamp", running)
+    assert_in_time(loop_at(tmp_path, CL1Culture(), CL1_PULSE, chosen), chosen, 1 / 25_000)
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_a_maxone_is_in_time_however_long_its_sequences_take_to_make(
+    tmp_path: Path, chosen: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = stand_in_maxlab.install(monkeypatch)
+
+    class Running(stand_in_maxlab.Stream):
+        def frame(self) -> int:
+            rig.now += 1
+            return rig.now - 1
+
+    vendor = sys.modules["maxlab"].Sequence
+    append = vendor.append
+
+    def slowly(sequence: Any, command: Any) -> None:
+        # Some 90 commands make the five pulses of an action: over 100 ms at 5 Hz, 9 ms at 20 Hz.
+        rig.now += (25, 2)[chosen]
+        append(sequence, command)
+
+    monkeypatch.setattr(vendor, "append", slowly)
+    sites = np.array([(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)])
+    selection = Selection(MAXONE, np.arange(13_000, 13_050), sites, draw_patterns(MAXONE, sites, seed=1))
+    culture = MaxOneCulture(selection, stream=Running(rig), settle=False)
+    assert_in_time(loop_at(tmp_path, culture, BALANCED_PULSE, chosen), chosen, 1 / 20_000)
