@@ -309,16 +309,43 @@ def _on_another_array() -> Selection:
 @pytest.mark.parametrize(("layout", "size"), [(EVENT_24, 24), (EVENT_16, 16)])
 def test_messages_of_the_stream_in_both_versions(layout: np.dtype, size: int) -> None:
     assert layout.itemsize == size
-    stream = ZmqSpikes(event_bytes=size)
-    spikes = np.zeros(2, layout)
-    spikes["frame"], spikes["channel"] = [41, 42], [1023, 5]
-    stream.hear([np.uint64(42).tobytes(), b"", spikes.tobytes()])
+    stream = ZmqSpikes()
+    # Six spikes of 16 bytes are as long as four of 24.
+    for count in (2, 6, 3, 1):
+        spikes = np.zeros(count, layout)
+        spikes["frame"], spikes["channel"], spikes["amplitude"] = 41, np.arange(count) * 170 + 5, -30.5
+        stream.hear([np.uint64(42).tobytes(), b"", spikes.tobytes()])
+        frames, channels = stream.take(0, 100)
+        assert (frames.tolist(), channels.tolist()) == ([41] * count, list(range(5, 5 + 170 * count, 170)))
     stream.hear([np.uint64(45).tobytes(), b""])
     assert (stream.frame(), stream.lost_frames) == (45, 2)
-    frames, channels = stream.take(0, 100)
-    assert (frames.tolist(), channels.tolist()) == ([41, 42], [1023, 5])
-    with pytest.raises(DeviceFailed, match="is event_bytes that of this version"):
-        stream.hear([np.uint64(46).tobytes(), b"", b"123"])
+
+
+@pytest.mark.parametrize("layout", [EVENT_24, EVENT_16])
+def test_a_message_that_is_laid_out_in_no_known_way_is_refused(layout: np.dtype) -> None:
+    stream = ZmqSpikes()
+    spike = np.zeros(1, layout)
+    spike["frame"], spike["channel"] = 100_000, 5
+    stream.hear([np.uint64(100_000).tobytes(), b"", spike.tobytes()])
+    for name, value in (("channel", 1024), ("frame", 70_000), ("frame", 2**63)):
+        bad = spike.copy()
+        bad[name] = value
+        with pytest.raises(DeviceFailed, match="of frame 100001 on amplifiers 0 to 1023, of 24 or 16 bytes each"):
+            stream.hear([np.uint64(100_001).tobytes(), b"", bad.tobytes()])
+    with pytest.raises(DeviceFailed, match="got 3 bytes that are neither"):
+        stream.hear([np.uint64(100_001).tobytes(), b"", b"123"])
+    with pytest.raises(DeviceFailed, match="a frame's number in 8 bytes, got 3"):
+        stream.hear([b"123"])
+    assert stream.take(0, 2**62)[0].tolist() == [100_000]
+
+
+def test_spikes_on_amplifiers_that_are_none_are_refused(rig: Rig) -> None:
+    for channel in (-1, 1024):
+        stream = Stream(rig)
+        with MaxOneCulture(selection(), stream=stream, settle=False) as culture:
+            stream.extra = [(rig.now + 20, channel)]
+            with pytest.raises(DeviceFailed, match=f"amplifiers 0 to 1023, got one on {channel}"):
+                culture.advance(0.1)
 
 
 def test_the_stream_hears_a_server() -> None:

@@ -18,7 +18,7 @@ from animat.cultures.base import Culture
 from animat.cultures.failing import in_words
 from animat.cultures.history import History
 from animat.cultures.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
-from animat.cultures.maxone_stream import SpikeStream, ZmqSpikes
+from animat.cultures.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
 from animat.cultures.maxone_wiring import Wiring, wire
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace, from_zero
@@ -247,6 +247,9 @@ class MaxOneCulture(Culture):
         stop = max(start + int(np.ceil(duration_s * FRAMES_PER_S)) + late, stream.frame() if duration_s else start)
         stream.wait(stop)
         frames, amplifiers = stream.take(start, stop)
+        if len(amplifiers) and not 0 <= amplifiers.min() <= amplifiers.max() < AMPLIFIERS:
+            strange = amplifiers[(amplifiers < 0) | (amplifiers >= AMPLIFIERS)][0]
+            raise DeviceFailed(f"MaxOne: expected spikes on amplifiers 0 to {AMPLIFIERS - 1}, got one on {strange}")
         row = self._wired().row_of[amplifiers]
         self.spikes_not_recorded += int(np.count_nonzero(row == UNKNOWN))
         frames, row = frames[row != UNKNOWN], row[row != UNKNOWN]

@@ -10,16 +10,20 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Int64
 
+from animat.cultures.failing import in_words
 from animat.errors import DeviceFailed
 
 ADDRESS = "tcp://localhost:7205"
 """The filtered stream, in which the server detects spikes: one message a frame."""
 PATIENCE_S = 2.0
 KEPT_SPIKES = 5_000_000
+AMPLIFIERS = 1024
+NEAR_FRAMES = 20_000
+"""How far the frame of a spike may be from that of its message, a second: read by a wrong layout it is anywhere."""
 FRAME = np.dtype("<u8")
 EVENT_24 = np.dtype([("pad", "V7"), ("well", "u1"), ("frame", "<u8"), ("channel", "<i4"), ("amplitude", "<f4")])
 EVENT_16 = np.dtype([("frame", "<u8"), ("amplitude", "<f4"), ("channel", "<u2"), ("well", "u1"), ("pad", "V1")])
-"""A spike in servers up to and after version 24.1."""
+"""A spike in the servers of version 24.1; in others, as far as is known, it is the other one: a message tells which."""
 
 
 class SpikeStream(Protocol):
@@ -51,23 +55,23 @@ class SpikeStream(Protocol):
 class ZmqSpikes:
     """The stream of MaxLab Live's server through ZeroMQ (the package pyzmq), read by a thread.
 
-    A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame.
+    A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame. How
+    spikes are laid out depends on the server's version, and is seen from them: their frames are near the message's.
     Frames that were lost on the way are counted in `lost_frames`.
 
     Args:
         address: of the server.
-        event_bytes: how long a spike is in this version of the server, 24 or 16.
     """
 
-    def __init__(self, address: str = ADDRESS, *, event_bytes: int = 24) -> None:
+    def __init__(self, address: str = ADDRESS) -> None:
         self._address = address
-        self._event = {24: EVENT_24, 16: EVENT_16}[event_bytes]
+        self._layouts = [EVENT_24, EVENT_16]
         self._spikes: deque[tuple[int, int]] = deque(maxlen=KEPT_SPIKES)
         self._frame = -1
         self._came_s = 0.0
         self._thread: threading.Thread | None = None
         self._going = threading.Event()
-        self._failed: str | None = None
+        self._failed: Exception | None = None
         self.lost_frames = 0
 
     def start(self) -> None:
@@ -100,11 +104,14 @@ class ZmqSpikes:
     def wait(self, frame: int) -> None:
         """Sleep until it came, in pieces of a tenth of a millisecond."""
         while self._frame < frame:
-            if self._failed is not None or time.monotonic() - self._came_s > PATIENCE_S:
+            failed = self._failed
+            if isinstance(failed, DeviceFailed):
+                raise DeviceFailed(str(failed)) from failed
+            if failed is not None or time.monotonic() - self._came_s > PATIENCE_S:
+                got = "none any more" if failed is None else in_words(failed)
                 raise DeviceFailed(
-                    f"MaxOne: expected frames from {self._address}, got {self._failed or 'none any more'}: is MaxLab "
-                    "Live's server running?"
-                )
+                    f"MaxOne: expected frames from {self._address}, got {got}: is MaxLab Live's server running?"
+                ) from failed
             time.sleep(1e-4)
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
@@ -136,25 +143,36 @@ class ZmqSpikes:
                         continue
                     self.hear(parts)
         except Exception as error:
-            self._failed = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            self._failed = error
 
     def hear(self, parts: list[bytes]) -> None:
         """Take in one message.
 
         Raises:
-            DeviceFailed: for one that is not laid out as the version says.
+            DeviceFailed: for one that is laid out as in no version that is known.
         """
         if len(parts[0]) != FRAME.itemsize:
             raise DeviceFailed(f"MaxOne: expected a frame's number in 8 bytes, got {len(parts[0])}")
         number = int(np.frombuffer(parts[0], FRAME)[0])
         if len(parts) > 2 and parts[2]:
-            if len(parts[2]) % self._event.itemsize:
-                raise DeviceFailed(
-                    f"MaxOne: expected spikes of {self._event.itemsize} bytes, got {len(parts[2])} bytes: is "
-                    "event_bytes that of this version of the server?"
-                )
-            spikes = np.frombuffer(parts[2], self._event)
-            self._spikes.extend(zip(spikes["frame"].tolist(), spikes["channel"].tolist(), strict=True))
+            self._spikes.extend(self._read(parts[2], number))
         if self._frame >= 0 and number > self._frame + 1:
             self.lost_frames += number - self._frame - 1
         self._frame, self._came_s = number, time.monotonic()
+
+    def _read(self, spikes: bytes, number: int) -> list[tuple[int, int]]:
+        """Frames and channels of a message's spikes, by the layout that they have."""
+        for place, layout in enumerate(self._layouts):
+            if len(spikes) % layout.itemsize:
+                continue
+            table = np.frombuffer(spikes, layout)
+            read = list(zip(table["frame"].tolist(), table["channel"].tolist(), strict=True))
+            if all(abs(frame - number) <= NEAR_FRAMES and 0 <= channel < AMPLIFIERS for frame, channel in read):
+                # The next message is of the same server.
+                self._layouts.insert(0, self._layouts.pop(place))
+                return read
+        raise DeviceFailed(
+            f"MaxOne: expected the spikes of frame {number} on amplifiers 0 to {AMPLIFIERS - 1}, of 24 or 16 bytes "
+            f"each, got {len(spikes)} bytes that are neither: this version of MaxLab Live is not known; hand over a "
+            "stream of your own"
+        )

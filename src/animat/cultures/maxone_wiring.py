@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
+from animat.cultures.maxone_stream import AMPLIFIERS
 from animat.errors import DeviceFailed
 from animat.recordings.recording import UNKNOWN, Channels
 from animat.recordings.selection import Selection
 
-AMPLIFIERS = 1024
 UNITS = 32
 
 
