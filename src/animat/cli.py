@@ -15,7 +15,8 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, subcommand
 
 from animat.cli_convert import Convert
 from animat.cli_inspect import Inspect
-from animat.cli_loop import Live, Recover, Run
+from animat.cli_live import Live
+from animat.cli_loop import Recover, Run
 from animat.cli_record import Record
 from animat.cli_studies import Reproduce, StudyFile
 from animat.cli_train import Evaluate, Train

@@ -1,16 +1,17 @@
-"""The commands of the living loop: `run`, `live`, `recover`; part of the command line, thin like the rest of it."""
+"""The commands of the closed loop: `run` and `recover`, and what `live` shares with them."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli_responses import say_findings
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 from animat.writing import alone_in
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from animat.closed_loop.session import Session
     from animat.cultures.base import Culture
     from animat.cultures.budget import Account
-    from animat.live.shadowing import Lived
     from animat.neurons.conditions import Conditions
     from animat.progress import Progress
     from animat.reality_gap import Calibration, RealityGap
@@ -172,11 +172,11 @@ class Run(Stimulating):
         return gap.to_dict()
 
     def _tell(self, gap: RealityGap) -> None:
-        _say(gap.findings)
+        say_findings(gap.findings)
         print(gap.to_text())
         if gap.session.recording_file.is_file():
             print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
-        _expect_no_fault(gap.session, self.out)
+        expect_no_fault(gap.session, self.out)
 
     def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
         from animat.cultures.kinds import culture_of, recorded_culture
@@ -248,130 +248,6 @@ class Run(Stimulating):
 
 
 @dataclass(frozen=True)
-class Live(Stimulating):
-    """Parameter shadowing on one culture while it lives: record, train, refresh, then run in closed loop."""
-
-    robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
-    """The robot to drive"""
-    mapping: Literal["1-threshold", "9-thresholds", "linear"] = "1-threshold"
-    """From responses to motor commands"""
-    policies: int = 5
-    """How many policies, each from its own random numbers"""
-    order: Literal["mixed", "blocked"] = "mixed"
-    """How recordings are presented; mixed is how a closed loop presents"""
-    pulses: int = 5
-    """Pulses a presentation, the last one read"""
-    presentations: int = 100
-    """Of each frequency in a recording"""
-    interval_min: float = 10.0
-    """Minutes of the culture's clock from one recording to the next"""
-    duration_min: float = 60.0
-    """Minutes of the culture's clock that training lasts"""
-    speed: float | None = None
-    """Minutes of the culture's clock in one of ours; default: 30 for a simulated culture, 1 for a living one"""
-    episodes: int = 5
-    """Of each policy in closed loop, at the end"""
-    controls: Literal["all", "random"] = "random"
-    """Run between the policies' episodes"""
-    percentiles: Literal["moving", "first"] = "moving"
-    """The mapping's percentiles move with the simulator, or are held from the first recording"""
-    simulator: Literal["histogram", "empirical"] = "histogram"
-    """histogram: a distribution in bins (the paper); empirical: draw a measured value"""
-    recordings: tuple[Path, ...] = ()
-    """For a replay: what it answers from"""
-    seed: int = 1
-    """Decides every random draw, but what the culture does and when simulators are swapped"""
-    out: Path = Path("live")
-    """Folder for recordings, policies, the session, and live.log"""
-    json: bool = False
-    """End with a line of JSON"""
-
-    def run(self) -> dict[str, Any]:
-        """Live."""
-        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
-        from animat.compilation import keep_compilations
-        from animat.cultures.budget import Account, Budget
-        from animat.cultures.kinds import culture_of, pulse_for
-        from animat.live.plan import Timetable, check_plan
-        from animat.live.shadowing import live
-        from animat.mapping import mapping_named
-        from animat.progress import Bar
-        from animat.recordings.protocol import Protocol
-        from animat.recordings.reading import read_recordings
-        from animat.robots.registry import robot_named
-        from animat.training.specification import Training
-
-        simulated = self.culture in ("virtual", "replay")
-        if self.speed is not None and self.speed != 1 and not simulated:
-            raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
-        if (self.culture == "replay") != bool(self.recordings):
-            raise InvalidArgument(
-                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
-                f"{self.culture}: a live run records the culture itself"
-            )
-        default_speed = 30.0 if simulated else 1.0
-        timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
-        robot = robot_named(self.robot)
-        training = Training(
-            robot,
-            mapping_named(self.mapping),
-            policies=self.policies,
-            iterations=robot.paper_iterations,
-            seed=self.seed,
-            percentiles=self.percentiles,
-        )
-        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
-        protocol = Protocol(
-            order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
-        )
-        settings = {**self._of_the_loop(), "follow": self.thresholds == "follow"}
-        check_plan(training, protocol, self.out, timetable, self.episodes, settings)
-        keep_compilations()
-        recordings = read_recordings(self.recordings) if self.recordings else []
-        seed = 1 if self.culture_seed is None else self.culture_seed
-        with (
-            ExitStack() as told,
-            alone_in(self.out),
-            polite_kill_as_ctrl_c(),
-            Bar("live") as progress,
-            culture_of(
-                self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
-            ) as culture,
-        ):
-            lived = live(
-                training,
-                culture,
-                replace(protocol, patterns=min(100, len(culture.patterns))),
-                self.out,
-                timetable=timetable,
-                episodes=self.episodes,
-                with_controls=self.controls == "all",
-                kind=self.simulator,
-                account=account,
-                progress=progress,
-                **settings,
-            )
-            # It is told even where the culture cannot be closed then.
-            told.callback(self._tell, lived)
-        return lived.to_dict()
-
-    def _tell(self, lived: Lived) -> None:
-        print(
-            f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
-            f"({lived.wall_s:.0f} s of ours); {lived.iterations:,} iterations of each policy, never stopped; "
-            f"{len(lived.swaps)} swaps of simulators:"
-        )
-        for swap in lived.swaps:
-            print(
-                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
-                f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
-            )
-        _say(lived.gap.findings)
-        print(lived.gap.to_text())
-        _expect_no_fault(lived.gap.session, self.out)
-
-
-@dataclass(frozen=True)
 class Recover:
     """Write the recording of a closed-loop session that was killed, from its log."""
 
@@ -429,7 +305,7 @@ def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions |
     return picked if all(set(every) <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None
 
 
-def _expect_no_fault(session: Session, folder: Path) -> None:
+def expect_no_fault(session: Session, folder: Path) -> None:
     """Turn an ending before its time into an error, now that all is told and written."""
     ending = session.ending
     if ending.by == "person":
@@ -438,13 +314,3 @@ def _expect_no_fault(session: Session, folder: Path) -> None:
         raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
     if not session.recording_file.is_file():
         raise InvalidFile(ending.sentence)
-
-
-def _range(members: Sequence[int]) -> str:
-    return f"p{members[0]} to p{members[-1]}" if len(members) > 1 else f"p{members[0]}"
-
-
-def _say(findings: Sequence[Finding]) -> None:
-    for finding in findings:
-        if finding.severity != "note":
-            print(f"warning: {finding.sentence}", file=sys.stderr)
