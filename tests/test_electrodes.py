@@ -153,6 +153,21 @@ def test_every_possible_pattern_is_found_and_one_more_is_too_many() -> None:
         draw_patterns(SMALL, electrodes, patterns=1, size=8, spacing_um=1.0, seed=0)
 
 
+def test_a_draw_that_finds_hardly_any_pattern_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    far = np.array([220 * 25 * i + 25 * j + 1_000 for i in range(4) for j in range(6)])
+    # 33 million sets of up to 24 begin well, and none has 25.
+    with pytest.raises(InvalidArgument, match="24 electrodes make only 0"):
+        draw_patterns(MAXONE, far, size=25, spacing_um=100.0, seed=1)
+    with pytest.raises(InvalidArgument, match="24 electrodes make only 24"):
+        draw_patterns(MAXONE, far, size=23, spacing_um=100.0, seed=1)
+    near = np.array([220 * row + column for row in range(10, 30) for column in range(10, 30)])
+    monkeypatch.setattr("animat.recordings.patterns._MOST_LOOKED_AT", 10_000)
+    with pytest.raises(
+        InvalidArgument, match="among 10,000 beginnings of such sets 0 could be completed: ask for fewer"
+    ):
+        draw_patterns(MAXONE, near, size=25, spacing_um=100.0, seed=1, patterns=1)
+
+
 def test_every_pattern_is_equally_likely() -> None:
     electrodes = np.array([0, 4, 8, 12, 16])
     counts = dict.fromkeys(itertools.combinations(electrodes.tolist(), 2), 0)

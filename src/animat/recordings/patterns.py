@@ -11,6 +11,8 @@ from animat.errors import InvalidArgument
 from animat.recordings.array import ElectrodeArray
 
 _TRIES_A_PATTERN = 200
+_MOST_LOOKED_AT = 2_000_000
+"""Sets of electrodes that are looked at, some seconds, before it is given up to list all that keep the distance."""
 
 
 def draw_patterns(
@@ -38,7 +40,7 @@ def draw_patterns(
         Electrodes of each pattern, rising.
 
     Raises:
-        InvalidArgument: if there are not that many; it says how many there are and what to relax.
+        InvalidArgument: if there are not that many, or too few were found; it says how many and what to relax.
 
     Source: the paper's methods (5 of 32 electrodes, more than 100 um apart, 100 patterns).
     """
@@ -58,27 +60,39 @@ def draw_patterns(
                     break
     if len(found) < patterns:
         # So few keep the distance that chance hardly meets them: there are few enough to list.
-        every = list(_cliques(is_far, size, limit=max(1_000_000, 10 * patterns)))
+        every, is_all = _cliques(is_far, size, limit=max(1_000_000, 10 * patterns))
         if len(every) < patterns:
+            there = f"{len(electrodes)} electrodes make only {len(every)}"
+            if not is_all:
+                there = f"among {_MOST_LOOKED_AT:,} beginnings of such sets {len(every)} could be completed"
             raise InvalidArgument(
                 f"patterns: expected {patterns} different sets of {size} electrodes with every pair more than "
-                f"{spacing_um:g} um apart, but {len(electrodes)} electrodes make only {len(every)}: ask for fewer "
-                "patterns, fewer electrodes in each, a shorter distance, or more stimulation sites"
+                f"{spacing_um:g} um apart, but {there}: ask for fewer patterns, fewer electrodes in each, a shorter "
+                "distance, or more stimulation sites"
             )
         found = dict.fromkeys(every[i] for i in np.sort(rng.choice(len(every), patterns, replace=False)))
     return electrodes[np.array(list(found), dtype=np.int64).reshape(patterns, size)]
 
 
-def _cliques(is_far: Bool[np.ndarray, "electrodes electrodes"], size: int, limit: int) -> list[tuple[int, ...]]:
-    """All sets of `size` that are far from each other, up to `limit` of them."""
+def _cliques(
+    is_far: Bool[np.ndarray, "electrodes electrodes"], size: int, limit: int
+) -> tuple[list[tuple[int, ...]], bool]:
+    """Sets of `size` that are far from each other, up to `limit` of them, and whether those are all."""
     found: list[tuple[int, ...]] = []
     open_sets: list[tuple[tuple[int, ...], np.ndarray]] = [((), np.arange(len(is_far)))]
-    while open_sets and len(found) < limit:
+    looked_at = 0
+    while open_sets:
+        if len(found) == limit or looked_at >= _MOST_LOOKED_AT:
+            return found, False
         chosen, possible = open_sets.pop()
+        looked_at += len(possible)
         if len(chosen) == size:
             found.append(chosen)
             continue
-        for i in possible:
-            later = possible[possible > i]
-            open_sets.append(((*chosen, int(i)), later[is_far[i, later]]))
-    return found
+        for place, i in enumerate(possible.tolist()):
+            later = possible[place + 1 :]
+            later = later[is_far[i, later]]
+            # What has too few left to choose from is no beginning of a set.
+            if len(chosen) + 1 + len(later) >= size:
+                open_sets.append(((*chosen, i), later))
+    return found, True
