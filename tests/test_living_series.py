@@ -22,6 +22,7 @@ from animat.cli import main
 from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
 from animat.cultures.base import Culture
 from animat.cultures.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.kinds import culture_of
 from animat.cultures.living_series import record_living_series
 from animat.cultures.maxone import MaxOneCulture
 from animat.cultures.observed import Observed
@@ -269,3 +270,24 @@ def test_a_hang_up_that_is_ignored_stays_so() -> None:
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_seed_below_0_is_refused_before_a_device_is_touched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stand_in_cl.install(monkeypatch)
+    with FakeCulture() as culture, pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
+        record_living_series(culture, SHORT, tmp_path / "a", sessions=1, seed=-1)
+    assert culture.pulses == 0
+    for make in (
+        lambda: CL1Culture(seed=-1),
+        lambda: ReplayCulture([make_up_recording(1, channels=32)], seed=-1),
+        lambda: culture_of("maxone", seed=-1, selection="x.json"),
+        lambda: culture_of("virtual", seed=-1),
+    ):
+        with pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
+            make()
+    for more in (["--culture", "cl1"], ["--culture", "maxone", "--selection", "x.json"], []):
+        assert main(["record", *more, "--seed", "-1", "--out", str(tmp_path / "a")]) == 1
+        assert capsys.readouterr().err == "animat: --seed: expected 0 or more, got -1\n"
+    assert not (tmp_path / "a").exists()

@@ -59,6 +59,9 @@ class Record:
                 f"--selection: expected a file of electrodes for a maxone and none for others, got {self.selection} "
                 f"for --culture {self.culture}"
             )
+        # Before any device is powered.
+        if self.seed < 0:
+            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         asked = [f"--{name}" for name in ("order", "pulses", "presentations") if getattr(self, name) is not None]
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")

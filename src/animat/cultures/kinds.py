@@ -29,17 +29,20 @@ def culture_of(
 
     Args:
         kind: `"virtual"`, `"replay"`, `"cl1"` or `"maxone"`.
-        seed: which virtual culture; of the draws of a replay; of a CL1's patterns.
+        seed: which virtual culture; of the draws of a replay; of a CL1's patterns. 0 or more.
         state: of a virtual culture, to go on from (`VirtualCulture.save_state`).
         recordings: that a replay answers from.
         selection: file of the electrodes of a MaxOne (`Selection.save`).
         progress: told about a virtual culture's scan.
 
     Raises:
-        InvalidArgument: for another kind, a state or a selection for one that has none, or a MaxOne without one.
+        InvalidArgument: for another kind, a seed below 0, a state or a selection for one that has none, or a MaxOne
+            without one.
         InvalidFile, Mismatch: if the state is damaged, or another culture's.
         DeviceFailed: for a device whose package is not installed.
     """
+    if seed < 0:
+        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if state is not None and kind != "virtual":
         raise InvalidArgument(f"state: expected none for a culture of kind {kind!r}, got {state}")
     if (selection is not None) != (kind == "maxone"):

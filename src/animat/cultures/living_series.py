@@ -9,7 +9,7 @@ from typing import NamedTuple
 from animat.cultures.base import Culture
 from animat.cultures.same_patterns import other_patterns
 from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
-from animat.errors import Mismatch
+from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
@@ -58,13 +58,13 @@ def record_living_series(
         progress: told after each block.
 
     Raises:
-        InvalidArgument: for no sessions, or an interval shorter than a recording.
+        InvalidArgument: for no sessions, an interval shorter than a recording, or a seed below 0.
         Mismatch: if recordings are there that another culture or protocol made, or that lie ahead of its clock, or
             another run is at work in the folder.
         InvalidFile: if a file cannot be written, or one that is there is damaged.
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
-    check_interval(protocol, sessions, interval_min)
+    _check(protocol, sessions, interval_min, seed)
     # Seen before it is touched: somebody else's folder stays as it is.
     _beginning_s(culture, protocol, _files(Path(folder), sessions, interval_min), 60 * interval_min)
     with alone_in(folder):
@@ -88,7 +88,7 @@ def record_in_held_folder(
     To open a device is to do something to it: whoever opens one for a folder holds that before. Arguments and errors
     are those of `record_living_series`.
     """
-    check_interval(protocol, sessions, interval_min)
+    _check(protocol, sessions, interval_min, seed)
     folder, progress = Path(folder), progress or Silent()
     files = _files(folder, sessions, interval_min)
     missed_min = []
@@ -105,6 +105,12 @@ def record_in_held_folder(
             culture.record(protocol, seed * 10_000 + session, part).save(file)
         progress.update(session + 1, sessions, file.name)
     return LivingSeries([file for file in files if file.exists()], missed_min)
+
+
+def _check(protocol: Protocol, sessions: int, interval_min: float, seed: int) -> None:
+    check_interval(protocol, sessions, interval_min)
+    if seed < 0:
+        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
 
 
 def _files(folder: Path, sessions: int, interval_min: float) -> list[Path]:

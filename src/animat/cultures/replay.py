@@ -32,11 +32,11 @@ class ReplayCulture(Culture):
     Args:
         recordings: of one culture, at least one, with stimuli of known frequencies and electrodes.
         how: `"draw"`, a response is drawn at random; `"in order"`, they come as they were recorded, then over again.
-        seed: decides the draws.
+        seed: decides the draws; 0 or more.
         limits: tighter limits than `SIMULATED_LIMITS`.
 
     Raises:
-        InvalidArgument: for no recordings, or another `how`.
+        InvalidArgument: for no recordings, another `how`, or a seed below 0.
         Mismatch: for recordings with different channels.
         UnusableData: for a recording without stimuli of known frequency and electrodes.
     """
@@ -54,6 +54,8 @@ class ReplayCulture(Culture):
         super().__init__(limits)
         if not recordings:
             raise InvalidArgument("recordings: expected at least one to answer from, got none")
+        if seed < 0:
+            raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
         if how not in ("draw", "in order"):
             raise InvalidArgument(f"how: expected 'draw' or 'in order', got {how!r}")
         self._recordings = sorted(recordings, key=lambda recording: recording.start_min)

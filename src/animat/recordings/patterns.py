@@ -31,7 +31,7 @@ def draw_patterns(
     Args:
         array: where the electrodes are.
         electrodes: to choose from.
-        seed: decides the draw.
+        seed: decides the draw; 0 or more.
         patterns: how many, no two of them the same set.
         size: electrodes in each.
         spacing_um: the distance that every pair must exceed.
@@ -40,7 +40,8 @@ def draw_patterns(
         Electrodes of each pattern, rising.
 
     Raises:
-        InvalidArgument: if there are not that many, or too few were found; it says how many and what to relax.
+        InvalidArgument: if there are not that many, or too few were found; it says how many and what to relax. For a
+            seed below 0.
 
     Source: the paper's methods (5 of 32 electrodes, more than 100 um apart, 100 patterns).
     """
@@ -48,6 +49,8 @@ def draw_patterns(
     for name, number in (("patterns", patterns), ("size", size)):
         if number < 1:
             raise InvalidArgument(f"{name}: expected at least 1, got {number}")
+    if seed < 0:
+        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 5])
     is_far = array.distance_um(electrodes, electrodes) > spacing_um
     found: dict[tuple[int, ...], None] = {}
