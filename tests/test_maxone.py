@@ -214,10 +214,25 @@ def test_whatever_goes_wrong_meanwhile_takes_the_power(rig: Rig) -> None:
             with pytest.raises(wrong):
                 culture.deliver([Stimulus(0.0, (SITES[0],), BALANCED_PULSE)], 0.1)
             assert not rig.powered
+            assert culture.is_stopped
             rig.on_send = None
-            with pytest.raises(DeviceFailed, match="stopped"):
+            with pytest.raises(UnsafeStimulus, match=f"stopped: .* broken off by {wrong.__name__}: now"):
                 culture.deliver([Stimulus(0.1, (SITES[0],), BALANCED_PULSE)], 0.2)
         assert rig.delivered == []
+
+
+def test_ctrl_c_while_nothing_is_stimulated_stops_it_too(rig: Rig) -> None:
+    class Interrupted(Stream):
+        def wait(self, frame: int) -> None:
+            raise KeyboardInterrupt
+
+    with MaxOneCulture(selection(), stream=Interrupted(rig), settle=False) as culture:
+        with pytest.raises(KeyboardInterrupt):
+            culture.advance(0.1)
+        assert not rig.powered
+        assert culture.is_stopped
+        with pytest.raises(UnsafeStimulus, match="stopped"):
+            culture.deliver([Stimulus(0.0, (SITES[0],), BALANCED_PULSE)], 0.2)
 
 
 def test_a_delivery_that_hung_sends_nothing_in_a_later_session(rig: Rig) -> None:

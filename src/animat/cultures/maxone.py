@@ -202,14 +202,11 @@ class MaxOneCulture(Culture):
         try:
             return self._sent(admitted, duration_s)
         except BaseException as error:
-            # A sequence that is under way goes on by itself: without power nothing comes of it.
+            # A sequence that is under way goes on by itself: without power nothing comes of it, nor of any later one.
             try:
-                self._halt()
-            except Exception as failed:
-                error.add_note(
-                    f"and the power could not be switched off ({in_words(failed)}): see to it that it gives no more "
-                    "pulses"
-                )
+                self.stop(f"a delivery was broken off by {in_words(error)}")
+            except DeviceFailed as failed:
+                error.add_note(f"and then: {failed}: see to it that it gives no more pulses")
             raise
 
     def _sent(self, admitted: Admitted, duration_s: float) -> Observed:

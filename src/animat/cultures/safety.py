@@ -195,8 +195,8 @@ class Guard:
         return self._stopped is not None
 
     def stop(self, reason: str) -> None:
-        """Refuse everything from now on; a new session has a guard of its own."""
-        self._stopped = reason
+        """Refuse everything from now on, for the first reason given; a new session has a guard of its own."""
+        self._stopped = reason if self._stopped is None else self._stopped
 
     def check(self, stimuli: Sequence[Stimulus], now_s: float) -> None:
         """Raise unless the request as a whole is within the limits; nothing is remembered.
