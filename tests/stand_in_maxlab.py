@@ -114,7 +114,9 @@ class Stream:
 
     def wait(self, frame: int) -> None:
         if self.rig.is_gone:
-            raise DeviceFailed("MaxOne: expected frames, got none any more")
+            raise DeviceFailed("MaxOne: expected frames, got none any more") from ConnectionError(
+                "nothing came for 2 s"
+            )
         self.rig.now = max(self.rig.now, frame)
 
     def forget(self, before: int) -> None:

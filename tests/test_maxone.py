@@ -363,6 +363,15 @@ def test_spikes_on_amplifiers_that_are_none_are_refused(rig: Rig) -> None:
                 culture.advance(0.1)
 
 
+def test_a_stream_that_falls_silent_is_a_lost_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.cultures.maxone_stream.PATIENCE_S", 0.0)
+    stream = ZmqSpikes()
+    stream.hear([np.uint64(42).tobytes(), b""])
+    with pytest.raises(DeviceFailed, match="got none any more: is MaxLab Live's server running") as failed:
+        stream.wait(43)
+    assert isinstance(failed.value.__cause__, ConnectionError)
+
+
 def test_the_stream_hears_a_server() -> None:
     zmq = pytest.importorskip("zmq", reason="pyzmq is not installed")
     with zmq.Context() as context, context.socket(zmq.PUB) as server:

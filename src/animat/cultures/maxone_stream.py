@@ -109,9 +109,10 @@ class ZmqSpikes:
                 raise DeviceFailed(str(failed)) from failed
             if failed is not None or time.monotonic() - self._came_s > PATIENCE_S:
                 got = "none any more" if failed is None else in_words(failed)
+                # Nobody says that a connection is lost that only listens: it is silent.
                 raise DeviceFailed(
                     f"MaxOne: expected frames from {self._address}, got {got}: is MaxLab Live's server running?"
-                ) from failed
+                ) from (failed or ConnectionError(f"nothing came for {PATIENCE_S:g} s"))
             time.sleep(1e-4)
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:

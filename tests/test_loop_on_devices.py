@@ -1,8 +1,9 @@
-"""A closed loop on devices whose clock goes on while the program works: pulses come when they are due all the same."""
+"""A closed loop on devices: their clocks go on while the program works, and they can be gone."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ import stand_in_maxlab
 from animat.closed_loop.contenders import Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import Session
+from animat.closed_loop.session import Session, read_session
 from animat.cultures.base import Culture
 from animat.cultures.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.maxone import MaxOneCulture
+from animat.errors import DeviceFailed
 from animat.mapping import Thresholds
 from animat.neurons.conditions import Condition
 from animat.recordings.array import MAXONE
@@ -27,6 +29,11 @@ from animat.recordings.stimulus import BALANCED_PULSE, Pulse
 from animat.robots import Navigation
 
 HZ = (5.0, 20.0)
+
+
+def selection() -> Selection:
+    sites = np.array([(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)])
+    return Selection(MAXONE, np.arange(13_000, 13_050), sites, draw_patterns(MAXONE, sites, seed=1))
 
 
 def loop_at(tmp_path: Path, culture: Culture, pulse: Pulse, chosen: int) -> Session:
@@ -89,7 +96,57 @@ def test_a_maxone_is_in_time_however_long_its_sequences_take_to_make(
         append(sequence, command)
 
     monkeypatch.setattr(vendor, "append", slowly)
-    sites = np.array([(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)])
-    selection = Selection(MAXONE, np.arange(13_000, 13_050), sites, draw_patterns(MAXONE, sites, seed=1))
-    culture = MaxOneCulture(selection, stream=Running(rig), settle=False)
+    culture = MaxOneCulture(selection(), stream=Running(rig), settle=False)
     assert_in_time(loop_at(tmp_path, culture, BALANCED_PULSE, chosen), chosen, 1 / 20_000)
+
+
+def test_a_cl1_that_is_gone_is_a_lost_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    neurons = stand_in_cl.install(monkeypatch)
+    loop, loops = neurons.loop, [0]
+
+    def lost(*given: int, **more: object) -> Iterator[object]:
+        loops[0] += 1
+        neurons.is_gone = loops[0] >= 8
+        return loop(*given, **more)
+
+    monkeypatch.setattr(neurons, "loop", lost)
+    with pytest.raises(DeviceFailed, match="cl1: expected it to close, got ConnectionResetError"):
+        loop_at(tmp_path, CL1Culture(), CL1_PULSE, 0)
+    ending = read_session(tmp_path).ending
+    assert ending.by == "culture"
+    assert "the connection to the culture is lost: DeviceFailed: CL1" in ending.sentence
+    assert "could not be interrupted" in ending.sentence
+    assert "BUT the culture could not be stopped" in ending.sentence
+
+
+def test_a_cl1_whose_loop_is_late_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    neurons = stand_in_cl.install(monkeypatch)
+    neurons.fail = TimeoutError("Loop fell behind by 1 frame (40 us)")
+    ending = loop_at(tmp_path, CL1Culture(), CL1_PULSE, 0).ending
+    assert ending.sentence.startswith(
+        "the culture raised DeviceFailed: CL1: expected a loop over 0.1 s, got TimeoutError"
+    )
+
+
+@pytest.mark.parametrize("where", ["server", "stream"])
+def test_a_maxone_that_is_gone_is_a_lost_connection(
+    tmp_path: Path, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = stand_in_maxlab.install(monkeypatch)
+
+    class Silent(stand_in_maxlab.Stream):
+        def wait(self, frame: int) -> None:
+            rig.is_gone = rig.is_gone or (where == "stream" and len(rig.sent) >= 5)
+            super().wait(frame)
+
+    def lose() -> None:
+        rig.is_gone = where == "server" and len(rig.sent) >= 5
+        rig.answer()
+
+    rig.on_send = lose
+    with pytest.raises(DeviceFailed, match="maxone: expected it to close, got ConnectionRefusedError"):
+        loop_at(tmp_path, MaxOneCulture(selection(), stream=Silent(rig), settle=False), BALANCED_PULSE, 0)
+    ending = read_session(tmp_path).ending
+    assert ending.by == "culture"
+    assert ending.sentence.startswith("the connection to the culture is lost: DeviceFailed")
+    assert "BUT the culture could not be stopped" in ending.sentence
