@@ -30,7 +30,9 @@ def dac_code(amplitude_mv: float, lsb_mv: float) -> int:
 
 
 class Sequences:
-    """Makes sequences of stimuli, and keeps one on the device for each pattern and pulse.
+    """Makes sequences of stimuli, and keeps one on the device for each pattern and pulse that came alone.
+
+    Trains are not put together from kept sequences: times between two sequences are the computer's, and not exact.
 
     Args:
         mx: the vendor's module.
