@@ -56,11 +56,13 @@ class MaxOneCulture(Culture):
     """A culture on a MaxOne: electrodes as selected, one stimulation unit each, all driven by one converter.
 
     Opening routes the array and refuses, by name, every stimulation electrode that was not routed, got no unit, or
-    shares one with another. Recording electrodes that were not routed are left out and counted. A stimulus powers and
-    connects the units of its electrodes for as long as its pulse lasts. Stimuli that follow each other within
-    `sequence_s` are one sequence, in which times are exact (50 us), made anew each time; one that is alone is kept on
-    the device as a sequence of its pattern and pulse, and sent again. When a sequence starts is the computer's doing: `stimulus_time_s` is estimated from the newest
-    frame when the server had taken it. `stop` takes the power from all units.
+    shares one with another. Recording electrodes that were not routed are left out and counted. All units in use are
+    powered from opening to closing; a stimulus connects those of its electrodes, for as long as its pulse lasts.
+
+    Stimuli that follow each other within `sequence_s` are one sequence, in which times are exact (50 us), made anew
+    each time; one that is alone is kept on the device as a sequence of its pattern and pulse, and sent again. When a
+    sequence starts is the computer's doing: `stimulus_time_s` is estimated from the newest frame when the server had
+    taken it. `stop` takes the power from all units.
 
     Never run on a device: `docs/hardware.md` says what was tested against what.
 
