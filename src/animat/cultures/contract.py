@@ -11,12 +11,15 @@ They take some seconds of the culture's time and deliver a few dozen stimuli, al
 from __future__ import annotations
 
 import abc
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from animat.cultures.base import Culture
+from animat.cultures.observed import Observed
+from animat.cultures.safety import Admitted
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.protocol import Protocol
 from animat.recordings.recording import UNKNOWN
@@ -167,6 +170,47 @@ class CultureContract(abc.ABC):
             _expect(UnsafeStimulus, lambda: culture.record(self.protocol))
             culture.advance(0.01)
             assert culture.delivered == 0
+        with culture:
+            culture.deliver([stimulus], 0.1)
+            assert culture.delivered == 1
+
+    def test_a_stop_from_another_thread_while_it_delivers_ends_in_a_culture_that_can_be_opened_again(self) -> None:
+        culture = self.make_culture()
+        begun, ended = threading.Event(), list[Exception | None]()
+        with culture:
+            stimulus, deliver = self.stimulus(culture), culture._deliver
+            stimuli = [self.stimulus(culture, 0.1 * number) for number in range(20)]
+
+            def noticed(admitted: Admitted, duration_s: float) -> Observed:
+                begun.set()
+                return deliver(admitted, duration_s)
+
+            def ask() -> None:
+                try:
+                    culture.deliver(stimuli, 2.0)
+                except (DeviceFailed, UnsafeStimulus) as error:
+                    ended.append(error)
+                else:
+                    # A simulation delivers all at once, and may have done so before.
+                    ended.append(None)
+
+            culture._deliver = noticed  # type: ignore[method-assign]
+            asking = threading.Thread(target=ask, daemon=True)
+            asking.start()
+            assert begun.wait(60)
+            culture.stop("from another thread")
+            asking.join(60)
+            assert len(ended) == 1
+            assert culture.is_stopped
+            delivered = culture.delivered
+            _expect(UnsafeStimulus, lambda: culture.deliver([stimulus], 0.1))
+            assert culture.delivered == delivered
+            culture._deliver = deliver  # type: ignore[method-assign]
+        with culture:
+            # How much of it came is not known: all counts as if it had been just now.
+            culture.rest(1.0)
+            culture.deliver([stimulus], 0.1)
+            assert culture.delivered == 1
 
     def test_a_device_that_is_gone_is_told_as_one_that_failed(self) -> None:
         culture = self.make_culture()
