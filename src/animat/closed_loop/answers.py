@@ -7,6 +7,7 @@ from math import isfinite
 import numpy as np
 from jaxtyping import Float64
 
+from animat.cultures.failing import in_words
 from animat.cultures.observed import Observed
 
 
@@ -61,8 +62,3 @@ def wrong_with(
     except Exception as error:
         return f"the culture answered something that cannot be read: {in_words(error)}"
     return None
-
-
-def in_words(error: BaseException) -> str:
-    """An error in one line, with its type."""
-    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no words'}"

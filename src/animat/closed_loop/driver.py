@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.answers import in_words, wrong_with
+from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import Contender, Controller
 from animat.closed_loop.following import Following
@@ -21,6 +21,7 @@ from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
+from animat.cultures.failing import in_words
 from animat.errors import BudgetSpent, UnsafeStimulus
 from animat.neurons.windows import read_windows
 from animat.recordings.recording import UNKNOWN

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.answers import in_words
 from animat.closed_loop.contenders import Contender, InTurn, interleaved
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.interrupts import told_instead
@@ -27,6 +26,7 @@ from animat.closed_loop.tick import Ending
 from animat.closed_loop.timing import Clock, WallClock
 from animat.cultures.base import Culture, more_left_out
 from animat.cultures.budget import Account
+from animat.cultures.failing import in_words
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress, Silent
 
