@@ -17,6 +17,8 @@ import pytest
 from animat.animat import Animat
 from animat.cli import main
 from animat.cli_responses import say_findings
+from animat.cli_train import Train
+from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
 from animat.mapping import Thresholds
 from animat.neurons.series import extract_series
@@ -350,6 +352,20 @@ def test_a_full_disk_while_training_leaves_what_was_there_whole(recordings: Path
     assert "Traceback" not in ran.stderr
     assert not list((tmp_path / "out").rglob("*.partial*"))
     assert not list((tmp_path / "out").glob("*.safetensors"))
+
+
+@pytest.mark.parametrize(("kind", "status"), [(InvalidArgument, 1), (KeyboardInterrupt, 130)])
+def test_what_went_wrong_besides_is_told_too(
+    kind: type[BaseException], status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(command: Train) -> None:
+        error = kind("it went wrong")
+        error.add_note("and then: the device could not be\nswitched off")
+        raise error
+
+    monkeypatch.setattr(Train, "run", run)
+    assert main(["train", "cartpole"]) == status
+    assert capsys.readouterr().err.splitlines()[1:] == ["animat: and then: the device could not be switched off"]
 
 
 def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:

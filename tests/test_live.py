@@ -429,6 +429,7 @@ def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None
     assert exchange.is_finished
 
 
+@pytest.mark.oracle
 def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,10 +49,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         results = command.run()
     except AnimatError as error:
         print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+        _say_notes(error)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         again = "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile) else ""
         print(f"animat: interrupted; what was finished is kept{again}", file=sys.stderr)
+        _say_notes(error)
         return 130
     except BrokenPipeError:
         # Whoever read the output closed it; Python would complain once more while exiting.
@@ -94,6 +96,12 @@ def _parse(
         rules = [i for i, line in enumerate(lines) if set(line) == {"─"}]
         what = " ".join(line for line in lines[1 : rules[0] if rules else None] if line)
         raise InvalidArgument(f"{what}; see animat {' '.join(arguments[:1])} --help") from None
+
+
+def _say_notes(error: BaseException) -> None:
+    """What went wrong besides, such as a device that could not be switched off."""
+    for note in getattr(error, "__notes__", ()):
+        print(f"animat: {' '.join(note.split())}", file=sys.stderr)
 
 
 def _as_json(value: Any) -> Any:
