@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 # Shapes and types in the signatures of the numerical core are checked while the tests run; this must come before
@@ -21,6 +22,10 @@ install_import_hook(
 )
 
 from animat.compilation import keep_compilations  # noqa: E402
+
+# The same random examples each time; others with --hypothesis-profile=default.
+settings.register_profile("the same", derandomize=True)
+settings.load_profile("the same")
 
 
 @pytest.fixture(scope="session", autouse=True)

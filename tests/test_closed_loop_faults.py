@@ -170,8 +170,14 @@ def test_a_connection_that_is_lost_between_two_stimuli(tmp_path: Path) -> None:
             assert_safe(session, culture, 3)
 
 
+@pytest.fixture
+def little_grace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who hangs is not waited for as long as usual."""
+    monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
+
+
 @pytest.mark.parametrize("left", range(40, 44))
-def test_a_clock_that_hangs(tmp_path: Path, left: int) -> None:
+def test_a_clock_that_hangs(tmp_path: Path, left: int, little_grace: None) -> None:
     released = threading.Event()
     with Gone(lambda: released.wait(60), left) as culture:
         try:
@@ -184,7 +190,7 @@ def test_a_clock_that_hangs(tmp_path: Path, left: int) -> None:
 
 
 @pytest.mark.parametrize("is_interrupted", [False, True])
-def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool) -> None:
+def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace: None) -> None:
     released, acted = threading.Event(), [0]
 
     class Pondering:
@@ -250,7 +256,7 @@ def test_a_later_pulse_of_a_presentation_that_comes_late_is_late(tmp_path: Path)
     assert session.to_dict()["late_pulses"] == 1
 
 
-def test_a_backend_that_hangs(tmp_path: Path) -> None:
+def test_a_backend_that_hangs(tmp_path: Path, little_grace: None) -> None:
     released = threading.Event()
 
     def hang(culture: FakeCulture, observed: Observed) -> Observed:
