@@ -197,7 +197,7 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
     assert "recording at 10 min, percentiles held from 0 min: 1 policies" in found.to_text()
     assert found.to_dict()["percentiles_held_from_min"] == 0.0 and not found.findings
     elsewhere = replace(held, provenance={**held.provenance, "simulators": {"recorded_at_min": [-10.0, 0.0]}})
-    (finding,) = evaluate({"a": elsewhere}, timeline, episodes=5).findings
+    (finding,) = evaluate({"a": elsewhere}, timeline, episodes=50).findings
     assert "held from the recording at -10 min, which is not the first of these" in finding.sentence
     with pytest.raises(Mismatch, match="b: expected the same percentiles as a"):
         evaluate({"a": moving, "b": held}, timeline)
@@ -222,10 +222,10 @@ def test_simulators_made_otherwise_than_in_training_are_told() -> None:
     timeline = timeline_of()
     trained = {"kind": "histogram", "bins": 40, "range_hz": None, "recorded_at_min": [0.0]}
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
-    (finding,) = evaluate({"a": policy}, timeline, episodes=5).findings
+    (finding,) = evaluate({"a": policy}, timeline, episodes=50).findings
     assert finding.name == "other-simulator" and finding.sentence.endswith("made otherwise: bins 40, here 20")
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
-    assert not evaluate({"a": alike}, timeline, episodes=5).findings
+    assert not evaluate({"a": alike}, timeline, episodes=50).findings
 
 
 def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
 from animat.animat import Environment
+from animat.compilation import FAST_TO_COMPILE
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
 from animat.training.policy import Policy
@@ -165,7 +166,7 @@ def roll_out(
     return Episodes(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), np.asarray(terminated))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=FAST_TO_COMPILE)
 def _roll_out(
     environment: Environment[Any],
     episodes: int,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
@@ -74,11 +74,17 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
             for c in range(len(responses.conditions))
         ]
     )
-    uniforms = (jnp.arange(20_000) + 0.5) / 20_000
-    conditions = jnp.arange(simulator.n_conditions)
-    x = jax.jit(jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None)))(conditions, uniforms)
+    x = _evenly_drawn(simulator)
     above = 0
     if isinstance(simulator, HistogramSimulator):
         above = int(np.count_nonzero(responses.rate_hz[kept].astype(np.float32) > np.asarray(simulator.edges_hz)[-1]))
     labels = tuple(condition.label for condition in responses.conditions)
     return Fidelity(labels, in_data, np.asarray(jnp.mean(x >= median, axis=1), np.float64), above)
+
+
+@jax.jit
+def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws"]:
+    """Evenly spaced quantiles of every condition; compiled once for all simulators of a shape."""
+    uniforms = (jnp.arange(20_000) + 0.5) / 20_000
+    draw = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
+    return draw(jnp.arange(simulator.n_conditions), uniforms)
