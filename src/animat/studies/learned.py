@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from animat.report.html import Table, cell
+from animat.report.html import Table, with_error
 from animat.studies.specification import Body, Study
 from animat.studies.tabulating import AIM
 
@@ -50,7 +50,7 @@ def as_good_as_the_limit_allows(study: Study, rows: list[dict[str, Any]]) -> Tab
                 row["condition"],
                 row["mapping"],
                 row["at_min"],
-                f"{cell(row['mean_return'])}\u00a0±\u00a0{cell(error)}",
+                with_error(row["mean_return"], error),
                 row["random"],
                 row["limit"],
                 row["limit_run"],

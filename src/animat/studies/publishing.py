@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, final
 
 from animat.evaluation.statistics import p_of_u
+from animat.recordings.protocol import Presentation
 from animat.report.html import Picture, Section, Table, write_page
 from animat.report.style import FORMATS
 from animat.studies.captions import CULTURE, ROBOT
@@ -185,7 +186,7 @@ def _done(study: Study) -> Section:
     else:
         recorded = (
             f"{culture.sessions} recordings, one every {culture.interval_min:g} min, of the {culture.kind} culture of "
-            f"seed {culture.seed}; stimuli {culture.order}, {culture.pulses} pulse(s) a presentation, "
+            f"seed {culture.seed}; stimuli {Presentation(culture.order, culture.pulses)}, "
             f"{culture.presentations} presentations of each."
         )
     points = [
