@@ -35,6 +35,7 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_perc
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, run_policies
 from animat.reality_gap.predicting import ANEW_EPISODES
 from animat.recordings.array import MAXONE
+from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.recording import Recording
 from animat.recordings.selection import Selection
@@ -221,6 +222,26 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
     other, _ = run(tmp_path / "follow", series, with_controls=False, follow=True)
     assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
     np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[0].predicted)
+
+
+def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
+    tmp_path: Path, series: list[Responses]
+) -> None:
+    remembers = Finding("memory", "note", "the culture remembers: 66 % and 36 %", 0.3)
+    found = [replace(each, findings=(*each.findings, remembers)) for each in series]
+    for kind, warned in (("histogram", True), ("memory", False)):
+        with FakeCulture() as culture:
+            gap = run_policies(
+                {"p": policy_of(0, series)},
+                culture,
+                Calibration.of_series(found, kind=kind),  # type: ignore[arg-type]
+                tmp_path / kind,
+                episodes=1,
+                with_controls=False,
+            )
+        warnings = [f.sentence for f in gap.findings if f.name == "no-memory"]
+        assert len(warnings) == warned
+        assert all("66 %" in sentence and "--simulator memory" in sentence for sentence in warnings)
 
 
 def drawn_responses(rng: np.random.Generator, n: int) -> Responses:

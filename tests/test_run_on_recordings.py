@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
 from animat.mapping import Thresholds
 from animat.neurons.conditions import Condition, conditions_named
+from animat.neurons.memory import MemorySimulator
 from animat.neurons.series import extract_series
-from animat.neurons.simulator import pooled_percentiles
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.protocol import Presentation, Protocol
@@ -153,6 +155,44 @@ def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
         np.testing.assert_array_equal(read, trained_on.rates_of(own))
     ticks = read_session(tmp_path / "session").ticks
     assert {tick.frequency_hz for tick in ticks} <= set(frequencies_hz)
+
+
+@pytest.mark.parametrize(
+    ("trained", "asked", "kind", "numbers"),
+    [
+        ({}, (), HistogramSimulator, 21),
+        ({"kind": "histogram", "bins": 10, "range_hz": 60.0}, (), HistogramSimulator, 11),
+        ({"kind": "histogram", "bins": 10, "range_hz": 60.0}, ("--bins", "5"), HistogramSimulator, 6),
+        ({"kind": "empirical", "bins": None, "range_hz": None}, (), EmpiricalSimulator, None),
+        ({"kind": "memory", "bins": None, "range_hz": None}, (), MemorySimulator, None),
+        ({"kind": "memory"}, ("--simulator", "histogram"), HistogramSimulator, 21),
+        ({"kind": "histogram", "bins": 20}, ("--simulator", "memory"), MemorySimulator, None),
+    ],
+)
+def test_the_simulator_that_predicts_is_made_as_the_policies_unless_asked_otherwise(
+    trained: dict[str, Any],
+    asked: tuple[str, ...],
+    kind: type[NeuronSimulator],
+    numbers: int | None,
+    series: Path,
+    tmp_path: Path,
+    small_ones: None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Taken(Exception):
+        pass
+
+    def take(policies: Any, culture: Any, calibration: Calibration, *_: Any, **__: Any) -> None:
+        assert type(calibration.simulator) is kind
+        assert all(type(each) is kind for each in calibration.redrawn)
+        if numbers is not None:
+            assert calibration.simulator.edges_hz.shape == (numbers,)  # type: ignore[attr-defined]
+        raise Taken
+
+    monkeypatch.setattr("animat.reality_gap.run_policies", take)
+    policy = replace(policy_of(0), provenance={"simulators": trained})
+    with pytest.raises(Taken):
+        run(tmp_path / "session", policy, series, *asked)
 
 
 def test_recordings_that_lack_a_frequency_are_refused_with_what_they_have(

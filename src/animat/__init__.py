@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from animat.mapping import Linear, Mapping, Thresholds, mapping_named
     from animat.neurons.conditions import Condition, conditions_named
     from animat.neurons.inspection import Inspection, inspect_recording
+    from animat.neurons.memory import fit_memory
     from animat.neurons.responses import Responses, extract_responses
     from animat.neurons.series import extract_series
     from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
@@ -70,6 +71,7 @@ _WHERE = {
     "neurons.series": ("extract_series",),
     "neurons.inspection": ("Inspection", "inspect_recording"),
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
+    "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
     "mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
     "robots": ("Robot", "Cartpole", "Navigation", "robot_named"),
@@ -127,6 +129,7 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "NeuronSimulator",
     "fit_histogram",
     "fit_empirical",
+    "fit_memory",
     "SimulatorTimeline",
     "fit_timeline",
     "Mapping",

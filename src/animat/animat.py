@@ -22,10 +22,18 @@ Delivery = Literal["chosen", "shuffled"]
 
 
 class EpisodeState(NamedTuple):
-    """Where an episode stands: the robot's state, and the iterations done."""
+    """Where an episode stands: the robot's state, the iterations done, and the last response.
+
+    Attributes:
+        robot: the state of the robot.
+        iteration: how many are done.
+        last_hz: the response of the last one, Hz per channel: all that neurons remember; 0 at the start, after silence
+            (NaN without neurons, from the first iteration on).
+    """
 
     robot: Any
     iteration: Int[Array, ""]
+    last_hz: Float[Array, ""]
 
 
 class Outcome(NamedTuple):
@@ -70,9 +78,13 @@ class Environment(abc.ABC, Generic[RobotState]):
 
     @abc.abstractmethod
     def actuate(
-        self, uniforms: Float[Array, " noise"], action: Array, simulator: NeuronSimulator | None
+        self,
+        uniforms: Float[Array, " noise"],
+        last_hz: Float[Array, ""],
+        action: Array,
+        simulator: NeuronSimulator | None,
     ) -> tuple[Array, Float[Array, ""], Float[Array, ""]]:
-        """Turn an action into (what was delivered, the response x in Hz, the command u in [-1, 1])."""
+        """Turn an action, after a response, into (what was delivered, the response x in Hz, the command in [-1, 1])."""
 
     @property
     def n_observations(self) -> int:
@@ -87,7 +99,7 @@ class Environment(abc.ABC, Generic[RobotState]):
     @final
     def reset(self, key: PRNGKeyArray) -> EpisodeState:
         """Start an episode."""
-        return EpisodeState(self.robot.reset(key), jnp.int32(0))
+        return EpisodeState(self.robot.reset(key), jnp.int32(0), jnp.float32(0.0))
 
     @final
     def step(self, key: PRNGKeyArray, state: EpisodeState, action: Array, simulator: NeuronSimulator | None) -> Outcome:
@@ -104,11 +116,12 @@ class Environment(abc.ABC, Generic[RobotState]):
     ) -> Outcome:
         """The same with the random numbers handed in: training draws them for many iterations at once."""
         of_robot = self.robot.noise_size
-        delivered, rate_hz, command = self.actuate(uniforms[of_robot:], action, simulator)
+        delivered, rate_hz, command = self.actuate(uniforms[of_robot:], state.last_hz, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[:of_robot], state.robot, command)
         iteration = state.iteration + 1
         truncated = (iteration >= self.robot.episode_limit) & ~terminated
-        return Outcome(EpisodeState(robot, iteration), reward, terminated, truncated, delivered, rate_hz, command)
+        after = EpisodeState(robot, iteration, rate_hz)
+        return Outcome(after, reward, terminated, truncated, delivered, rate_hz, command)
 
     @final
     def observe(self, state: EpisodeState) -> Float[Array, " observations"]:
@@ -142,13 +155,17 @@ class Animat(Environment[RobotState]):
         return self.robot.noise_size + 2
 
     def actuate(
-        self, uniforms: Float[Array, " noise"], action: Array, simulator: NeuronSimulator | None
+        self,
+        uniforms: Float[Array, " noise"],
+        last_hz: Float[Array, ""],
+        action: Array,
+        simulator: NeuronSimulator | None,
     ) -> tuple[Array, Float[Array, ""], Float[Array, ""]]:
         if simulator is None:
             raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
         if self.delivery == "shuffled":
             action = jnp.minimum((uniforms[1] * self.n_conditions).astype(jnp.int32), self.n_conditions - 1)
-        rate_hz = simulator.quantile(action, uniforms[0])
+        rate_hz = simulator.answer(action, uniforms[0], last_hz)
         return action, rate_hz, self.mapping.command(rate_hz, simulator.percentiles)
 
 
@@ -173,7 +190,11 @@ class WithoutNeurons(Environment[RobotState]):
         return self.robot.noise_size
 
     def actuate(
-        self, uniforms: Float[Array, " noise"], action: Array, simulator: NeuronSimulator | None
+        self,
+        uniforms: Float[Array, " noise"],
+        last_hz: Float[Array, ""],
+        action: Array,
+        simulator: NeuronSimulator | None,
     ) -> tuple[Array, Float[Array, ""], Float[Array, ""]]:
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
         return action, jnp.float32(jnp.nan), jnp.clip(command, -1.0, 1.0)

@@ -47,8 +47,8 @@ class Live(Stimulating):
     """Run between the policies' episodes"""
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are held from the first recording"""
-    simulator: Literal["histogram", "empirical"] = "histogram"
-    """histogram: a distribution in bins (the paper); empirical: draw a measured value"""
+    simulator: Literal["histogram", "empirical", "memory"] = "histogram"
+    """histogram: bins (the paper); empirical: a measured value; memory: one measured after one like the last"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
     seed: int = 1

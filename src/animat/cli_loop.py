@@ -84,12 +84,12 @@ class Run(Stimulating):
     """all: random, constant, silent, shuffled and made by hand; random: only that one"""
     pulses: int | None = None
     """Pulses a presentation; default: as the policies' recordings had"""
-    simulator: Literal["histogram", "empirical"] = "histogram"
-    """That predicts; as for animat train"""
-    bins: int = 20
-    """Bins of a histogram"""
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """That predicts, as for animat train; default: as the policies were trained"""
+    bins: int | None = None
+    """Bins of a histogram; default: as the policies were trained"""
     range_hz: float | None = None
-    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
+    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: as the policies were trained"""
     burst_threshold: float | None = None
     """Share of active channels above which a response is a burst; 1: none is; default: as in the recording"""
     despite: tuple[str, ...] = ()
@@ -125,10 +125,11 @@ class Run(Stimulating):
             raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        if self.simulator == "histogram":
-            check_binning(self.bins, self.range_hz)
         policies = load_policies(self.policies)
         first = check_policies(policies)
+        fit = self._fit(first)
+        if fit["kind"] == "histogram":
+            check_binning(fit["bins"], fit["range_hz"])
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
         Loop.of_policy(first, np.zeros(N_PERCENTILES), **settings)
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
@@ -242,9 +243,15 @@ class Run(Stimulating):
             burst_threshold=self.burst_threshold,
             despite=self.despite,
         )
-        return Calibration.of_series(
-            series, first, at_min=at_min, kind=self.simulator, bins=self.bins, range_hz=self.range_hz
-        )
+        return Calibration.of_series(series, first, at_min=at_min, **self._fit(first))
+
+    def _fit(self, first: Policy) -> dict[str, Any]:
+        """How the simulator that predicts is made: as the policies' were, but for what is asked for."""
+        trained = first.provenance.get("simulators") or {}
+        asked = {"kind": self.simulator, "bins": self.bins, "range_hz": self.range_hz}
+        usual = {"kind": "histogram", "bins": 20, "range_hz": None}
+        known = usual | {name: trained[name] for name in usual if trained.get(name) is not None}
+        return known | {name: value for name, value in asked.items() if value is not None}
 
 
 @dataclass(frozen=True)

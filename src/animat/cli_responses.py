@@ -31,8 +31,8 @@ class Responding:
 class Fitting(Responding):
     """How a neuron simulator is made of responses."""
 
-    simulator: Literal["histogram", "empirical"] = "histogram"
-    """histogram: a distribution in bins (the paper); empirical: draw a measured value"""
+    simulator: Literal["histogram", "empirical", "memory"] = "histogram"
+    """histogram: bins (the paper); empirical: a measured value; memory: one measured after one like the last"""
     bins: int = 20
     """Bins of a histogram"""
     range_hz: float | None = None

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Float, Float64, Int
 
 from animat.animat import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.mapping import Mapping, Thresholds
-from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.simulator import PERCENTILES, NeuronSimulator
 
 CONTINUOUS_ACTIONS = 21
 """How many evenly spaced commands stand for a continuous action."""
@@ -24,6 +24,9 @@ _QUANTILES = 2048
 """How many responses of equal probability stand for a condition's distribution, where the mapping is continuous."""
 
 _MOST_LEVELS = 12
+
+_LAST_RESPONSES = 8
+"""How many last responses stand for each of their classes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,10 @@ class Commands:
             return self
         levels = np.concatenate([self.levels - shift, self.levels + shift], axis=1)
         return Commands(self.actions, levels, np.concatenate([self.probabilities, self.probabilities], axis=1) / 2)
+
+    def that(self, likely: Float64[np.ndarray, "actions levels"]) -> Commands:
+        """The part of each action's commands that comes with something else, by how likely it is with each of them."""
+        return replace(self, probabilities=self.probabilities * likely)
 
     def onto(self, nodes: Float64[np.ndarray, " nodes"], *, smooth: bool) -> Float64[np.ndarray, "actions nodes"]:
         """Weights that take a function's values at a few commands to its mean over each action's commands.
@@ -101,7 +108,9 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
         else:
             actions = np.arange(environment.n_actions)
         nothing_random = jnp.zeros(environment.noise_size - environment.robot.noise_size)
-        leads_to = [float(environment.actuate(nothing_random, jnp.asarray(a), simulator)[2]) for a in actions]
+        leads_to = [
+            float(environment.actuate(nothing_random, jnp.float32(0), jnp.asarray(a), simulator)[2]) for a in actions
+        ]
         return Commands(actions, np.array(leads_to)[:, None], np.ones((len(actions), 1)))
     if simulator is None:
         raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
@@ -115,6 +124,75 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
         levels = np.tile(levels.reshape(1, -1), (n_actions, 1))
         probabilities = np.tile(probabilities.reshape(1, -1) / n_actions, (n_actions, 1))
     return Commands(np.arange(n_actions), levels, probabilities)
+
+
+def class_of(simulator: NeuronSimulator, rate_hz: Array) -> Int[Array, "*responses"]:
+    """Which of the classes that a last response is remembered in: between which of P10, P20, ..., P90 it lies.
+
+    All are one class to a simulator without memory.
+    """
+    inner = simulator.percentiles[1:-1] if simulator.has_memory else jnp.zeros(0)
+    return jnp.sum(jnp.asarray(rate_hz)[..., None] >= inner, axis=-1)
+
+
+def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
+    """What each action leads to after a last response of each class, and of which class the response is then.
+
+    Classes are those of `class_of`: a memory in ten steps, and exact for thresholds as far as the command goes, as
+    they lie between classes.
+
+    Args:
+        environment, simulator: as in `commands_of`.
+
+    Returns:
+        For each class of the last response, for each class of the response to come: the commands, with the
+        probabilities that they come with a response of that class; over all of these they add up to 1. Without
+        memory, one class and the commands of `commands_of`.
+    """
+    if simulator is None or not simulator.has_memory or not isinstance(environment, Animat):
+        return [[commands_of(environment, simulator)]]
+    levels, classes = (np.asarray(x) for x in _answers(environment, simulator, _last_responses(simulator)))
+    n_classes, n_actions = levels.shape[:2]
+    if environment.delivery == "shuffled":
+        levels, classes = (np.repeat(x.reshape(n_classes, 1, -1), n_actions, axis=1) for x in (levels, classes))
+    actions, even = np.arange(n_actions), np.full(levels.shape[1:], 1 / levels.shape[-1])
+    after = [Commands(actions, of_class.astype(np.float64), even) for of_class in levels]
+    return [
+        [commands.that(likely=then == of) for of in range(n_classes)]
+        for commands, then in zip(after, classes, strict=True)
+    ]
+
+
+def _last_responses(simulator: NeuronSimulator) -> Float[Array, "classes responses"]:
+    """A few responses of each class, evenly spaced in rank among all that there can be."""
+    x = jnp.sort(_responses(simulator).ravel())
+    classes = np.asarray(class_of(simulator, x))
+    ends = np.searchsorted(classes, np.arange(len(PERCENTILES)))
+    within = (np.arange(_LAST_RESPONSES) + 0.5) / _LAST_RESPONSES
+    # A class that no response is of gets those of the next; none will be remembered in it.
+    rows = (ends[:-1, None] + within * np.diff(ends)[:, None]).astype(np.int64)
+    return x[np.minimum(rows, len(x) - 1)]
+
+
+def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses"]:
+    """Responses to each condition at evenly spaced quantiles, whatever was before."""
+    uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
+    quantile = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
+    return quantile(jnp.arange(simulator.n_conditions), uniforms)
+
+
+@partial(jax.jit, static_argnums=0)
+def _answers(
+    environment: Animat[Any], simulator: NeuronSimulator, last_hz: Float[Array, "classes responses"]
+) -> tuple[Float[Array, "classes conditions draws"], Int[Array, "classes conditions draws"]]:
+    """The commands, and the classes of the responses, at evenly spaced quantiles of each condition after each class."""
+    uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
+
+    answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
+    answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
+    conditions = jnp.arange(simulator.n_conditions)
+    x = answers(conditions, uniforms, last_hz).reshape(len(last_hz), len(conditions), -1)
+    return environment.mapping.command(x, simulator.percentiles), class_of(simulator, x)
 
 
 def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[np.ndarray, " nodes"], bool]:
@@ -166,8 +244,5 @@ def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Arra
 
 def _quantiles(mapping: Mapping, simulator: NeuronSimulator) -> tuple[np.ndarray, np.ndarray]:
     """The commands at evenly spaced quantiles of each condition."""
-    uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
-    quantile = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
-    x = quantile(jnp.arange(simulator.n_conditions), uniforms)
-    levels = np.asarray(mapping.command(x, simulator.percentiles), np.float64)
+    levels = np.asarray(mapping.command(_responses(simulator), simulator.percentiles), np.float64)
     return levels, np.full(levels.shape, 1 / _QUANTILES)

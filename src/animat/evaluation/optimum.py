@@ -9,14 +9,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt16
 
 from animat.animat import Environment
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import Commands, commands_of, nodes_for
+from animat.evaluation.commands import class_of, commands_after, nodes_for
 from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.landings import Motion
+from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
@@ -39,8 +41,9 @@ class Optimum:
     """The best possible mean return of any controller, and how well it is known.
 
     Attributes:
-        value: by dynamic programming, of a controller that knows the time left. What the grid cannot resolve raises it
-            more often than it lowers it, as the best of several values is taken: the upper end of a bracket.
+        value: by dynamic programming, of a controller that knows the time left, and the last response where neurons
+            remember it. What the grid cannot resolve raises it more often than it lowers it, as the best of several
+            values is taken: the upper end of a bracket.
         grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
         monte_carlo: mean return of that controller, run on the environment itself: a return that can be had, the lower
             end of the bracket; NaN where it was not run, as the three that follow.
@@ -116,7 +119,8 @@ def best_returns(
 
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 
-    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. V is kept
+    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. Where the
+    neurons remember, s holds the class of the last response too (`commands_after`). V is kept
     at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
     `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
     a return that can be had and cannot lie above the true limit by more than chance.
@@ -147,14 +151,16 @@ def best_returns(
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
 
-    kept_mib = 2 * fine.size * robot.episode_limit / 2**20
+    # With memory a case has a layer of values for each class of the last response.
+    layers = max(len(commands_after(*case)) for case in cases)
+    kept_mib = 2 * fine.size * layers * robot.episode_limit / 2**20
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []
     for start in range(0, len(cases), at_once):
         batch = cases[start : start + at_once]
         rough = _Programme(coarse, batch).run(None, seed)
         programme = _Programme(fine, batch)
-        tables = _Tables(fine, len(batch), robot.episode_limit) if episodes else None
+        tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
         values = programme.run(tables, seed)
         for case in range(len(batch)):
             known, unknown = (
@@ -186,28 +192,28 @@ def _mean_with_error(returns: Float64[np.ndarray, " episodes"] | None) -> tuple[
 class _Tables:
     """Values for every time left, for the controller to look up: in 16 bits each, as all of them must be kept."""
 
-    def __init__(self, grid: Grid, n_cases: int, n_times: int) -> None:
+    def __init__(self, grid: Grid, n_layers: int, n_times: int) -> None:
         self._shape = (grid.n_rows, grid.along.stored)
-        self._kept: UInt16[np.ndarray, "times cases nodes"] = np.empty((n_times, n_cases, grid.size), np.uint16)
-        self._low = np.empty((n_times, n_cases))
-        self._step = np.empty((n_times, n_cases))
+        self._kept: UInt16[np.ndarray, "times layers nodes"] = np.empty((n_times, n_layers, grid.size), np.uint16)
+        self._low = np.empty((n_times, n_layers))
+        self._step = np.empty((n_times, n_layers))
 
-    def keep(self, remaining: int, values: Float32[np.ndarray, "rows cases nodes"]) -> None:
+    def keep(self, remaining: int, values: Float32[np.ndarray, "rows layers nodes"]) -> None:
         """Keep the values for a time left."""
-        for case in range(values.shape[1]):
-            of_case = values[:, case].ravel()
-            low, high = float(of_case.min()), float(of_case.max())
+        for layer in range(values.shape[1]):
+            of_layer = values[:, layer].ravel()
+            low, high = float(of_layer.min()), float(of_layer.max())
             step = max(high - low, 1e-6) / 65535
-            self._low[remaining, case], self._step[remaining, case] = low, step
+            self._low[remaining, layer], self._step[remaining, layer] = low, step
             # Adding half and cutting off rounds, and is a pass less.
-            self._kept[remaining, case] = (of_case - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
+            self._kept[remaining, layer] = (of_layer - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
 
-    def values(self, remaining: int, case: int) -> Float32[np.ndarray, "rows nodes"]:
+    def values(self, remaining: int, layers: slice) -> Float32[np.ndarray, "rows layers nodes"]:
         """Look them up."""
-        kept: Float32[np.ndarray, " nodes"] = self._kept[remaining, case].astype(np.float32)
-        kept *= np.float32(self._step[remaining, case])
-        kept += np.float32(self._low[remaining, case])
-        return kept.reshape(self._shape)
+        kept: Float32[np.ndarray, "layers nodes"] = self._kept[remaining, layers].astype(np.float32)
+        kept *= self._step[remaining, layers, None].astype(np.float32)
+        kept += self._low[remaining, layers, None].astype(np.float32)
+        return np.ascontiguousarray(np.moveaxis(kept.reshape(len(kept), *self._shape), 0, 1))
 
 
 class _Programme:
@@ -216,27 +222,29 @@ class _Programme:
     def __init__(self, grid: Grid, cases: Sequence[Case]) -> None:
         self._grid, self._cases = grid, cases
         self._robot = robot = cases[0][0].robot
-        self._commands = [commands_of(*case) for case in cases]
-        commands = self._commands
+        after = [commands_after(*case) for case in cases]
+        self._actions = [of_case[0][0].actions for of_case in after]
         uniforms: Float[np.ndarray, "draws noise"] = np.full((1, robot.noise_size), 0.5)
-        if grid.noise_in_command is not None:
-            commands = [of_case.with_noise(grid.noise_in_command) for of_case in commands]
+        if (noise := grid.noise_in_command) is not None:
+            after = [[[each.with_noise(noise) for each in row] for row in of_case] for of_case in after]
         elif robot.noise_size:
             # Two points a number: exact for the mean of a cubic polynomial.
             points = (0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12))
             uniforms = np.array(list(itertools.product(points, repeat=robot.noise_size)))
-        nodes, smooth = nodes_for(commands, grid.smooth_commands)
-        weights = [_spread(of_case, nodes, smooth, len(uniforms)) for of_case in commands]
-        most = max(len(of_case) for of_case in weights)
-        # A case of fewer actions has its last one again.
-        self._weights = np.stack([np.pad(w, ((0, most - len(w)), (0, 0)), mode="edge") for w in weights])
+        every = [commands for of_case in after for row in of_case for commands in row]
+        nodes, smooth = nodes_for(every, grid.smooth_commands)
+        self._outcomes = [Outcomes.of(of_case, nodes, smooth=smooth, n_draws=len(uniforms)) for of_case in after]
+        ends = np.cumsum([len(of_case) for of_case in after]).tolist()
+        self._layers = [slice(end - len(of_case), end) for end, of_case in zip(ends, after, strict=True)]
+        self.n_layers = ends[-1]
         self._motion = Motion(robot, grid, nodes, uniforms)
 
     def run(self, tables: _Tables | None, seed: int) -> Float64[np.ndarray, " cases"]:
         """Step back from the end of an episode to its start; the value there, and all values into the tables."""
-        grid, n_cases = self._grid, len(self._cases)
+        grid = self._grid
         landings = self._motion.from_grid()
-        shape = (grid.n_rows, n_cases, grid.along.stored)
+        pairs, weights = side_by_side(self._outcomes)
+        shape = (grid.n_rows, self.n_layers, grid.along.stored)
         values = np.zeros(math.prod(shape), np.float32)
         before = np.empty_like(values)
         for remaining, (lowest, highest) in zip(range(self._robot.episode_limit), landings.bounds(), strict=False):
@@ -250,7 +258,8 @@ class _Programme:
                 landings.places,
                 landings.rewards,
                 grid.row_offsets,
-                self._weights,
+                pairs,
+                weights,
                 remaining,
                 np.float32(lowest),
                 np.float32(highest),
@@ -258,7 +267,12 @@ class _Programme:
             )
             values, before = before, values
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
-        return self._interpolate(values.reshape(shape), starts)
+        # An episode starts after silence.
+        silence = [
+            of_case.start + (0 if simulator is None else int(class_of(simulator, jnp.float32(0))))
+            for of_case, (_, simulator) in zip(self._layers, self._cases, strict=True)
+        ]
+        return self._interpolate(values.reshape(shape)[:, silence], starts)
 
     def play(
         self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool
@@ -266,6 +280,8 @@ class _Programme:
         """Returns of the maximising controller on the environment itself."""
         environment, simulator = self._cases[case]
         limit = self._robot.episode_limit
+        outcomes, actions = self._outcomes[case], self._actions[case]
+        pairs = np.repeat(outcomes.pairs[None], len(outcomes.weights), axis=0)
 
         @jax.jit
         def step(key: Any, state: Any, action: Any, simulator: Any) -> Any:
@@ -280,19 +296,23 @@ class _Programme:
         for iteration, key in enumerate(jax.random.split(others, limit)):
             remaining = limit - 1 - iteration if clock else limit - 1
             landings = self._motion.from_states(state.robot)
+            layers = np.zeros(episodes, np.int32)
+            if simulator is not None:
+                layers += np.asarray(class_of(simulator, state.last_hz), np.int32)
             look_ahead(
-                tables.values(remaining, case),
+                tables.values(remaining, self._layers[case]),
                 landings.rows,
                 landings.row_places,
                 landings.nodes[:, :, 0],
                 landings.places[:, :, 0],
                 landings.rewards[:, :, 0],
                 self._grid.row_offsets,
-                self._weights[case],
+                layers,
+                pairs,
+                outcomes.weights,
                 remaining,
                 chosen,
             )
-            actions = self._commands[case].actions
             action = actions[np.minimum(chosen, len(actions) - 1)]
             outcome = step(key, state, action, simulator)
             state = outcome.state
@@ -314,10 +334,3 @@ class _Programme:
             around = values[row + self._grid.row_offsets, :, node : node + 4]
             total += np.einsum("t,tcn,n->c", weights, around, np.array(cubic(place)))
         return total / len(rows)
-
-
-def _spread(
-    commands: Commands, nodes: Float64[np.ndarray, " nodes"], smooth: bool, n_draws: int
-) -> Float32[np.ndarray, "actions landings"]:
-    """Weights of landings: a landing is a pair of a command and a draw of noise, all draws equally likely."""
-    return np.repeat(commands.onto(nodes, smooth=smooth) / n_draws, n_draws, axis=1).astype(np.float32)

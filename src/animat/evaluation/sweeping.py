@@ -42,43 +42,51 @@ def fill_row_weights(places: Float32[np.ndarray, " axes"], weights: Float32[np.n
 
 @compiled
 def step_back(
-    values: Float32[np.ndarray, " nodes_of_all_rows_and_cases"],
+    values: Float32[np.ndarray, " nodes_of_all_rows_and_layers"],
     rows: Int32[np.ndarray, "landings rows"],
     row_places: Float32[np.ndarray, "landings rows axes"],
     nodes: Int32[np.ndarray, "landings rows nodes"],
     places: Float32[np.ndarray, "landings rows nodes"],
     rewards: Float32[np.ndarray, "landings rows nodes"],
     row_offsets: Int32[np.ndarray, " taps"],
-    weights: Float32[np.ndarray, "cases actions landings"],
+    outcomes: Int32[np.ndarray, "layers outcomes 2"],
+    weights: Float32[np.ndarray, "layers actions outcomes"],
     remaining: int,
     lowest: np.float32,
     highest: np.float32,
-    best: Float32[np.ndarray, " nodes_of_all_rows_and_cases"],
+    best: Float32[np.ndarray, " nodes_of_all_rows_and_layers"],
 ) -> None:
     """What each state is worth under its best action, given what the states that follow are worth.
 
-        best(s) = max_a sum_k weights(a, k) (reward_k(s) + value(landing_k(s)))
+        best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))),    (k, m) = outcomes_l(o)
 
-    The rows around a landing are the same for all of a row's nodes, and for all cases: they are added up once, node by
-    node, which is fast, and what is left to do for each node is to interpolate along the row.
+    There is one layer of values for each case; for one whose neurons remember, a layer for each class of the last
+    response. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
+    once, node by node, which is fast, and what is left to do for each node is to interpolate along the row.
 
     Args:
-        values: of the states that follow, at the grid's nodes: row by row, in a row case by case.
+        values: of the states that follow, at the grid's nodes: row by row, in a row layer by layer.
         rows, row_places, nodes, places, rewards: the landings, as in `animat.evaluation.landings.Landings`.
         row_offsets: of the rows around a landing.
-        weights: of the landings, for each case and action.
+        outcomes: what an action can lead to in each layer: which landing, and which layer then.
+        weights: of the outcomes, for each layer and action.
         remaining: iterations left after this one.
         lowest, highest: what no value can be outside of; interpolation near a cliff could pass them.
         best: filled, as `values`.
     """
     n_landings, n_rows, n_nodes = nodes.shape
-    n_cases, n_actions, _ = weights.shape
+    n_layers, n_actions, n_outcomes = weights.shape
     n_taps = len(row_offsets)
-    width = n_nodes * n_cases
+    width = n_nodes * n_layers
     tap_weights = np.empty(n_taps, np.float32)
     summed = np.empty(width, np.float32)
     landed = np.empty((n_landings, width), np.float32)
     worth = np.empty(n_nodes, np.float32)
+    follows = np.zeros((n_landings, n_layers), np.bool_)
+    for layer in range(n_layers):
+        for outcome in range(n_outcomes):
+            k, then = outcomes[layer, outcome]
+            follows[k, then] = True
     for row in range(n_rows):
         for k in range(n_landings):
             alive = False
@@ -100,33 +108,37 @@ def step_back(
                         i3 = (first + row_offsets[tap + 3]) * width
                         v0, v1 = values[i0 : i0 + width], values[i1 : i1 + width]
                         v2, v3 = values[i2 : i2 + width], values[i3 : i3 + width]
-                        for j in range(width):
-                            summed[j] += (w0 * v0[j] + w1 * v1[j]) + (w2 * v2[j] + w3 * v3[j])
+                        for layer in range(n_layers):
+                            if follows[k, layer]:
+                                for j in range(layer * n_nodes, (layer + 1) * n_nodes):
+                                    summed[j] += (w0 * v0[j] + w1 * v1[j]) + (w2 * v2[j] + w3 * v3[j])
             for node in range(n_nodes):
                 at = nodes[k, row, node]
                 reward = rewards[k, row, node]
                 if at < 0:
                     if at == -2 and remaining > 0:
                         reward += places[k, row, node]
-                    for case in range(n_cases):
-                        landed[k, case * n_nodes + node] = reward
+                    for layer in range(n_layers):
+                        landed[k, layer * n_nodes + node] = reward
                 else:
                     w0, w1, w2, w3 = cubic(places[k, row, node])
-                    for case in range(n_cases):
-                        i = case * n_nodes + at
-                        landed[k, case * n_nodes + node] = reward + (
-                            (w0 * summed[i] + w1 * summed[i + 1]) + (w2 * summed[i + 2] + w3 * summed[i + 3])
-                        )
-        for case in range(n_cases):
-            start = row * width + case * n_nodes
+                    for layer in range(n_layers):
+                        if follows[k, layer]:
+                            i = layer * n_nodes + at
+                            landed[k, layer * n_nodes + node] = reward + (
+                                (w0 * summed[i] + w1 * summed[i + 1]) + (w2 * summed[i + 2] + w3 * summed[i + 3])
+                            )
+        for layer in range(n_layers):
+            start = row * width + layer * n_nodes
             here = best[start : start + n_nodes]
             here[:] = f4(-np.inf)
             for action in range(n_actions):
                 worth[:] = f4(0)
-                for k in range(n_landings):
-                    weight = weights[case, action, k]
+                for outcome in range(n_outcomes):
+                    weight = weights[layer, action, outcome]
                     if weight != f4(0):
-                        there = landed[k, case * n_nodes : (case + 1) * n_nodes]
+                        k, then = outcomes[layer, outcome]
+                        there = landed[k, then * n_nodes : (then + 1) * n_nodes]
                         for node in range(n_nodes):
                             worth[node] += weight * there[node]
                 for node in range(n_nodes):
@@ -137,14 +149,16 @@ def step_back(
 
 @compiled
 def look_ahead(
-    values: Float32[np.ndarray, "rows nodes"],
+    values: Float32[np.ndarray, "rows layers nodes"],
     rows: Int32[np.ndarray, "landings states"],
     row_places: Float32[np.ndarray, "landings states axes"],
     nodes: Int32[np.ndarray, "landings states"],
     places: Float32[np.ndarray, "landings states"],
     rewards: Float32[np.ndarray, "landings states"],
     row_offsets: Int32[np.ndarray, " taps"],
-    weights: Float32[np.ndarray, "actions landings"],
+    layers: Int32[np.ndarray, " states"],
+    outcomes: Int32[np.ndarray, "layers outcomes 2"],
+    weights: Float32[np.ndarray, "layers actions outcomes"],
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
@@ -154,33 +168,37 @@ def look_ahead(
         values: of the states that follow, of one case.
         rows, row_places, nodes, places, rewards: the landings of the states.
         row_offsets: of the rows around a landing.
-        weights: of the landings, for each action.
+        layers: of the states.
+        outcomes, weights: as in `step_back`, of the case's layers.
         remaining: iterations left after this one.
         chosen: filled.
     """
-    n_landings, n_states = nodes.shape
+    n_states = nodes.shape[1]
+    _, n_actions, n_outcomes = weights.shape
     n_taps = len(row_offsets)
     tap_weights = np.empty(n_taps, np.float32)
-    landed = np.empty(n_landings, np.float32)
+    landed = np.empty(n_outcomes, np.float32)
     for state in range(n_states):
-        for k in range(n_landings):
-            landed[k] = rewards[k, state]
+        layer = layers[state]
+        for outcome in range(n_outcomes):
+            k, then = outcomes[layer, outcome]
+            landed[outcome] = rewards[k, state]
             at = nodes[k, state]
             if at == -2 and remaining > 0:
-                landed[k] += places[k, state]
+                landed[outcome] += places[k, state]
             if at >= 0:
                 fill_row_weights(row_places[k, state], tap_weights)
                 w0, w1, w2, w3 = cubic(places[k, state])
                 for tap in range(n_taps):
-                    row = values[rows[k, state] + row_offsets[tap]]
-                    landed[k] += tap_weights[tap] * (
+                    row = values[rows[k, state] + row_offsets[tap], then]
+                    landed[outcome] += tap_weights[tap] * (
                         (w0 * row[at] + w1 * row[at + 1]) + (w2 * row[at + 2] + w3 * row[at + 3])
                     )
         highest = f4(-np.inf)
-        for action in range(len(weights)):
+        for action in range(n_actions):
             worth = f4(0)
-            for k in range(n_landings):
-                worth += weights[action, k] * landed[k]
+            for outcome in range(n_outcomes):
+                worth += weights[layer, action, outcome] * landed[outcome]
             if worth > highest:
                 highest = worth
                 chosen[state] = action

@@ -15,9 +15,10 @@ from animat.animat import Animat, Delivery
 from animat.errors import InvalidArgument
 from animat.mapping import Mapping, mapping_named
 from animat.neurons.conditions import conditions_named
+from animat.neurons.kinds import Kind
 from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.series import extract_series
-from animat.neurons.simulator import Kind, NeuronSimulator
+from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.neurons.windows import DEFAULT_WINDOW_MS
 from animat.recordings.reading import read_recordings
@@ -78,7 +79,7 @@ def set_up(
             first.
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
         window_ms: when a response is read after its stimulus.
-        kind: `histogram` (the paper) or `empirical`.
+        kind: `histogram` (the paper), `empirical` or `memory`.
         delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
         parameters: of the robot, `pole_mass_kg=0.55`.
 

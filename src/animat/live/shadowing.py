@@ -25,9 +25,10 @@ from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan
 from animat.live.recording import record_within
 from animat.live.trainers import Trainers
+from animat.neurons.kinds import Kind
 from animat.neurons.responses import Responses
 from animat.neurons.series import extract_series
-from animat.neurons.simulator import Kind, pooled_percentiles
+from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies

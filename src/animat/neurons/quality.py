@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from animat.neurons.bursts import BurstSeparation
 from animat.neurons.conditions import NO_CONDITION, Assignment
 from animat.neurons.drift_quality import drift_findings
+from animat.neurons.memory_quality import memory_findings
 from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
 from animat.neurons.timing_quality import artefact_findings
 from animat.recordings.findings import Finding
@@ -65,6 +66,7 @@ def findings_on(
         *_bursts(responses, bursts),
         *_difference(responses),
         *drift_findings(responses),
+        *memory_findings(responses),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class Responses:
         findings: what was noticed about them.
         time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
             responses that come from elsewhere.
+        before_hz: x of the response before each one, 0 before the first, which follows silence, shape (responses,);
+            left out, they are those of `rate_hz`.
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
@@ -55,6 +57,7 @@ class Responses:
     start_min: float = 0.0
     findings: tuple[Finding, ...] = ()
     time_s: Float64[np.ndarray, " responses"] | None = None
+    before_hz: Float64[np.ndarray, " responses"] = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {
@@ -62,7 +65,10 @@ class Responses:
             "rate_hz": np.float64,
             "active_ratio": np.float64,
             "is_burst": np.bool_,
+            "before_hz": np.float64,
         }
+        if not len(self.before_hz):
+            object.__setattr__(self, "before_hz", np.concatenate([[0.0], self.rate_hz])[:-1])
         if self.time_s is not None:
             columns["time_s"] = np.float64
         for name, dtype in columns.items():
@@ -98,7 +104,8 @@ class Responses:
     def redrawn(self, rng: np.random.Generator) -> Responses:
         """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
 
-        Bursts are left out, and a condition without other responses stays without.
+        Each keeps the response that was before it. Bursts are left out, and a condition without other responses stays
+        without.
         """
         rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
         drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
@@ -110,6 +117,7 @@ class Responses:
             is_burst=self.is_burst[drawn],
             findings=(),
             time_s=None if self.time_s is None else self.time_s[drawn],
+            before_hz=self.before_hz[drawn],
         )
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:

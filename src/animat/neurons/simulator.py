@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, final
+from typing import Any, ClassVar, TypeAlias, final
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,6 @@ from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.responses import Responses
-
-Kind = Literal["histogram", "empirical"]
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it is on its way to another process."""
@@ -31,9 +29,11 @@ class NeuronSimulator(abc.ABC):
 
     Attributes:
         percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,).
+        has_memory: whether what it answers depends on its last answer.
     """
 
     percentiles: Float[Stored, "*recordings percentiles"]
+    has_memory: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
@@ -44,10 +44,19 @@ class NeuronSimulator(abc.ABC):
     def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
         """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies."""
 
+    def answer(
+        self, condition: Int[Array, ""], uniform: Float[Array, ""], last_hz: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """The response x to a condition after the response `last_hz`, by a uniform in [0, 1); all in Hz per channel.
+
+        A simulator without memory answers the same whatever was before.
+        """
+        return self.quantile(condition, uniform)
+
     @final
-    def sample(self, key: PRNGKeyArray, condition: Int[Array, ""]) -> Float[Array, ""]:
-        """Draw one response x to a condition, in Hz per channel."""
-        return self.quantile(condition, jax.random.uniform(key))
+    def sample(self, key: PRNGKeyArray, condition: Int[Array, ""], last_hz: float | Array = 0.0) -> Float[Array, ""]:
+        """Draw one response x to a condition after another (0: after silence), both in Hz per channel."""
+        return self.answer(condition, jax.random.uniform(key), jnp.asarray(last_hz, jnp.float32))
 
 
 @jax.tree_util.register_dataclass
@@ -175,27 +184,6 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
     return EmpiricalSimulator(
         jnp.asarray(table, jnp.float32), jnp.asarray(counts, jnp.int32), pooled_percentiles(responses)
     )
-
-
-def fit_simulator(
-    responses: Responses,
-    *,
-    kind: str = "histogram",
-    bins: int = 20,
-    range_hz: float | None = None,
-    room: int | None = None,
-) -> NeuronSimulator:
-    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of an empirical one.
-
-    Raises:
-        InvalidArgument: for another kind, and as `fit_histogram` and `fit_empirical` do.
-        UnusableData: if a condition has no non-burst response.
-    """
-    if kind == "histogram":
-        return fit_histogram(responses, bins=bins, range_hz=range_hz)
-    if kind == "empirical":
-        return fit_empirical(responses, room=room)
-    raise InvalidArgument(f"kind: expected 'histogram' or 'empirical', got {kind!r}")
 
 
 def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:

@@ -14,8 +14,9 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import Fidelity, fidelity
+from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import Kind, NeuronSimulator, fit_simulator
+from animat.neurons.simulator import NeuronSimulator
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 
@@ -84,7 +85,8 @@ def fit_timeline(
 
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
-        kind: `"histogram"` (the paper) or `"empirical"` (draw a measured value).
+        kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one that was measured
+            after a response like the last).
         bins: of a histogram.
         range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
             percentiles are the edges (`fit_histogram`).

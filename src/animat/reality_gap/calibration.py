@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.neurons.conditions import Condition
+from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import Kind, NeuronSimulator, fit_simulator
+from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation

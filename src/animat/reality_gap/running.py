@@ -109,6 +109,10 @@ def run_policies(
             f"{culture.now_s / 60:.0f} min: cultures drift; take a later recording (--at-min), or train on later ones"
         )
         findings += (Finding("old-calibration", "warning", sentence, age_min),)
+    remembers = next((finding for finding in calibration.findings if finding.name == "memory"), None)
+    if remembers is not None and not calibration.simulator.has_memory:
+        sentence = f"{remembers.sentence}: what is lived will be something else than predicted (--simulator memory)"
+        findings += (Finding("no-memory", "warning", sentence, remembers.value),)
     account = account or Account()
 
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))

@@ -129,7 +129,7 @@ class Simulators:
         despite: findings to go on in spite of.
     """
 
-    kind: Literal["histogram", "empirical"] = "histogram"
+    kind: Literal["histogram", "empirical", "memory"] = "histogram"
     bins: int = 20
     range_hz: float | None = None
     conditions: str = ""

@@ -183,7 +183,10 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             if str(file["fingerprint"]) != fingerprint:
                 raise InvalidFile(f"{path}: expected a checkpoint of this training, got one of another; remove it")
-            read = [jnp.asarray(file[f"leaf{i}"]) for i in range(len(leaves))]
+            kept = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]
+            if [(a.shape, a.dtype) for a in kept] != [(a.shape, a.dtype) for a in leaves]:
+                raise InvalidFile(f"{path}: expected a checkpoint as this animat writes it, got another's; remove it")
+            read = [jnp.asarray(array) for array in kept]
             done, curve = int(file["done"]), file["curve"]
     except InvalidFile:
         raise

@@ -1,0 +1,36 @@
+"""The kinds of neuron simulators, by name."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from animat.errors import InvalidArgument
+from animat.neurons.memory import fit_memory
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
+
+Kind = Literal["histogram", "empirical", "memory"]
+"""A distribution in bins (the paper); a measured value; one that was measured after a response like the last."""
+
+
+def fit_simulator(
+    responses: Responses,
+    *,
+    kind: str = "histogram",
+    bins: int = 20,
+    range_hz: float | None = None,
+    room: int | None = None,
+) -> NeuronSimulator:
+    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others.
+
+    Raises:
+        InvalidArgument: for another kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
+        UnusableData: if a condition has no non-burst response.
+    """
+    if kind == "histogram":
+        return fit_histogram(responses, bins=bins, range_hz=range_hz)
+    if kind == "empirical":
+        return fit_empirical(responses, room=room)
+    if kind == "memory":
+        return fit_memory(responses, room=room)
+    raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")

@@ -1,0 +1,272 @@
+"""The simulator that remembers, against nearest neighbours found by hand, Markov chains, and games solved exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from animat.animat import Animat
+from animat.errors import InvalidArgument, UnusableData
+from animat.evaluation.commands import commands_after, commands_of
+from animat.evaluation.optimum import best_return, best_returns
+from animat.evaluation.rollouts import Constant, Uniform, roll_out
+from animat.mapping import Linear, Thresholds
+from animat.neurons.conditions import Condition
+from animat.neurons.made_up import made_up_simulator
+from animat.neurons.memory import MemorySimulator, fit_memory
+from animat.neurons.memory_quality import memory_findings
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import fit_empirical
+from animat.neurons.timeline import fit_timeline
+from animat.robots.cartpole import Cartpole
+from animat.robots.navigation import Navigation
+from test_optimum import STEPS, Stairs, coins
+from test_simulator import responses_of
+
+
+def chain(
+    n: int, *, after_low: tuple[float, ...], after_high: tuple[float, ...], seed: int = 1, **changes: Any
+) -> Responses:
+    """Responses of a culture that remembers whether its last response was high: each is high with these chances."""
+    rng = np.random.default_rng(seed)
+    condition = rng.integers(0, len(after_low), n)
+    x = np.zeros(n)
+    last = 0.0
+    for i, c in enumerate(condition):
+        high = rng.random() < (after_high if last >= 50 else after_low)[c]
+        last = x[i] = rng.uniform(50, 100) if high else rng.uniform(0, 50)
+    columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": np.zeros(n, bool)}
+    return replace(responses_of(*[[1.0]] * len(after_low)), before_hz=np.empty(0), **columns, **changes)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 1), st.integers(0, 6), st.booleans()), min_size=3, max_size=40),
+    st.integers(-1, 7),
+    st.floats(0, 1, exclude_max=True, width=32),
+)
+def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], last: int, uniform: float) -> None:
+    """What is drawn is in the list, comes of the right condition, and no other k came after responses more alike."""
+    condition, x, burst = (np.array(column) for column in zip(*rows, strict=True))
+    responses = replace(
+        responses_of([1.0], [1.0]),
+        condition=condition,
+        rate_hz=x.astype(float),
+        active_ratio=np.full(len(x), 0.1),
+        is_burst=burst,
+        before_hz=np.empty(0),
+    )
+    for c in (0, 1):
+        mine = [i for i in range(len(x)) if condition[i] == c and not burst[i]]
+        if not mine:
+            with pytest.raises(UnusableData, match="expected non-burst responses to fit"):
+                fit_memory(responses)
+            return
+    simulator = fit_memory(responses)
+    before = np.concatenate([[0], x[:-1]])
+    for c in (0, 1):
+        mine = np.array([i for i in range(len(x)) if condition[i] == c and not burst[i]])
+        k = round(np.sqrt(len(mine)))
+        drawn = float(simulator.answer(jnp.int32(c), jnp.float32(uniform), jnp.float32(last)))
+        # In ranks: those before which a smaller response lies, the same one, and a larger one.
+        ranks = np.searchsorted(np.sort(before[mine]), [last, last + 0.5])
+        middle = ranks.mean()
+        ordered = mine[np.argsort(before[mine], kind="stable")]
+        reach = np.abs(np.arange(len(mine)) + 0.5 - middle)
+        nearest = set(x[ordered[np.argsort(reach, kind="stable")[: k + 1]]].tolist())
+        assert drawn in nearest
+
+
+def test_what_was_recorded_first_follows_silence_and_what_follows_a_burst_is_kept() -> None:
+    responses = responses_of([3.0, 4.0, 5.0], bursts_hz=(90.0,))
+    assert responses.before_hz.tolist() == [0.0, 3.0, 4.0, 5.0]
+    later = replace(
+        responses, is_burst=np.array([False, True, False, False]), rate_hz=np.array([3.0, 90.0, 5.0, 6.0]),
+        before_hz=np.empty(0),
+    )  # fmt: skip
+    simulator = fit_memory(later)
+    assert np.asarray(simulator.before_hz)[0].tolist() == [0.0, 5.0, 90.0]
+    assert np.asarray(simulator.after_hz)[0].tolist() == [3.0, 6.0, 5.0]
+
+
+def test_a_known_chain_is_answered_as_it_is() -> None:
+    """Two conditions, four chances: the share of high answers after a low and a high one, within chance."""
+    low, high = (0.1, 0.5), (0.3, 0.9)
+    simulator = fit_memory(chain(8000, after_low=low, after_high=high))
+    uniforms = jnp.linspace(0, 1, 2000, endpoint=False)
+    for c in (0, 1):
+        for last, chance in ((25.0, low[c]), (75.0, high[c])):
+            lasts = jnp.linspace(last - 15, last + 15, 50)
+            x = jax.vmap(lambda at, c=c: jax.vmap(lambda u: simulator.answer(jnp.int32(c), u, at))(uniforms))(lasts)
+            share = float(jnp.mean(x >= 50))
+            # About 1,200 responses lie behind it.
+            assert abs(share - chance) < 5 * np.sqrt(chance * (1 - chance) / 1200)
+
+
+def test_without_regard_to_the_last_it_is_the_empirical_simulator() -> None:
+    responses = chain(400, after_low=(0.1, 0.5), after_high=(0.3, 0.9))
+    remembering, plain = fit_memory(responses), fit_empirical(responses)
+    uniforms = jnp.linspace(0, 1, 300, endpoint=False)
+    for c in (0, 1):
+        ours, theirs = (jax.vmap(s.quantile, (None, 0))(jnp.int32(c), uniforms) for s in (remembering, plain))
+        np.testing.assert_array_equal(ours, theirs)
+        np.testing.assert_array_equal(
+            jax.vmap(plain.answer, (None, 0, None))(jnp.int32(c), uniforms, jnp.float32(70.0)), theirs
+        )
+    np.testing.assert_array_equal(remembering.percentiles, plain.percentiles)
+
+
+def test_redrawn_responses_keep_what_was_before_them() -> None:
+    responses = chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9))
+    redrawn = responses.redrawn(np.random.default_rng(0))
+    pairs = set(zip(responses.before_hz, responses.rate_hz, strict=True))
+    assert len(redrawn) == 500
+    assert set(zip(redrawn.before_hz, redrawn.rate_hz, strict=True)) <= pairs
+
+
+def test_simulators_of_recordings_of_different_lengths_stack() -> None:
+    series = [chain(n, after_low=(0.1, 0.5), after_high=(0.3, 0.9), start_min=float(n)) for n in (200, 300)]
+    timeline = fit_timeline(series, kind="memory")
+    alone = fit_memory(series[0])
+    uniforms = jnp.linspace(0, 1, 100, endpoint=False)
+    for last in (0.0, 30.0, 80.0, 500.0):
+        drawn = [
+            jax.vmap(s.answer, (None, 0, None))(jnp.int32(1), uniforms, jnp.float32(last))
+            for s in (timeline.at(200.0), alone)
+        ]
+        np.testing.assert_array_equal(*drawn)
+    with pytest.raises(InvalidArgument, match="room"):
+        fit_memory(series[1], room=20)
+
+
+def test_an_animat_remembers_its_last_response() -> None:
+    # Whatever is chosen, this culture answers as it did before.
+    stubborn = replace(
+        responses_of([1.0], [1.0]),
+        condition=np.tile([0, 1], 100),
+        rate_hz=np.repeat([10.0, 90.0], 100),
+        active_ratio=np.full(200, 0.1),
+        is_burst=np.zeros(200, bool),
+        before_hz=np.empty(0),
+    )
+    simulator = fit_memory(stubborn)
+    animat = Animat(Cartpole(), Thresholds(1), 2)
+    state = animat.reset(jax.random.key(0))
+    assert float(state.last_hz) == 0.0
+    outcome = animat.step(jax.random.key(1), state._replace(last_hz=jnp.float32(80.0)), jnp.int32(0), simulator)
+    assert float(outcome.rate_hz) == 90.0
+    assert float(outcome.state.last_hz) == 90.0
+    assert float(animat.step(jax.random.key(1), state, jnp.int32(1), simulator).rate_hz) == 10.0
+
+
+def persistent(n: int = 10) -> MemorySimulator:
+    """A coin for each of two conditions: heads in 0.2 and 0.5 of the tosses after tails, 0.5 and 0.8 after heads."""
+    tails, heads = (2, 5), (5, 8)
+    after = np.array(
+        [[0.0] * (n - t) + [1.0] * t + [0.0] * (n - h) + [1.0] * h for t, h in zip(tails, heads, strict=True)]
+    )
+    before = np.array([[0.0] * n + [1.0] * n] * 2)
+    plain = coins(3, 6)
+    return MemorySimulator(
+        jnp.sort(jnp.asarray(after, jnp.float32), axis=1),
+        jnp.full(2, 2 * n),
+        plain.percentiles,
+        jnp.asarray(before, jnp.float32),
+        jnp.asarray(after, jnp.float32),
+        jnp.full(2, n),
+    )
+
+
+@pytest.mark.parametrize("limit", [1, 2, 5, 60])
+def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
+    """Up and down stairs with a coin that remembers, folded back by hand over step and last toss."""
+    heads = np.array([[0.2, 0.5], [0.5, 0.8]])  # after tails and heads, of each action
+    worth = np.zeros((5, 2))
+    for _ in range(limit):
+        up = np.array([[1.0 if s + 1 == 4 else worth[s + 1, 1]] * 2 for s in range(1, 4)])
+        down = np.array([[0.0 if s - 1 == 0 else worth[s - 1, 0]] * 2 for s in range(1, 4)])
+        of_actions = heads[None] * up[:, :, None] + (1 - heads[None]) * down[:, :, None]
+        worth[1:4] = of_actions.max(-1)
+    found = best_return(Animat(Stairs(limit), Thresholds(1), 2), persistent(), grid=STEPS, episodes=4000)
+    # Chances are known to one of 2,048 draws.
+    assert found.value == pytest.approx(worth[2, 0], abs=1e-3)
+    assert abs(found.monte_carlo - worth[2, 0]) < 4 * found.standard_error + 1e-6
+
+
+def test_cases_with_and_without_memory_have_the_limits_that_they_have_alone() -> None:
+    environment = Animat(Stairs(), Thresholds(1), 2)
+    cases = [(environment, coins(3, 6)), (environment, persistent()), (environment, coins(1, 2))]
+    together = best_returns(cases, grid=STEPS, episodes=500)
+    for case, found in zip(cases, together, strict=True):
+        assert best_return(*case, grid=STEPS, episodes=500).to_dict() == found.to_dict()
+
+
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9), Linear()])
+def test_a_culture_without_memory_has_the_commands_that_it_has_without_remembering(mapping: Any) -> None:
+    """After every class of responses the commands are those of the condition, within the chance of its samples."""
+    rng = np.random.default_rng(0)
+    simulator = fit_memory(responses_of(*[rng.permutation(rng.gamma(6.0, 1.0 + c, 2000)) for c in range(3)]))
+    environment = Animat(Navigation(), mapping, 3)
+    after = commands_after(environment, simulator)
+    assert len(after) == len(after[0]) == 10
+    whole = commands_of(environment, simulator)
+    means = np.sum(whole.levels * whole.probabilities, axis=1)
+    for row in after:
+        np.testing.assert_allclose(sum(each.probabilities.sum(axis=1) for each in row), 1.0, atol=1e-9)
+        mean = sum(np.sum(each.levels * each.probabilities, axis=1) for each in row)
+        # 45 responses lie behind a last one, some hundred behind a class of them.
+        np.testing.assert_allclose(mean, means, atol=0.35)
+    plain = made_up_simulator()
+    (alone,) = commands_after(Animat(Navigation(), mapping, 5), plain)
+    assert len(alone) == 1
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
+def test_the_controller_that_remembers_gets_what_was_promised(robot: Any, mapping: Any) -> None:
+    """The limit's own controller, on the simulator with its memory of a real number, beside ten classes of it."""
+    chances = {"after_low": (0.05, 0.2, 0.35, 0.45, 0.5), "after_high": (0.25, 0.5, 0.75, 0.85, 0.9)}
+    simulator = fit_memory(chain(2500, **chances))
+    found = best_return(Animat(robot, mapping, 5), simulator, resolution=0.8, episodes=4000)
+    assert abs(found.value - found.monte_carlo) < 4 * found.standard_error + 2 * found.grid_error + 0.02 * abs(
+        found.value
+    )
+
+
+def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
+    simulator = fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9)))
+    environment = Animat(Stairs(), Thresholds(1), 2, "shuffled")
+    limit = best_return(environment, simulator, grid=STEPS, episodes=0)
+    played = [
+        roll_out(environment, simulator, actor, 1, episodes=4000, seed=1).returns
+        for actor in (Uniform(), Constant(jnp.array([0])))
+    ]
+    for returns in played:
+        # Ten classes stand for a memory of a real number.
+        assert abs(returns.mean() - limit.value) < 5 * returns.std() / np.sqrt(4000) + 0.03
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000))
+def test_memory_is_found_where_there_is_one_and_not_where_there_is_none(seed: int) -> None:
+    remembers = chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9), seed=seed)
+    (found,) = memory_findings(remembers)
+    assert found.severity == "note"
+    assert found.value == pytest.approx(0.4, abs=0.2)
+    does_not = chain(500, after_low=(0.2, 0.7), after_high=(0.2, 0.7), seed=seed)
+    assert not list(memory_findings(does_not))
+
+
+def test_conditions_in_blocks_are_not_taken_for_memory() -> None:
+    rng = np.random.default_rng(0)
+    blocks = responses_of(*[rng.normal(mean, 1.0, 100) for mean in (20, 25, 30, 35, 40)])
+    assert not list(memory_findings(blocks))
+    assert not list(memory_findings(replace(blocks, conditions=(*blocks.conditions, Condition("none", 1.0, "Hz")))))
