@@ -1,11 +1,13 @@
 """The headline table: predicted against lived return by how recordings and loop present, over cultures and both robots.
 
-    python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation] [--policies 2] [--episodes 20]
-        [--thresholds follow held] [--controls] [--out gap/]
+    python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation]
+        [--ways paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
+        [--controls] [--out gap/]
 
-For each virtual culture and presentation - the paper's blocks with one pulse, mixed with one, mixed with five - the
-culture is recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same culture from where
-the last recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
+For each virtual culture and way - the paper's blocks with one pulse, mixed with one, mixed with five, and mixed with
+one, recorded five times as long and simulated with its memory, through one threshold and through nine - the culture is
+recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same culture from where the last
+recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +24,11 @@ from animat.cli import main as animat
 COLUMNS = (
     "culture",
     "robot",
-    "presentation",
+    "recorded",
+    "simulator",
+    "mapping",
     "percentiles",
-    "random",
+    "random, lived",
     "limit",
     "predicted, 95 %",
     "lived",
@@ -31,7 +36,31 @@ COLUMNS = (
     "of the range",
     "pulses/action",
 )
-PRESENTATIONS = (("blocked", 1), ("mixed", 1), ("mixed", 5))
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a culture is recorded and simulated, and what policies act through."""
+
+    order: str = "mixed"
+    pulses: int = 1
+    presentations: int = 100
+    simulator: str = "histogram"
+    mapping: str = "1-threshold"
+
+    @property
+    def recorded(self) -> str:
+        """In words."""
+        return f"{self.order}, {self.pulses}, {self.presentations} times"
+
+
+WAYS = {
+    "paper": Way(order="blocked"),
+    "mixed": Way(),
+    "five": Way(pulses=5),
+    "memory": Way(presentations=500, simulator="memory"),
+    "memory9": Way(presentations=500, simulator="memory", mapping="9-thresholds"),
+}
 
 
 def main() -> None:
@@ -39,6 +68,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--robots", nargs="+", default=["cartpole", "navigation"])
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     parser.add_argument("--thresholds", nargs="+", default=["follow", "held"])
     parser.add_argument("--policies", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=20)
@@ -48,45 +78,42 @@ def main() -> None:
     options = parser.parse_args()
 
     lines: list[str] = []
-    for seed in options.seeds:
-        for order, pulses in PRESENTATIONS:
-            folder = options.out / f"culture{seed}-{order}-{pulses}"
-            recordings = str(folder / "recordings")
-            presented = ["--order", order, "--pulses", str(pulses)]
-            expect(["record", "--seed", str(seed), "--sessions", "2", *presented, "--out", recordings])
-            for robot in options.robots:
-                policies = str(folder / robot / "policies")
-                given = ["--recordings", recordings, "--policies", str(options.policies), "--duration-min", "20"]
-                given += ["--iterations", str(options.iterations)] if options.iterations else []
-                expect(["train", robot, *given, "--out", policies])
-                for thresholds in options.thresholds:
-                    table = folder / robot / f"{thresholds}.json"
-                    if not table.exists():
-                        run = ["run", policies, "--recordings", recordings, "--episodes", str(options.episodes)]
-                        run += ["--controls", "all" if options.controls else "random", "--thresholds", thresholds]
-                        run += ["--out", str(free(folder / robot / thresholds))]
-                        table.write_text(json.dumps(ran(run)) + "\n")
-                    lines.append(told(seed, f"{order}, {pulses}", thresholds, json.loads(table.read_text())))
-                    print(lines[-1], flush=True)
-    print(
-        "\n| culture | robot | presentation | percentiles | random | limit | predicted, 95 % | lived | gap, 95 % ",
-        end="",
-    )
-    print("| of the range | pulses/action |")
-    print("|---" * 11 + "|")
+    for seed, (name, way) in itertools.product(options.seeds, ((name, WAYS[name]) for name in options.ways)):
+        recordings = str(options.out / f"culture{seed}" / f"{way.order}-{way.pulses}-{way.presentations}")
+        presented = ["--order", way.order, "--pulses", str(way.pulses), "--presentations", str(way.presentations)]
+        expect(["record", "--seed", str(seed), "--sessions", "2", *presented, "--out", recordings])
+        for robot in options.robots:
+            folder = options.out / f"culture{seed}" / name / robot
+            policies = str(folder / "policies")
+            given = ["--recordings", recordings, "--policies", str(options.policies), "--duration-min", "20"]
+            given += ["--simulator", way.simulator, "--mapping", way.mapping]
+            given += ["--iterations", str(options.iterations)] if options.iterations else []
+            expect(["train", robot, *given, "--out", policies])
+            for thresholds in options.thresholds:
+                table = folder / f"{thresholds}.json"
+                if not table.exists():
+                    run = ["run", policies, "--recordings", recordings, "--episodes", str(options.episodes)]
+                    run += ["--controls", "all" if options.controls else "random", "--thresholds", thresholds]
+                    run += ["--out", str(free(folder / thresholds))]
+                    table.write_text(json.dumps(ran(run)) + "\n")
+                lines.append(told(seed, way, thresholds, json.loads(table.read_text())))
+                print(lines[-1], flush=True)
+    print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
     print("\n".join(lines))
 
 
-def told(seed: int, presentation: str, thresholds: str, ran: dict[str, Any]) -> str:
+def told(seed: int, way: Way, thresholds: str, ran: dict[str, Any]) -> str:
     """A line of the table; the range is from random to the limit, both on the simulator."""
     policies, random = ran["rows"][0], next(row for row in ran["rows"] if row["name"] == "random")
     prediction, gap = policies["prediction"], policies["gap"]
     cells = (
         f"{seed}",
         ran["robot"],
-        presentation,
+        way.recorded,
+        way.simulator,
+        way.mapping,
         thresholds,
-        f"{random['predicted']:.1f}",
+        f"{random['predicted']:.1f}, {random['lived']:.1f}",
         f"{ran['limit']:.1f}",
         f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})",
         f"{policies['lived']:.1f}",
