@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.mapping import Linear, Thresholds
 from animat.neurons.conditions import Condition
+from animat.neurons.kinds import Kind
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.memory_quality import memory_findings
@@ -29,6 +31,8 @@ from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.studies.simulating import load_timeline, save_timeline
+from animat.studies.specification import Simulators
 from test_optimum import STEPS, Stairs, coins
 from test_simulator import responses_of
 
@@ -146,6 +150,18 @@ def test_simulators_of_recordings_of_different_lengths_stack() -> None:
         np.testing.assert_array_equal(*drawn)
     with pytest.raises(InvalidArgument, match="room"):
         fit_memory(series[1], room=20)
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> None:
+    series = [chain(n, after_low=(0.1, 0.5), after_high=(0.3, 0.9), start_min=float(n)) for n in (200, 300)]
+    timeline = fit_timeline(series, kind=kind)
+    save_timeline(timeline, tmp_path / "timeline.safetensors")
+    loaded = load_timeline(tmp_path / "timeline.safetensors")
+    assert type(loaded.simulators) is type(timeline.simulators)
+    for read, written in zip(jax.tree.leaves(loaded.simulators), jax.tree.leaves(timeline.simulators), strict=True):
+        np.testing.assert_array_equal(read, written)
+    assert Simulators(kind=kind).kind == loaded.fitted["kind"] == kind
 
 
 def test_an_animat_remembers_its_last_response() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.fidelity import Fidelity
+from animat.neurons.memory import MemorySimulator
 from animat.neurons.responses import Responses
 from animat.neurons.series import extract_series
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
@@ -26,7 +27,7 @@ from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE, write_table
 from animat.studies.specification import Study
 from animat.writing import written_whole
 
-_KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator)}
+_KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator, MemorySimulator)}
 
 
 @final
