@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,27 +14,32 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.animat import Animat
+import animat.gym  # noqa: F401
+from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, UnusableData
-from animat.evaluation.commands import commands_after, commands_of
+from animat.evaluation.commands import commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
-from animat.evaluation.rollouts import Constant, Uniform, roll_out
+from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.mapping import Linear, Thresholds
-from animat.neurons.conditions import Condition
+from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.kinds import Kind
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.memory_quality import memory_findings
-from animat.neurons.responses import Responses
+from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.protocol import Presentation
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.studies.simulating import load_timeline, save_timeline
 from animat.studies.specification import Simulators
+from animat.training.specification import Training
+from animat.training.trainer import train
 from test_optimum import STEPS, Stairs, coins
+from test_responses import recording
 from test_simulator import responses_of
 
 
@@ -49,17 +55,16 @@ def chain(
         high = rng.random() < (after_high if last >= 50 else after_low)[c]
         last = x[i] = rng.uniform(50, 100) if high else rng.uniform(0, 50)
     columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": np.zeros(n, bool)}
-    return replace(responses_of(*[[1.0]] * len(after_low)), before_hz=np.empty(0), **columns, **changes)
+    return replace(responses_of(*[[1.0]] * len(after_low)), before_hz=None, **columns, **changes)
 
 
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 1), st.integers(0, 6), st.booleans()), min_size=3, max_size=40),
     st.integers(-1, 7),
-    st.floats(0, 1, exclude_max=True, width=32),
 )
-def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], last: int, uniform: float) -> None:
-    """What is drawn is in the list, comes of the right condition, and no other k came after responses more alike."""
+def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], last: int) -> None:
+    """All that came after the very same response can be drawn, and nothing beyond the k nearest in rank."""
     condition, x, burst = (np.array(column) for column in zip(*rows, strict=True))
     responses = replace(
         responses_of([1.0], [1.0]),
@@ -67,39 +72,55 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], last: int
         rate_hz=x.astype(float),
         active_ratio=np.full(len(x), 0.1),
         is_burst=burst,
-        before_hz=np.empty(0),
     )
+    if any(not np.any((condition == c) & ~burst) for c in (0, 1)):
+        with pytest.raises(UnusableData, match="expected non-burst responses to fit"):
+            fit_memory(responses)
+        return
+    simulator = fit_memory(responses)
+    uniforms = jnp.linspace(0, 1, 400, endpoint=False)
     for c in (0, 1):
         mine = [i for i in range(len(x)) if condition[i] == c and not burst[i]]
-        if not mine:
-            with pytest.raises(UnusableData, match="expected non-burst responses to fit"):
-                fit_memory(responses)
-            return
-    simulator = fit_memory(responses)
-    before = np.concatenate([[0], x[:-1]])
-    for c in (0, 1):
-        mine = np.array([i for i in range(len(x)) if condition[i] == c and not burst[i]])
-        k = round(np.sqrt(len(mine)))
-        drawn = float(simulator.answer(jnp.int32(c), jnp.float32(uniform), jnp.float32(last)))
-        # In ranks: those before which a smaller response lies, the same one, and a larger one.
-        ranks = np.searchsorted(np.sort(before[mine]), [last, last + 0.5])
-        middle = ranks.mean()
-        ordered = mine[np.argsort(before[mine], kind="stable")]
-        reach = np.abs(np.arange(len(mine)) + 0.5 - middle)
-        nearest = set(x[ordered[np.argsort(reach, kind="stable")[: k + 1]]].tolist())
-        assert drawn in nearest
+        mine = [i for i in mine if i == 0 or not burst[i - 1]] or mine
+        before = {i: 0 if i == 0 or burst[i - 1] else x[i - 1] for i in mine}
+        k = int(simulator.nearest[c])
+        assert 1 <= k <= len(mine) == simulator.followers[c]
+        answers = jax.vmap(simulator.answer, (None, 0, None))(jnp.int32(c), uniforms, jnp.float32(last))
+        drawn = set(np.asarray(answers).tolist())
+        same = [i for i in mine if before[i] == last]
+        assert drawn >= {x[i] for i in same}
+        if len(same) >= k:
+            assert drawn == {x[i] for i in same}
+        # Between the last response and that before one that is drawn lie fewer than k others.
+        near = [
+            i for i in mine if sum(min(last, before[i]) < before[other] < max(last, before[i]) for other in mine) < k
+        ]
+        assert drawn <= {x[i] for i in near}
 
 
-def test_what_was_recorded_first_follows_silence_and_what_follows_a_burst_is_kept() -> None:
+def test_what_was_recorded_first_follows_silence_and_what_follows_a_burst_is_known_to() -> None:
     responses = responses_of([3.0, 4.0, 5.0], bursts_hz=(90.0,))
-    assert responses.before_hz.tolist() == [0.0, 3.0, 4.0, 5.0]
-    later = replace(
-        responses, is_burst=np.array([False, True, False, False]), rate_hz=np.array([3.0, 90.0, 5.0, 6.0]),
-        before_hz=np.empty(0),
-    )  # fmt: skip
+    assert responses.last_hz.tolist() == [0.0, 3.0, 4.0, 5.0]
+    later = replace(responses, is_burst=np.array([False, True, False, False]), rate_hz=np.array([3.0, 90.0, 5.0, 6.0]))
+    np.testing.assert_array_equal(later.last_hz, [0.0, 3.0, np.nan, 5.0])
     simulator = fit_memory(later)
-    assert np.asarray(simulator.before_hz)[0].tolist() == [0.0, 5.0, 90.0]
-    assert np.asarray(simulator.after_hz)[0].tolist() == [3.0, 6.0, 5.0]
+    assert int(simulator.followers[0]) == 2
+    assert np.asarray(simulator.before_hz)[0].tolist() == [0.0, 5.0, np.inf]
+    assert np.asarray(simulator.after_hz)[0, :2].tolist() == [3.0, 6.0]
+    # All that is not a burst is there for whoever does not ask what was before.
+    assert np.asarray(simulator.values_hz)[0].tolist() == [3.0, 5.0, 6.0]
+
+
+def test_what_came_before_is_what_was_presented_before() -> None:
+    """Also where that has no condition; and nothing, where nothing was presented for a while."""
+    times_s = [0.1, 0.3, 0.5, 0.7, 3.0, 3.2]
+    spikes = [(t + 0.003 + 0.0005 * i, 0) for n, t in enumerate(times_s) for i in range(n)]
+    given = recording(spikes, times_s, n_channels=1, frequency_hz=[5.0, 80.0, 5.0, 80.0, 5.0, 5.0])
+    every = extract_responses(given, burst_threshold=1.0)
+    np.testing.assert_allclose(every.last_hz, np.array([0, 0, 1, 2, 0, 4]) * 125.0)
+    fives = extract_responses(given, conditions_named("frequency:5"), burst_threshold=1.0)
+    np.testing.assert_allclose(fives.rate_hz, np.array([0, 2, 4, 5]) * 125.0)
+    np.testing.assert_allclose(fives.last_hz, np.array([0, 1, 0, 4]) * 125.0)
 
 
 def test_a_known_chain_is_answered_as_it_is() -> None:
@@ -109,7 +130,7 @@ def test_a_known_chain_is_answered_as_it_is() -> None:
     uniforms = jnp.linspace(0, 1, 2000, endpoint=False)
     for c in (0, 1):
         for last, chance in ((25.0, low[c]), (75.0, high[c])):
-            lasts = jnp.linspace(last - 15, last + 15, 50)
+            lasts = jnp.linspace(last - 10, last + 10, 50)
             x = jax.vmap(lambda at, c=c: jax.vmap(lambda u: simulator.answer(jnp.int32(c), u, at))(uniforms))(lasts)
             share = float(jnp.mean(x >= 50))
             # About 1,200 responses lie behind it.
@@ -132,9 +153,9 @@ def test_without_regard_to_the_last_it_is_the_empirical_simulator() -> None:
 def test_redrawn_responses_keep_what_was_before_them() -> None:
     responses = chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9))
     redrawn = responses.redrawn(np.random.default_rng(0))
-    pairs = set(zip(responses.before_hz, responses.rate_hz, strict=True))
+    pairs = set(zip(responses.last_hz, responses.rate_hz, strict=True))
     assert len(redrawn) == 500
-    assert set(zip(redrawn.before_hz, redrawn.rate_hz, strict=True)) <= pairs
+    assert set(zip(redrawn.last_hz, redrawn.rate_hz, strict=True)) <= pairs
 
 
 def test_simulators_of_recordings_of_different_lengths_stack() -> None:
@@ -172,7 +193,7 @@ def test_an_animat_remembers_its_last_response() -> None:
         rate_hz=np.repeat([10.0, 90.0], 100),
         active_ratio=np.full(200, 0.1),
         is_burst=np.zeros(200, bool),
-        before_hz=np.empty(0),
+        before_hz=None,
     )
     simulator = fit_memory(stubborn)
     animat = Animat(Cartpole(), Thresholds(1), 2)
@@ -198,6 +219,7 @@ def persistent(n: int = 10) -> MemorySimulator:
         plain.percentiles,
         jnp.asarray(before, jnp.float32),
         jnp.asarray(after, jnp.float32),
+        jnp.full(2, 2 * n),
         jnp.full(2, n),
     )
 
@@ -226,24 +248,50 @@ def test_cases_with_and_without_memory_have_the_limits_that_they_have_alone() ->
         assert best_return(*case, grid=STEPS, episodes=500).to_dict() == found.to_dict()
 
 
+def independent(seed: int, n: int = 500) -> Responses:
+    """Responses to five conditions in turn, of a culture that remembers nothing."""
+    rng = np.random.default_rng(seed)
+    condition = rng.permutation(np.arange(n) % 5)
+    return replace(
+        responses_of(*[[1.0]] * 5),
+        condition=condition,
+        rate_hz=rng.gamma(6.0, 5.0 + condition),
+        active_ratio=np.full(n, 0.1),
+        is_burst=np.zeros(n, bool),
+    )
+
+
+def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator() -> None:
+    none = 0
+    for seed in range(60):
+        simulator = fit_memory(independent(seed))
+        none += bool(np.all(simulator.nearest == simulator.followers))
+    # With memory invented in a part of them; the rule of one standard error keeps that part small.
+    assert none >= 45
+    assert not any(
+        np.all(each.nearest == each.followers)
+        for each in (
+            fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9), seed=seed)) for seed in range(20)
+        )
+    )
+
+
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9), Linear()])
-def test_a_culture_without_memory_has_the_commands_that_it_has_without_remembering(mapping: Any) -> None:
-    """After every class of responses the commands are those of the condition, within the chance of its samples."""
-    rng = np.random.default_rng(0)
-    simulator = fit_memory(responses_of(*[rng.permutation(rng.gamma(6.0, 1.0 + c, 2000)) for c in range(3)]))
-    environment = Animat(Navigation(), mapping, 3)
-    after = commands_after(environment, simulator)
+def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory(mapping: Any) -> None:
+    responses = independent(0)
+    simulator, plain = fit_memory(responses), fit_empirical(responses)
+    assert np.all(simulator.nearest == simulator.followers)
+    environment = Animat(Navigation(), mapping, 5)
+    after, (whole,) = commands_after(environment, simulator), commands_after(environment, plain)[0]
     assert len(after) == len(after[0]) == 10
-    whole = commands_of(environment, simulator)
     means = np.sum(whole.levels * whole.probabilities, axis=1)
     for row in after:
         np.testing.assert_allclose(sum(each.probabilities.sum(axis=1) for each in row), 1.0, atol=1e-9)
         mean = sum(np.sum(each.levels * each.probabilities, axis=1) for each in row)
-        # 45 responses lie behind a last one, some hundred behind a class of them.
-        np.testing.assert_allclose(mean, means, atol=0.35)
-    plain = made_up_simulator()
-    (alone,) = commands_after(Animat(Navigation(), mapping, 5), plain)
-    assert len(alone) == 1
+        np.testing.assert_allclose(mean, means, atol=0.01)
+    if isinstance(mapping, Thresholds):
+        limits = [best_return(environment, each, resolution=0.4, episodes=0).value for each in (simulator, plain)]
+        assert limits[0] == pytest.approx(limits[1], abs=0.1)
 
 
 @pytest.mark.oracle
@@ -279,6 +327,16 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     assert 51 <= covered <= 60
 
 
+def test_an_environment_without_neurons_has_its_limit_whatever_simulator_is_beside_it() -> None:
+    """As a case of its own, and beside one whose neurons remember."""
+    alone = best_return(WithoutNeurons(Stairs(5), (-1.0, 1.0)), None, grid=STEPS, episodes=10)
+    both = [(WithoutNeurons(Stairs(5), (-1.0, 1.0)), persistent()), (Animat(Stairs(5), Thresholds(1), 2), persistent())]
+    assert [found.value for found in best_returns(both, grid=STEPS, episodes=10)] == [
+        alone.value,
+        best_return(*both[1], grid=STEPS, episodes=0).value,
+    ]
+
+
 def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
     simulator = fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9)))
     environment = Animat(Stairs(), Thresholds(1), 2, "shuffled")
@@ -299,8 +357,10 @@ def test_memory_is_found_where_there_is_one_and_not_where_there_is_none(seed: in
     (found,) = memory_findings(remembers)
     assert found.severity == "note"
     assert found.value == pytest.approx(0.4, abs=0.2)
-    does_not = chain(500, after_low=(0.2, 0.7), after_high=(0.2, 0.7), seed=seed)
-    assert not list(memory_findings(does_not))
+    assert not list(memory_findings(independent(seed)))
+    falls = independent(seed, 2500)
+    drifting = replace(falls, rate_hz=falls.rate_hz * np.linspace(1.4, 0.6, 2500))
+    assert not list(memory_findings(drifting))
 
 
 def test_conditions_in_blocks_are_not_taken_for_memory() -> None:
@@ -308,3 +368,50 @@ def test_conditions_in_blocks_are_not_taken_for_memory() -> None:
     blocks = responses_of(*[rng.normal(mean, 1.0, 100) for mean in (20, 25, 30, 35, 40)])
     assert not list(memory_findings(blocks))
     assert not list(memory_findings(replace(blocks, conditions=(*blocks.conditions, Condition("none", 1.0, "Hz")))))
+
+
+def test_a_memory_of_blocks_is_told() -> None:
+    for order in ("mixed", "blocked"):
+        responses = chain(200, after_low=(0.1, 0.5), after_high=(0.3, 0.9), presentation=Presentation(order))
+        found = {finding.name for finding in fit_timeline([responses], kind="memory").findings}
+        assert ("memory-of-blocks" in found) == (order == "blocked")
+        assert "memory-of-blocks" not in {finding.name for finding in fit_timeline([responses]).findings}
+
+
+def test_what_a_simulator_with_memory_keeps_is_told_by_what_it_answers() -> None:
+    (kept,) = fit_timeline([chain(2000, after_low=(0.1, 0.5), after_high=(0.5, 0.9))], kind="memory").fidelities
+    np.testing.assert_allclose(kept.in_simulator, kept.in_data, atol=0.03)
+    assert not np.array_equal(kept.in_simulator, kept.in_data)
+
+
+def test_gymnasium_environments_remember(tmp_path: Path) -> None:
+    make_up_recording(1, channels=32).save(tmp_path / "made-up.nwb")
+    with pytest.warns(UserWarning, match="presented in blocks"):
+        environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "made-up.nwb", kind="memory")
+    environment.reset(seed=1)
+    rates_hz = [environment.step(0)[4]["rate_hz"] for _ in range(20)]
+    assert len(set(rates_hz)) > 1
+
+
+def test_training_through_a_memory_begins_each_episode_after_silence(tmp_path: Path) -> None:
+    """One chance alone to move right: the culture answers high after low and low after high, whatever is chosen."""
+    x = np.tile([10.0, 90.0], 100)
+    turns = replace(
+        responses_of([1.0], [1.0]),
+        condition=np.tile([0, 0, 1, 1], 50),
+        rate_hz=x,
+        active_ratio=np.full(200, 0.1),
+        is_burst=np.zeros(200, bool),
+    )
+    timeline = fit_timeline([turns, replace(turns, start_min=10.0)], kind="memory")
+    training = Training(Navigation(episode_limit=7), Thresholds(1), policies=2, iterations=4_000, duration_min=20.0)
+    trained = train(training, timeline, tmp_path / "policies", workers=1)
+    assert all(policy.fitted["kind"] == "memory" for policy in trained.values())
+    played = roll_out(
+        training.environment(2), timeline.at(0.0), networks_of(list(trained.values())), 2, episodes=3, seed=1
+    )
+    # Every episode is the same one, in training as in evaluation.
+    assert len(set(played.returns.ravel().tolist())) == 1
+    for policy in trained.values():
+        means = policy.learning_curve[:, 2]
+        np.testing.assert_allclose(means[~np.isnan(means)], played.returns[0, 0], atol=1e-3)

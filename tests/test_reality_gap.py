@@ -32,7 +32,7 @@ from animat.neurons.conditions import Condition
 from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
-from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, run_policies
+from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.predicting import ANEW_EPISODES
 from animat.recordings.array import MAXONE
 from animat.recordings.findings import Finding
@@ -242,6 +242,17 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
         warnings = [f.sentence for f in gap.findings if f.name == "no-memory"]
         assert len(warnings) == warned
         assert all("66 %" in sentence and "--simulator memory" in sentence for sentence in warnings)
+        assert not any(f.name == "other-simulator" for f in gap.findings)
+    trained = {"simulators": {"kind": "empirical", "bins": None, "range_hz": None}}
+    with FakeCulture() as culture:
+        policy = policy_of(0, series, provenance=trained)
+        gap = run_policies(
+            {"p": policy}, culture, Calibration.of_series(found), tmp_path / "other", episodes=1, with_controls=False
+        )
+    (other,) = (f.sentence for f in gap.findings if f.name == "other-simulator")
+    assert "empirical" in other and "histogram" in other
+    with pytest.raises(Mismatch, match="the same fitted as p"):
+        check_policies({"p": policy, "q": policy_of(0, series)})
 
 
 def drawn_responses(rng: np.random.Generator, n: int) -> Responses:

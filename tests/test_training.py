@@ -210,6 +210,14 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
     with pytest.raises(InvalidFile, match="of another"):
         train_group(replace(group, fingerprint="other"), checkpoint, stop, checkpoint_s=0.0)
     whole = checkpoint.read_bytes()
+    with np.load(checkpoint) as kept:
+        arrays = dict(kept)
+    last = max((name for name in arrays if name.startswith("leaf")), key=lambda name: int(name[4:]))
+    fewer = {name: array for name, array in arrays.items() if name != last}
+    for others in (fewer, arrays | {last: arrays[last][..., None]}, arrays | {"leaf0": arrays["leaf0"].astype(float)}):
+        np.savez(checkpoint, **others)
+        with pytest.raises(InvalidFile, match="expected a checkpoint as this animat writes it"):
+            train_group(group, checkpoint, stop, checkpoint_s=0.0)
     # Flags and compression of the first entry in the table at the end: zipfile has errors of other kinds for these.
     table = whole.index(b"PK\x01\x02")
     encrypted, unknown = bytearray(whole), bytearray(whole)

@@ -246,12 +246,12 @@ class Run(Stimulating):
         return Calibration.of_series(series, first, at_min=at_min, **self._fit(first))
 
     def _fit(self, first: Policy) -> dict[str, Any]:
-        """How the simulator that predicts is made: as the policies' were, but for what is asked for."""
-        trained = first.provenance.get("simulators") or {}
-        asked = {"kind": self.simulator, "bins": self.bins, "range_hz": self.range_hz}
+        """How the simulator that predicts is made: as the policies' were, unless another one is asked for."""
         usual = {"kind": "histogram", "bins": 20, "range_hz": None}
-        known = usual | {name: trained[name] for name in usual if trained.get(name) is not None}
-        return known | {name: value for name, value in asked.items() if value is not None}
+        asked = {"kind": self.simulator, "bins": self.bins, "range_hz": self.range_hz}
+        trained = first.fitted if self.simulator is None else {}
+        given = {name: value for known in (trained, asked) for name, value in known.items() if value is not None}
+        return usual | given
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64
 from animat.mapping import N_PERCENTILES
 
 MOST_FOLLOWED = 100
-"""Of each condition, as many as the paper's recording holds: of a longer one the newest, as older ones follow late."""
+"""Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones follow late."""
 
 
 class Following:
@@ -23,11 +23,15 @@ class Following:
     recording would hold now, and not of what a policy likes to choose.
 
     Args:
-        responses_hz: non-burst responses of each condition, in the order of time; the newest `MOST_FOLLOWED` count.
+        responses_hz: non-burst responses of each condition, in the order of time. Where a condition has more than
+            `MOST_FOLLOWED`, the newest count, of all conditions the same part.
     """
 
     def __init__(self, responses_hz: Sequence[Float64[np.ndarray, " responses"]]) -> None:
-        self._newest = [deque((float(x) for x in each), maxlen=min(len(each), MOST_FOLLOWED)) for each in responses_hz]
+        part = min(1.0, MOST_FOLLOWED / max(len(each) for each in responses_hz))
+        self._newest = [
+            deque((float(x) for x in each), maxlen=max(1, round(part * len(each)))) for each in responses_hz
+        ]
         self.seen = 0
 
     def add(self, condition: int, rate_hz: float) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Float64, Int
 from animat.animat import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.mapping import Mapping, Thresholds
-from animat.neurons.simulator import PERCENTILES, NeuronSimulator
+from animat.neurons.simulator import PERCENTILES, NeuronSimulator, Stored
 
 CONTINUOUS_ACTIONS = 21
 """How many evenly spaced commands stand for a continuous action."""
@@ -126,39 +126,43 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     return Commands(np.arange(n_actions), levels, probabilities)
 
 
-def class_of(simulator: NeuronSimulator, rate_hz: Array) -> Int[Array, "*responses"]:
-    """Which of the classes that a last response is remembered in: between which of P10, P20, ..., P90 it lies.
+def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
+    """How many classes of the last response make a difference: one where nothing is remembered."""
+    remembers = isinstance(environment, Animat) and simulator is not None and simulator.has_memory
+    return len(PERCENTILES) - 1 if remembers else 1
 
-    All are one class to a simulator without memory.
-    """
-    inner = simulator.percentiles[1:-1] if simulator.has_memory else jnp.zeros(0)
-    return jnp.sum(jnp.asarray(rate_hz)[..., None] >= inner, axis=-1)
+
+def class_of(
+    percentiles: Float[Stored, " percentiles"], rate_hz: Float[Stored, "*responses"]
+) -> Int[Array, "*responses"]:
+    """Which of ten classes a response is remembered in: between which of P10, P20, ..., P90 it lies."""
+    return jnp.sum(jnp.asarray(rate_hz)[..., None] >= percentiles[1:-1], axis=-1)
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
     """What each action leads to after a last response of each class, and of which class the response is then.
 
-    Classes are those of `class_of`: a memory in ten steps, and exact for thresholds as far as the command goes, as
-    they lie between classes.
+    A memory in ten steps (`class_of`): 8 responses stand for all of a class, and 2048 draws after each of them for what
+    is answered. Thresholds lie between classes, so that a class has one command.
 
     Args:
         environment, simulator: as in `commands_of`.
 
     Returns:
         For each class of the last response, for each class of the response to come: the commands, with the
-        probabilities that they come with a response of that class; over all of these they add up to 1. Without
-        memory, one class and the commands of `commands_of`.
+        probabilities that they come with a response of that class; over all of these they add up to 1. Where nothing is
+        remembered, one class and the commands of `commands_of`.
     """
-    if simulator is None or not simulator.has_memory or not isinstance(environment, Animat):
+    if simulator is None or not isinstance(environment, Animat) or layers_of(environment, simulator) == 1:
         return [[commands_of(environment, simulator)]]
     levels, classes = (np.asarray(x) for x in _answers(environment, simulator, _last_responses(simulator)))
-    n_classes, n_actions = levels.shape[:2]
     if environment.delivery == "shuffled":
-        levels, classes = (np.repeat(x.reshape(n_classes, 1, -1), n_actions, axis=1) for x in (levels, classes))
-    actions, even = np.arange(n_actions), np.full(levels.shape[1:], 1 / levels.shape[-1])
+        # Whatever is chosen, any condition is delivered: one action stands for all.
+        levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
+    actions, even = np.arange(levels.shape[1]), np.full(levels.shape[1:], 1 / levels.shape[-1])
     after = [Commands(actions, of_class.astype(np.float64), even) for of_class in levels]
     return [
-        [commands.that(likely=then == of) for of in range(n_classes)]
+        [commands.that(likely=then == of) for of in range(len(levels))]
         for commands, then in zip(after, classes, strict=True)
     ]
 
@@ -166,10 +170,9 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
 def _last_responses(simulator: NeuronSimulator) -> Float[Array, "classes responses"]:
     """A few responses of each class, evenly spaced in rank among all that there can be."""
     x = jnp.sort(_responses(simulator).ravel())
-    classes = np.asarray(class_of(simulator, x))
-    ends = np.searchsorted(classes, np.arange(len(PERCENTILES)))
+    ends = np.searchsorted(np.asarray(class_of(simulator.percentiles, x)), np.arange(len(PERCENTILES)))
     within = (np.arange(_LAST_RESPONSES) + 0.5) / _LAST_RESPONSES
-    # A class that no response is of gets those of the next; none will be remembered in it.
+    # In a class that no response is of, only an episode's start can be: those next to it stand for it.
     rows = (ends[:-1, None] + within * np.diff(ends)[:, None]).astype(np.int64)
     return x[np.minimum(rows, len(x) - 1)]
 
@@ -192,7 +195,7 @@ def _answers(
     answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
     conditions = jnp.arange(simulator.n_conditions)
     x = answers(conditions, uniforms, last_hz).reshape(len(last_hz), len(conditions), -1)
-    return environment.mapping.command(x, simulator.percentiles), class_of(simulator, x)
+    return environment.mapping.command(x, simulator.percentiles), class_of(simulator.percentiles, x)
 
 
 def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[np.ndarray, " nodes"], bool]:

@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt16
+from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.animat import Environment
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import class_of, commands_after, nodes_for
+from animat.evaluation.commands import class_of, commands_after, layers_of, nodes_for
 from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
@@ -41,9 +40,9 @@ class Optimum:
     """The best possible mean return of any controller, and how well it is known.
 
     Attributes:
-        value: by dynamic programming, of a controller that knows the time left, and the last response where neurons
-            remember it. What the grid cannot resolve raises it more often than it lowers it, as the best of several
-            values is taken: the upper end of a bracket.
+        value: by dynamic programming, of a controller that knows the time left, and where neurons remember it the
+            class of the last response (one of ten: `animat.evaluation.commands.class_of`). What the grid cannot resolve
+            raises it more often than it lowers it, as the best of several values is taken: the upper end of a bracket.
         grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
         monte_carlo: mean return of that controller, run on the environment itself: a return that can be had, the lower
             end of the bracket; NaN where it was not run, as the three that follow.
@@ -97,7 +96,10 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
     if apart > 0:
         told += f"{standard_error:.2f} part: the best possible return lies between the two"
     else:
-        told += f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution"
+        told += (
+            f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution (or the "
+            "ten classes of what a memory simulator remembers are)"
+        )
     return (Finding("limit", "warning", told, apart),)
 
 
@@ -151,9 +153,7 @@ def best_returns(
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
 
-    # With memory a case has a layer of values for each class of the last response.
-    layers = max(len(commands_after(*case)) for case in cases)
-    kept_mib = 2 * fine.size * layers * robot.episode_limit / 2**20
+    kept_mib = 2 * fine.size * max(layers_of(*case) for case in cases) * robot.episode_limit / 2**20
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []
     for start in range(0, len(cases), at_once):
@@ -268,10 +268,7 @@ class _Programme:
             values, before = before, values
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
         # An episode starts after silence.
-        silence = [
-            of_case.start + (0 if simulator is None else int(class_of(simulator, jnp.float32(0))))
-            for of_case, (_, simulator) in zip(self._layers, self._cases, strict=True)
-        ]
+        silence = [of_case.start + int(self._layer(case, np.zeros(1))[0]) for case, of_case in enumerate(self._layers)]
         return self._interpolate(values.reshape(shape)[:, silence], starts)
 
     def play(
@@ -296,9 +293,6 @@ class _Programme:
         for iteration, key in enumerate(jax.random.split(others, limit)):
             remaining = limit - 1 - iteration if clock else limit - 1
             landings = self._motion.from_states(state.robot)
-            layers = np.zeros(episodes, np.int32)
-            if simulator is not None:
-                layers += np.asarray(class_of(simulator, state.last_hz), np.int32)
             look_ahead(
                 tables.values(remaining, self._layers[case]),
                 landings.rows,
@@ -307,7 +301,7 @@ class _Programme:
                 landings.places[:, :, 0],
                 landings.rewards[:, :, 0],
                 self._grid.row_offsets,
-                layers,
+                self._layer(case, state.last_hz),
                 pairs,
                 outcomes.weights,
                 remaining,
@@ -321,6 +315,13 @@ class _Programme:
             if not going.any():
                 break
         return returns
+
+    def _layer(self, case: int, last_hz: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
+        """In which of a case's layers episodes are, by their last response."""
+        simulator = self._cases[case][1]
+        if simulator is None or layers_of(*self._cases[case]) == 1:
+            return np.zeros(len(last_hz), np.int32)
+        return np.asarray(class_of(simulator.percentiles, last_hz), np.int32)
 
     def _interpolate(
         self, values: Float32[np.ndarray, "rows cases nodes"], states: Any

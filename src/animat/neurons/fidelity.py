@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from animat.neurons.memory import MemorySimulator
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
 from animat.recordings.findings import Finding
@@ -64,7 +65,8 @@ class Fidelity:
 def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     """Compare a simulator with the responses it was fitted to, at the pooled median P50.
 
-    The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50.
+    The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; of a
+    simulator with memory, of 200 after each response that it knows.
     """
     median = float(simulator.percentiles[5])
     kept = ~responses.is_burst
@@ -75,6 +77,8 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
         ]
     )
     x = _evenly_drawn(simulator)
+    if isinstance(simulator, MemorySimulator):
+        x = _drawn_after_each(simulator)
     above = 0
     if isinstance(simulator, HistogramSimulator):
         above = int(np.count_nonzero(responses.rate_hz[kept].astype(np.float32) > np.asarray(simulator.edges_hz)[-1]))
@@ -88,3 +92,18 @@ def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws"
     uniforms = (jnp.arange(20_000) + 0.5) / 20_000
     draw = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
     return draw(jnp.arange(simulator.n_conditions), uniforms)
+
+
+@jax.jit
+def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions draws"]:
+    """Evenly spaced answers to every condition after each response that came before one of its own."""
+    uniforms = (jnp.arange(200) + 0.5) / 200
+    answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
+    rows = jnp.arange(simulator.before_hz.shape[1])
+
+    def of_condition(condition: Int[Array, ""]) -> Float[Array, " draws"]:
+        # What is padded is stood for by those that are there, over and over.
+        before = simulator.before_hz[condition][rows % simulator.followers[condition]]
+        return answer(condition, uniforms, before).ravel()
+
+    return jax.vmap(of_condition)(jnp.arange(simulator.n_conditions))

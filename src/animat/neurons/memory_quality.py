@@ -15,45 +15,51 @@ if TYPE_CHECKING:
 
 CERTAIN = 4.0
 """Standard errors that the difference must be away from none."""
+STRETCH = 250
+"""Responses in a stretch of the recording, which has a median of its own: a drift is no memory."""
 
 
 def memory_findings(responses: Responses) -> Iterator[Finding]:
     """A finding on the culture's memory from one response to the next (`memory`), if there is some.
 
-    For each condition, how often its non-burst responses pass P50 after a response that did, p1, and after one that did
-    not, p0. The difference is averaged over conditions, each weighted by n1 n0 / (n1 + n0), so that what differs
-    between conditions is not taken for memory; its standard error is that of independent responses.
+    For each condition in each stretch of the recording, how often its non-burst responses pass the stretch's median
+    after a response that did, p1, and after one that did not, p0. The difference is averaged over all of these with the
+    weights w = n1 n0 / (n1 + n0), so that neither what differs between conditions nor what drifts is taken for memory.
+    Its standard error is sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0): that of independent
+    responses.
 
     Args:
         responses: in the order of time.
 
-    Source: the weights of Cochran 1954 (doi:10.2307/3001616) for differences of proportions in several tables.
+    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
     """
-    median_hz = responses.median_rate_hz
-    passes, after = responses.rate_hz >= median_hz, responses.before_hz >= median_hz
-    weights, above, below = [], [], []
-    for i in range(len(responses.conditions)):
-        chosen = (responses.condition == i) & ~responses.is_burst
-        n1, n0 = (int(np.count_nonzero(chosen & (after == did))) for did in (True, False))
-        if n1 and n0:
-            weights.append(n1 * n0 / (n1 + n0))
-            above.append(float(passes[chosen & after].mean()))
-            below.append(float(passes[chosen & ~after].mean()))
-    if not weights:
+    last_hz, is_burst = responses.last_hz, responses.is_burst
+    tables = []
+    for stretch in np.array_split(np.arange(len(responses)), max(1, len(responses) // STRETCH)):
+        usable = stretch[~is_burst[stretch] & ~np.isnan(last_hz[stretch])]
+        if not len(usable):
+            continue
+        median_hz = np.median(responses.rate_hz[usable])
+        for condition in range(len(responses.conditions)):
+            chosen = usable[responses.condition[usable] == condition]
+            passes, after = responses.rate_hz[chosen] >= median_hz, last_hz[chosen] >= median_hz
+            n1 = int(np.count_nonzero(after))
+            if 0 < n1 < len(chosen):
+                tables.append((n1, len(chosen) - n1, float(passes[after].mean()), float(passes[~after].mean())))
+    if not tables:
         return
-    w, p1, p0 = (np.array(each) for each in (weights, above, below))
-    # Without memory both shares are the condition's own; n1 and n0 come into it by the weight alone.
-    pooled = (p1 + p0) / 2
-    error = math.sqrt(float(np.sum(w * pooled * (1 - pooled)))) / float(w.sum())
-    after_one, after_none = (float(np.average(p, weights=w)) for p in (p1, p0))
-    difference = after_one - after_none
-    if abs(difference) <= CERTAIN * error:
+    n1s, n0s, p1, p0 = (np.array(column, np.float64) for column in zip(*tables, strict=True))
+    weights = n1s * n0s / (n1s + n0s)
+    pooled = (n1s * p1 + n0s * p0) / (n1s + n0s)
+    error = math.sqrt(float(np.sum(weights * pooled * (1 - pooled)))) / float(weights.sum())
+    after_one, after_none = (float(np.average(p, weights=weights)) for p in (p1, p0))
+    if abs(after_one - after_none) <= CERTAIN * error:
         return
     yield Finding(
         "memory",
         "note",
-        f"the culture remembers: after a response that passes P50 {100 * after_one:.0f} % of the next ones do, after "
-        f"one that does not {100 * after_none:.0f} %, conditions apart; histograms know nothing of it, the memory "
-        "simulator does",
-        difference,
+        f"the culture remembers: after a response that passes the median {100 * after_one:.0f} % of the next ones do, "
+        f"after one that does not {100 * after_none:.0f} %, conditions apart; histograms know nothing of it, the "
+        "memory simulator does",
+        after_one - after_none,
     )

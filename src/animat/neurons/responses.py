@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,9 @@ from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import Recording
+
+SILENCE_S = 1.0
+"""A response longer ago counts as silence: the slowest of the paper's stimuli come 0.2 s after each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +40,9 @@ class Responses:
         findings: what was noticed about them.
         time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
             responses that come from elsewhere.
-        before_hz: x of the response before each one, 0 before the first, which follows silence, shape (responses,);
-            left out, they are those of `rate_hz`.
+        before_hz: x of the presentation before each one's, whether that has a condition or not: 0 where there was none
+            in the `SILENCE_S` before, NaN where it was a burst; shape (responses,). None: all presentations are here,
+            one soon after the other (see `last_hz`).
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
@@ -57,7 +61,7 @@ class Responses:
     start_min: float = 0.0
     findings: tuple[Finding, ...] = ()
     time_s: Float64[np.ndarray, " responses"] | None = None
-    before_hz: Float64[np.ndarray, " responses"] = field(default_factory=lambda: np.empty(0))
+    before_hz: Float64[np.ndarray, " responses"] | None = None
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {
@@ -65,12 +69,8 @@ class Responses:
             "rate_hz": np.float64,
             "active_ratio": np.float64,
             "is_burst": np.bool_,
-            "before_hz": np.float64,
         }
-        if not len(self.before_hz):
-            object.__setattr__(self, "before_hz", np.concatenate([[0.0], self.rate_hz])[:-1])
-        if self.time_s is not None:
-            columns["time_s"] = np.float64
+        columns |= {name: np.float64 for name in ("time_s", "before_hz") if getattr(self, name) is not None}
         for name, dtype in columns.items():
             array = np.array(getattr(self, name), dtype=dtype)
             if array.shape != (len(self),):
@@ -85,6 +85,13 @@ class Responses:
 
     def __len__(self) -> int:
         return len(self.condition)
+
+    @property
+    def last_hz(self) -> Float64[np.ndarray, " responses"]:
+        """x of the response before each one, Hz: 0 after silence, NaN after a burst."""
+        if self.before_hz is not None:
+            return self.before_hz
+        return _before(self.rate_hz, self.is_burst, np.zeros(len(self), bool))
 
     @property
     def non_burst_rate_hz(self) -> Float64[np.ndarray, " non_bursts"]:
@@ -117,7 +124,7 @@ class Responses:
             is_burst=self.is_burst[drawn],
             findings=(),
             time_s=None if self.time_s is None else self.time_s[drawn],
-            before_hz=self.before_hz[drawn],
+            before_hz=self.last_hz[drawn],
         )
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
@@ -161,16 +168,19 @@ def extract_responses(
         raise UnusableData("channels: expected at least one, got a recording without any; x is a mean over channels")
     stimuli = recording.stimuli
     assignment = (by or default_conditions(stimuli)).assign(stimuli)
-    read = stimuli.is_last_of_presentation & (assignment.condition != NO_CONDITION)
     # An end that is the last stimulus' or spike's own time is rounded like them.
     inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
-    used = read & inside
-    rate_hz, active_ratio = read_windows(recording, stimuli.time_s[used], window_ms)
-    bursts = separate_bursts(active_ratio, burst_threshold)
+    presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
+    # Those without a condition are read too: they are what came before others.
+    rate_hz, active_ratio = read_windows(recording, stimuli.time_s[presented], window_ms)
+    chosen = assignment.condition[presented] != NO_CONDITION
+    used = presented[chosen]
+    bursts = separate_bursts(active_ratio[chosen], burst_threshold)
+    is_rested = np.diff(stimuli.time_s[presented], prepend=-np.inf) > SILENCE_S
     responses = Responses(
         condition=assignment.condition[used],
-        rate_hz=rate_hz,
-        active_ratio=active_ratio,
+        rate_hz=rate_hz[chosen],
+        active_ratio=active_ratio[chosen],
         is_burst=bursts.is_burst,
         conditions=assignment.conditions,
         window_ms=window_ms,
@@ -180,5 +190,16 @@ def extract_responses(
         presentation=recording.presentation,
         start_min=recording.start_min,
         time_s=stimuli.time_s[used],
+        before_hz=_before(rate_hz, active_ratio > bursts.threshold, is_rested)[chosen],
     )
     return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))
+
+
+def _before(
+    rate_hz: Float64[np.ndarray, " responses"],
+    is_burst: Bool[np.ndarray, " responses"],
+    is_rested: Bool[np.ndarray, " responses"],
+) -> Float64[np.ndarray, " responses"]:
+    """The response before each one: NaN for a burst, 0 before the first one and where the culture rested."""
+    before_hz = np.concatenate([[0.0], np.where(is_burst, np.nan, rate_hz)])[:-1]
+    return np.where(is_rested, 0.0, before_hz)

@@ -20,6 +20,13 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 
+_MEMORY_OF_BLOCKS = Finding(
+    "memory-of-blocks",
+    "warning",
+    "in recordings presented in blocks a condition follows on itself only: the simulator does not know what a culture "
+    "answers after another one; record with --order mixed",
+)
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatorTimeline:
@@ -120,6 +127,8 @@ def fit_timeline(
         for responses, kept in zip(ordered, fidelities, strict=True)
         for finding in (*responses.findings, *kept.findings())
     )
+    if kind == "memory" and first.presentation is not None and first.presentation.order == "blocked":
+        findings += (_MEMORY_OF_BLOCKS,)
     return SimulatorTimeline(
         simulators=jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted),
         start_min=start_min,

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
 from animat.neurons.conditions import Condition
 from animat.neurons.kinds import Kind, fit_simulator
+from animat.neurons.memory import MemorySimulator
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
@@ -34,6 +36,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         conditions, window_ms, presentation: of the recording.
         findings: what was noticed.
+        fitted: how the simulators were made: `kind`, `bins`, `range_hz`.
     """
 
     simulator: NeuronSimulator
@@ -45,6 +48,7 @@ class Calibration:
     window_ms: tuple[float, float]
     presentation: Presentation | None
     findings: tuple[Finding, ...]
+    fitted: dict[str, Any]
 
     @property
     def percentiles(self) -> Float64[np.ndarray, " percentiles"]:
@@ -84,9 +88,10 @@ class Calibration:
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
+        simulator = timeline.at(start_min)
         calibration = cls(
-            simulator=timeline.at(start_min),
-            redrawn=tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN)),
+            simulator=simulator,
+            redrawn=tuple(_as_near(simulator, fit_simulator(responses.redrawn(rng), **fit)) for _ in range(REDRAWN)),
             responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             start_min=start_min,
@@ -94,6 +99,7 @@ class Calibration:
             window_ms=timeline.window_ms,
             presentation=timeline.presentation,
             findings=tuple(f for f in timeline.findings if f.sentence.startswith(f"at {start_min:g} min: ")),
+            fitted={name: timeline.fitted[name] for name in fit},
         )
         held = trained.get("percentiles") == "first"
         return calibration.holding(timeline.with_first_percentiles().at(start_min).percentiles) if held else calibration
@@ -105,3 +111,11 @@ class Calibration:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
         return replace(self, simulator=held(self.simulator), redrawn=tuple(map(held, self.redrawn)))
+
+
+def _as_near(simulator: NeuronSimulator, redrawn: NeuronSimulator) -> NeuronSimulator:
+    """A redrawn simulator whose nearest reach as far as those it was drawn from: a response that was drawn twice is no
+    neighbour that tells of itself."""
+    if not (isinstance(simulator, MemorySimulator) and isinstance(redrawn, MemorySimulator)):
+        return redrawn
+    return replace(redrawn, nearest=jnp.minimum(simulator.nearest, redrawn.followers))

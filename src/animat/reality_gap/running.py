@@ -111,8 +111,13 @@ def run_policies(
         findings += (Finding("old-calibration", "warning", sentence, age_min),)
     remembers = next((finding for finding in calibration.findings if finding.name == "memory"), None)
     if remembers is not None and not calibration.simulator.has_memory:
-        sentence = f"{remembers.sentence}: what is lived will be something else than predicted (--simulator memory)"
+        blocked = calibration.presentation is not None and calibration.presentation.order == "blocked"
+        remedy = "record with --order mixed" if blocked else "--simulator memory"
+        sentence = f"{remembers.sentence}: what is lived will be something else than predicted ({remedy})"
         findings += (Finding("no-memory", "warning", sentence, remembers.value),)
+    if first.fitted and first.fitted != calibration.fitted:
+        sentence = f"the policies were trained on simulators made otherwise ({first.fitted}) than the one that predicts"
+        findings += (Finding("other-simulator", "warning", f"{sentence} ({calibration.fitted})"),)
     account = account or Account()
 
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
@@ -165,13 +170,14 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
 
     Raises:
         InvalidArgument: for none.
-        Mismatch: if they differ in robot, mapping, conditions, presentation or response window.
+        Mismatch: if they differ in robot, mapping, conditions, presentation, response window, or in how the simulators
+            were made that they were trained on.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))
     for name, policy in policies.items():
-        for attribute in ("robot", "mapping", "conditions", "presentation", "window_ms"):
+        for attribute in ("robot", "mapping", "conditions", "presentation", "window_ms", "fitted"):
             if getattr(policy, attribute) != getattr(first, attribute):
                 raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; run it alone")
     return first

@@ -147,7 +147,10 @@ class RealityGap:
                 "episodes in which theirs is larger"
             )
         if policies.gap.high < 0:
-            said += "; they live less than predicted: a simulator has no memory and does not tire, a culture does both"
+            said += (
+                "; they live less than predicted: a culture tires, which no simulator does, and remembers, which only "
+                "one with memory does"
+            )
         return said
 
     def to_dict(self) -> dict[str, Any]:

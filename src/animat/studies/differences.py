@@ -79,6 +79,12 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
     papers = "The paper's 20 bins reach from 0 to 120 Hz, chosen for its culture. "
     if simulators.kind == "empirical":
         yield "Histogram", papers + "Here there are none: one of the measured responses is drawn."
+    elif simulators.kind == "memory":
+        yield (
+            "Memory",
+            "The paper's histogram answers the same whatever was before. Here one of the measured responses that came "
+            "after a response like the last one is drawn, so what a culture remembers from one to the next is in it.",
+        )
     else:
         if simulators.range_hz is None:
             here = (

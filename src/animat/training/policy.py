@@ -97,6 +97,14 @@ class Policy:
         return str(self._trained.get("delivery", "chosen"))
 
     @property
+    def fitted(self) -> Dict[str, Any]:
+        """How the simulators it was trained on were made: `kind`, `bins`, `range_hz`; empty where that is not known."""
+        told = self.provenance.get("simulators")
+        if not (isinstance(told, Dict) and isinstance(told.get("kind"), str)):
+            return {}
+        return {name: told.get(name) for name in ("kind", "bins", "range_hz")}
+
+    @property
     def _trained(self) -> Dict[str, Any]:
         told = self.provenance.get("training")
         return told if isinstance(told, Dict) else {}
