@@ -414,4 +414,4 @@ def test_training_through_a_memory_begins_each_episode_after_silence(tmp_path: P
     assert len(set(played.returns.ravel().tolist())) == 1
     for policy in trained.values():
         means = policy.learning_curve[:, 2]
-        np.testing.assert_allclose(means[~np.isnan(means)], played.returns[0, 0], atol=1e-3)
+        np.testing.assert_allclose(means[~np.isnan(means)], played.returns[0, 0], atol=5e-3)
