@@ -28,7 +28,7 @@ COLUMNS = (
     "simulator",
     "mapping",
     "percentiles",
-    "random, lived",
+    "random: predicted, lived",
     "limit",
     "predicted, 95 %",
     "lived",

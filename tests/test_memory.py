@@ -34,6 +34,8 @@ from animat.recordings.made_up import make_up_recording
 from animat.recordings.protocol import Presentation
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.studies.differences import decisions
+from animat.studies.paper import paper_study
 from animat.studies.simulating import load_timeline, save_timeline
 from animat.studies.specification import Simulators
 from animat.training.specification import Training
@@ -183,6 +185,14 @@ def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> N
     for read, written in zip(jax.tree.leaves(loaded.simulators), jax.tree.leaves(timeline.simulators), strict=True):
         np.testing.assert_array_equal(read, written)
     assert Simulators(kind=kind).kind == loaded.fitted["kind"] == kind
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> None:
+    said = dict(decisions(replace(paper_study(), simulators=Simulators(kind=kind))))
+    words = {"histogram": "20 bins are percentiles", "empirical": "there are none", "memory": "after a response like"}
+    for other, sentence in words.items():
+        assert any(sentence in text for text in said.values()) == (other == kind)
 
 
 def test_an_animat_remembers_its_last_response() -> None:
