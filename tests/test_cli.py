@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -386,3 +387,8 @@ def test_the_worst_of_several_warnings_is_told(
 ) -> None:
     say_findings([Finding(name, "warning", f"it is {value}", value) for value in values])
     assert capsys.readouterr().err.startswith(f"warning: it is {worst} (and ")
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"animat {version('animat')}\n"

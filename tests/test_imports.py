@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
-EVERYWHERE = {"differences", "errors", "writing", "progress", "compilation"}
+EVERYWHERE = {"differences", "errors", "writing", "progress", "compilation", "ctrl_c"}
 """What stands under the story and may be used by all of it."""
 
 MAY_IMPORT = {
@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "writing": {"errors"},
     "progress": set(),
     "compilation": set(),
+    "ctrl_c": set(),
     "recordings": set(),
     "neurons": {"recordings"},
     "robots": set(),

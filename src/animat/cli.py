@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import io
 import json
 import math
@@ -20,6 +21,7 @@ from animat.cli_loop import Recover, Run
 from animat.cli_record import Record
 from animat.cli_studies import Reproduce, StudyFile
 from animat.cli_train import Evaluate, Train
+from animat.ctrl_c import heard_everywhere
 from animat.errors import AnimatError, InvalidArgument
 
 Command = (
@@ -40,13 +42,18 @@ COMMANDS = tuple(command.__metadata__[0].name for command in get_args(Command))
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given == ["--version"]:
+        print(f"animat {importlib.metadata.version('animat')}")
+        return 0
     try:
-        command = _parse(sys.argv[1:] if arguments is None else list(arguments))
+        command = _parse(given)
     except InvalidArgument as error:
         print(f"animat: {error}", file=sys.stderr)
         return 2
     try:
-        results = command.run()
+        with heard_everywhere():
+            results = command.run()
     except AnimatError as error:
         print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
         _say_notes(error)

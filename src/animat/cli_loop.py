@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli_responses import say_findings
+from animat.cli_responses import fit_as, say_findings
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 from animat.writing import alone_in
 
@@ -127,7 +127,7 @@ class Run(Stimulating):
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         policies = load_policies(self.policies)
         first = check_policies(policies)
-        fit = self._fit(first)
+        fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] == "histogram":
             check_binning(fit["bins"], fit["range_hz"])
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
@@ -243,15 +243,9 @@ class Run(Stimulating):
             burst_threshold=self.burst_threshold,
             despite=self.despite,
         )
-        return Calibration.of_series(series, first, at_min=at_min, **self._fit(first))
-
-    def _fit(self, first: Policy) -> dict[str, Any]:
-        """How the simulator that predicts is made: as the policies' were, unless another one is asked for."""
-        usual = {"kind": "histogram", "bins": 20, "range_hz": None}
-        asked = {"kind": self.simulator, "bins": self.bins, "range_hz": self.range_hz}
-        trained = first.fitted if self.simulator is None else {}
-        given = {name: value for known in (trained, asked) for name, value in known.items() if value is not None}
-        return usual | given
+        return Calibration.of_series(
+            series, first, at_min=at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
+        )
 
 
 @dataclass(frozen=True)

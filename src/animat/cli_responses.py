@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument
 from animat.recordings.findings import Finding
@@ -31,17 +31,17 @@ class Responding:
 class Fitting(Responding):
     """How a neuron simulator is made of responses."""
 
-    simulator: Literal["histogram", "empirical", "memory"] = "histogram"
-    """histogram: bins (the paper); empirical: a measured value; memory: one measured after one like the last"""
-    bins: int = 20
-    """Bins of a histogram"""
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """histogram (the paper, default); empirical: draw a measured value; memory: one measured after one like the last"""
+    bins: int | None = None
+    """Bins of a histogram; default: 20"""
     range_hz: float | None = None
     """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
     despite: tuple[str, ...] = ()
     """Findings to go on in spite of, by name, such as dead-window"""
 
-    def timeline(self, recordings: Sequence[Path]) -> SimulatorTimeline:
-        """Read the recordings and fit a simulator to each."""
+    def timeline(self, recordings: Sequence[Path], trained: Mapping[str, Any] | None = None) -> SimulatorTimeline:
+        """Read the recordings and fit a simulator to each: as those that policies were trained on, unless asked."""
         from animat.neurons.conditions import conditions_named
         from animat.neurons.series import extract_series
         from animat.neurons.timeline import fit_timeline
@@ -57,9 +57,17 @@ class Fitting(Responding):
             burst_threshold=self.burst_threshold,
             despite=self.despite,
         )
-        timeline = fit_timeline(series, kind=self.simulator, bins=self.bins, range_hz=self.range_hz)
+        timeline = fit_timeline(series, **fit_as(trained or {}, self.simulator, self.bins, self.range_hz))
         say_findings(timeline.findings)
         return timeline
+
+
+def fit_as(trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None) -> dict[str, Any]:
+    """How simulators are made: as those that policies were trained on, unless another kind is asked for."""
+    usual = {"kind": "histogram", "bins": 20, "range_hz": None}
+    asked = {"kind": kind, "bins": bins, "range_hz": range_hz}
+    given = (asked,) if kind is not None else (trained, asked)
+    return usual | {name: value for known in given for name, value in known.items() if value is not None}
 
 
 def say_findings(findings: Sequence[Finding]) -> None:

@@ -106,7 +106,7 @@ class Train(Fitting):
 
 @dataclass(frozen=True)
 class Evaluate(Fitting):
-    """Run trained policies, and controls beside them, on the simulator of a recording."""
+    """Run trained policies, and controls beside them, on the simulator of a recording, made as in their training."""
 
     policies: Positional[Path] = Path("policies")
     """A policy file or a folder of them"""
@@ -121,7 +121,7 @@ class Evaluate(Fitting):
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
     limit: bool = False
-    """Also compute the best return that any controller could get there, and scores beside it; takes seconds"""
+    """Also compute the best return that any controller could get there, and scores; seconds, with memory minutes"""
     seed: int = 1
     """Decides every random draw"""
     json: bool = False
@@ -140,7 +140,9 @@ class Evaluate(Fitting):
             if self.robot is not None and policy.robot.name != self.robot:
                 raise Mismatch(f"{name}: expected a policy for {self.robot}, got one for {policy.robot.name}")
         through_neurons = any(policy.mapping is not None for policy in policies.values())
-        timeline = self.timeline(self.recordings) if through_neurons else None
+        # On what they were trained on, unless asked otherwise.
+        trained = next((policy.fitted for policy in policies.values() if policy.mapping is not None), None)
+        timeline = self.timeline(self.recordings, trained) if through_neurons else None
 
         from animat.evaluation.table import evaluate
 

@@ -24,9 +24,9 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     """A finding on drift within the recording (`drift`), if there is some.
 
     Least squares of x / m_c = 1 + s t over the non-burst responses, m_c the mean of the response's condition and t its
-    time relative to the mean time of its condition, in units of the recording's length: so that what differs between
-    conditions, which a blocked protocol presents one after the other, is not taken for drift. s is the relative change
-    from start to end; its standard error comes from the residuals.
+    time relative to the mean time of its condition, in units of the time that the condition was presented for: so that
+    what differs between conditions, which a blocked protocol presents one after the other, is not taken for drift. s is
+    the relative change from a condition's first stimuli to its last; its standard error comes from the residuals.
 
     Args:
         responses: with their times.
@@ -42,7 +42,11 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         mean_hz = float(responses.rate_hz[chosen].mean()) if chosen.any() else 0.0
         if np.count_nonzero(chosen) < 3 or mean_hz <= 0:
             continue
-        time = responses.time_s[chosen] / span_s
+        presented_s = responses.time_s[responses.condition == i]
+        of_condition_s = float(presented_s[-1] - presented_s[0])
+        if of_condition_s <= 0:
+            continue
+        time = responses.time_s[chosen] / of_condition_s
         times.append(time - time.mean())
         relative.append(responses.rate_hz[chosen] / mean_hz - 1)
     if not times:
@@ -60,7 +64,7 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         "drift",
         "warning" if large else "note",
         f"responses {'rise' if slope > 0 else 'fall'} by {100 * abs(slope):.0f} % of their mean "
-        f"(+- {100 * error:.0f} %) from the start to the end of the recording ({span_s / 60:.1f} min), conditions apart"
+        f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last (recording: {span_s / 60:.1f} min)"
         + (
             ": one simulator stands for a culture that changes; record for a shorter time, wait until it has settled, "
             "or present conditions mixed, so that drift is not taken for a difference"

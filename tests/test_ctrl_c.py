@@ -1,0 +1,54 @@
+"""Ctrl-C in a callback of the garbage collector, where Python prints what is raised and goes on."""
+
+from __future__ import annotations
+
+import gc
+import signal
+import time
+from typing import Any
+
+import pytest
+
+from animat.ctrl_c import heard_everywhere
+
+
+def interrupt_while_collecting() -> None:
+    """One Ctrl-C that comes in a callback of the garbage collector."""
+    sent = []
+
+    def callback(phase: str, info: dict[str, Any]) -> None:
+        if not sent:
+            sent.append(phase)
+            signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(callback)
+    try:
+        gc.collect()
+    finally:
+        gc.callbacks.remove(callback)
+    assert sent
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_it_is_dropped_by_python_and_heard_here() -> None:
+    interrupt_while_collecting()
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        interrupt_while_collecting()
+        time.sleep(5.0)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_elsewhere_it_is_raised_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_whoever_handles_it_already_goes_on_to() -> None:
+    heard = []
+    before = signal.signal(signal.SIGINT, lambda *_: heard.append(True))
+    try:
+        with heard_everywhere():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert heard
