@@ -125,6 +125,15 @@ def test_what_came_before_is_what_was_presented_before() -> None:
     np.testing.assert_allclose(fives.last_hz, np.array([0, 1, 0, 4]) * 125.0)
 
 
+def test_between_the_pulses_of_a_slow_presentation_there_is_no_silence() -> None:
+    """Presentations of seven pulses, 0.2 s apart, last longer than a silence; the third comes after one."""
+    starts_s = np.array([0.1, 1.5, 5.0])
+    times_s = (starts_s[:, None] + 0.2 * np.arange(7)).ravel()
+    spikes = [(t + 0.004, 0) for t in times_s]
+    given = recording(spikes, times_s, n_channels=1, presentation=np.repeat([0, 1, 2], 7).tolist())
+    np.testing.assert_allclose(extract_responses(given, burst_threshold=1.0).last_hz, [0.0, 125.0, 0.0])
+
+
 def test_a_known_chain_is_answered_as_it_is() -> None:
     """Two conditions, four chances: the share of high answers after a low and a high one, within chance."""
     low, high = (0.1, 0.5), (0.3, 0.9)

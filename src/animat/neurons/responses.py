@@ -18,7 +18,7 @@ from animat.recordings.protocol import Presentation
 from animat.recordings.recording import Recording
 
 SILENCE_S = 1.0
-"""A response longer ago counts as silence: the slowest of the paper's stimuli come 0.2 s after each other."""
+"""So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,9 @@ def extract_responses(
     chosen = assignment.condition[presented] != NO_CONDITION
     used = presented[chosen]
     bursts = separate_bursts(active_ratio[chosen], burst_threshold)
-    is_rested = np.diff(stimuli.time_s[presented], prepend=-np.inf) > SILENCE_S
+    # Between the pulses of a presentation there is no silence, however long it lasts.
+    silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
+    is_rested = np.diff(silences[presented], prepend=0) > 0
     responses = Responses(
         condition=assignment.condition[used],
         rate_hz=rate_hz[chosen],
