@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -52,7 +53,7 @@ RANDOM = Contender("random", "any", AnyCondition(5))
 
 def loop_of(**changed: Any) -> Loop:
     given = {"robot": SHORT, "mapping": Thresholds(9), "conditions": CONDITIONS, "percentiles": PERCENTILES}
-    return Loop(**(given | {"pause_s": 0.1} | changed))
+    return Loop(**(given | {"pause_s": 0.1, "lead_in": 0} | changed))
 
 
 class TestFake(CultureContract):
@@ -71,6 +72,7 @@ class TestFake(CultureContract):
     jitter=st.booleans(),
     on_burst=st.sampled_from(["use", "repeat", "skip"]),
     window_ms=st.sampled_from([(2.0, 10.0), (0.0, 5.0), (3.15, 11.05)]),
+    lead_in=st.integers(0, 2),
 )
 def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     tmp_path_factory: pytest.TempPathFactory,
@@ -79,9 +81,10 @@ def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     jitter: bool,
     on_burst: str,
     window_ms: tuple[float, float],
+    lead_in: int,
 ) -> None:
     folder = tmp_path_factory.mktemp("session")
-    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms)
+    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms, lead_in=lead_in)
     contenders = [
         RANDOM,
         Contender("shuffled", "", OneCondition(1), "shuffled"),
@@ -273,6 +276,61 @@ def test_a_response_on_a_percentile_passes_it_as_in_training(tmp_path: Path) -> 
     ties = [tick for tick in session.ticks if tick.spikes == 3]
     assert ties
     assert all(tick.command == (1.0 if tick.spikes >= 3 else -1.0) for tick in session.ticks)
+
+
+def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: Path) -> None:
+    class Fixed:
+        def act(self, observation: Any, rng: np.random.Generator) -> int:
+            np.testing.assert_array_equal(observation, SHORT.observe(SHORT.reset(jax.random.key(0))))
+            raise Done
+
+    class Done(Exception):
+        pass
+
+    rest = Contender("rest", "no pulse", AnyCondition(5), "silent")
+    loop = loop_of(lead_in=3, pulses=2, burst_threshold=0.5, on_burst="repeat")
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [RANDOM, rest], tmp_path / "two", episodes=2)
+    for episode in session.episodes:
+        ticks = [tick for tick in session.ticks if tick.episode == episode.number]
+        leading = [tick for tick in ticks if tick.handled == "lead-in"]
+        # Silence has nothing before it either.
+        assert len(leading) == (0 if episode.contender == "rest" else 15)
+        assert ticks[: len(leading)] == leading
+        for n in range(0, len(leading), 5):
+            assert sorted(tick.delivered for tick in leading[n : n + 5]) == [0, 1, 2, 3, 4]
+        assert len({tuple(tick.delivered for tick in leading[n : n + 5]) for n in (0, 5, 10)}) == (3 if leading else 1)
+        for tick in leading:
+            assert (tick.iteration, tick.command, tick.reward, tick.observation) == (-1, None, None, ())
+            assert len(tick.pulse_time_s) == 2
+        assert ticks[len(leading)].iteration == 0
+        assert episode.iterations == 6
+        assert episode.pulses == sum(len(tick.pulse_time_s) for tick in ticks)
+    assert_read_alike(tmp_path / "two", loop)
+    # The robot stands until the policy's first choice.
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [Contender("fixed", "", Fixed())], tmp_path / "one", episodes=1)
+    assert session.ending.by == "controller"
+    assert "Done" in session.ending.sentence
+    assert len(session.ticks) == 15
+
+
+def test_what_leads_in_counts_for_percentiles_that_follow(tmp_path: Path) -> None:
+    following = tuple(np.zeros(3) for _ in HZ)
+    loop = loop_of(lead_in=3, following=following)
+    one = Contender("constant", "", OneCondition(0), calibrates=False)
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [one], tmp_path, episodes=1)
+    leading = [tick.rate_hz for tick in session.ticks if tick.handled == "lead-in"]
+    told = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
+    assert len(leading) == 15
+    assert max(leading) > 0
+    # Three of each condition: all that was recorded has given way.
+    np.testing.assert_array_equal(told, [np.percentile(leading, np.linspace(0, 100, 11)).astype(np.float32)])
+    acted = [tick for tick in session.ticks if tick.handled != "lead-in"]
+    assert all(
+        tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), np.float32(told[0]))) for tick in acted
+    )
 
 
 def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:

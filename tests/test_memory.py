@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,14 +18,14 @@ from hypothesis import strategies as st
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, UnusableData
-from animat.evaluation.commands import commands_after
+from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.mapping import Linear, Thresholds
 from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.kinds import Kind
-from animat.neurons.memory import MemorySimulator, fit_memory
+from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
 from animat.neurons.memory_quality import memory_findings
 from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.simulator import fit_empirical
@@ -57,16 +58,37 @@ def chain(
         high = rng.random() < (after_high if last >= 50 else after_low)[c]
         last = x[i] = rng.uniform(50, 100) if high else rng.uniform(0, 50)
     columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": np.zeros(n, bool)}
-    return replace(responses_of(*[[1.0]] * len(after_low)), before_hz=None, **columns, **changes)
+    return replace(responses_of(*[[1.0]] * len(after_low)), presented=None, place=None, **columns, **changes)
 
 
-@settings(max_examples=50, deadline=None)
+def pasts_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
+    """The past of each response as `Memory` says, in fractions; all presentations are among them."""
+    decay, weight = Fraction(memory.decay), Fraction(memory.weight)
+    x, burst, condition = (getattr(responses, name).tolist() for name in ("rate_hz", "is_burst", "condition"))
+    kept = [value for value, is_burst in zip(x, burst, strict=True) if not is_burst]
+    rank = [Fraction(sum(k < v for k in kept) + sum(k <= v for k in kept), 2 * len(kept)) for v in x]
+    past, pasts = Fraction(0), []
+    for r, is_burst, c in zip(rank, burst, condition, strict=True):
+        pasts.append(past)
+        alike = [rank[j] for j in range(len(x)) if condition[j] == c and not burst[j]]
+        mean = sum(alike, Fraction(0)) / len(alike)
+        past = Fraction(1, 2) if is_burst else decay * past + (1 - decay) * (r + weight * mean) / (1 + weight)
+    return pasts
+
+
+MEMORIES = st.builds(
+    Memory, st.sampled_from([0.0, 0.25, 0.5]), st.sampled_from([0.0, 0.5, 1.0]), st.sampled_from([0.5, 0.8, 1.0])
+)
+
+
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 1), st.integers(0, 6), st.booleans()), min_size=3, max_size=40),
-    st.integers(-1, 7),
+    st.none() | MEMORIES,
+    st.integers(0, 16),
 )
-def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], last: int) -> None:
-    """All that came after the very same response can be drawn, and nothing beyond the k nearest in rank."""
+def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], memory: Memory | None, at: int) -> None:
+    """All that had the very same past can be drawn, and nothing beyond the k nearest in rank."""
     condition, x, burst = (np.array(column) for column in zip(*rows, strict=True))
     responses = replace(
         responses_of([1.0], [1.0]),
@@ -79,25 +101,55 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], last: int
         with pytest.raises(UnusableData, match="expected non-burst responses to fit"):
             fit_memory(responses)
         return
-    simulator = fit_memory(responses)
+    simulator = fit_memory(responses, memory=memory)
+    memory = simulator.memory
+    pasts = [np.float32(float(past)) for past in pasts_by_hand(responses, memory)]
+    # Also exactly where a recorded one is.
+    last = np.float32(at / 16) if at % 2 else pasts[at % len(pasts)]
     uniforms = jnp.linspace(0, 1, 400, endpoint=False)
     for c in (0, 1):
         mine = [i for i in range(len(x)) if condition[i] == c and not burst[i]]
         mine = [i for i in mine if i == 0 or not burst[i - 1]] or mine
-        before = {i: 0 if i == 0 or burst[i - 1] else x[i - 1] for i in mine}
         k = int(simulator.nearest[c])
+        assert k == round(len(mine) ** memory.reach)
         assert 1 <= k <= len(mine) == simulator.followers[c]
+        np.testing.assert_allclose(simulator.before[c][: len(mine)], sorted(pasts[i] for i in mine), atol=1e-6)
         answers = jax.vmap(simulator.answer, (None, 0, None))(jnp.int32(c), uniforms, jnp.float32(last))
-        drawn = set(np.asarray(answers).tolist())
-        same = [i for i in mine if before[i] == last]
-        assert drawn >= {x[i] for i in same}
-        if len(same) >= k:
-            assert drawn == {x[i] for i in same}
-        # Between the last response and that before one that is drawn lie fewer than k others.
+        drawn = set(np.asarray(answers.rate_hz).tolist())
+        same = [i for i in mine if abs(pasts[i] - last) < 1e-6]
+        # Between this past and that of one that is drawn lie fewer than k others.
         near = [
-            i for i in mine if sum(min(last, before[i]) < before[other] < max(last, before[i]) for other in mine) < k
+            i for i in mine if sum(min(last, pasts[i]) + 1e-6 < pasts[j] < max(last, pasts[i]) - 1e-6 for j in mine) < k
         ]
         assert drawn <= {x[i] for i in near}
+        if memory.decay == memory.weight == 0:
+            # Pasts are ranks then, the same to the last bit wherever the last responses are.
+            assert drawn >= {x[i] for i in same}
+            if len(same) >= k:
+                assert drawn == {x[i] for i in same}
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), MEMORIES)
+def test_what_is_remembered_of_an_answer_is_what_the_recording_remembered_of_it(seed: int, memory: Memory) -> None:
+    """Answered as it was recorded, a simulator comes through the pasts that the recording came through."""
+    rng = np.random.default_rng(seed)
+    n = 30
+    responses = replace(
+        responses_of([1.0], [1.0], [1.0]),
+        condition=np.concatenate([[0, 1, 2], rng.integers(0, 3, n - 3)]),
+        rate_hz=rng.permutation(n).astype(float),
+        active_ratio=np.full(n, 0.1),
+        is_burst=np.zeros(n, bool),
+    )
+    # Of one neighbour alone, and at its own past, that very response is drawn.
+    simulator = replace(fit_memory(responses, memory=memory), nearest=jnp.ones(3, jnp.int32))
+    pasts = pasts_by_hand(responses, memory)
+    for i in range(n - 1):
+        answer = simulator.answer(jnp.int32(responses.condition[i]), jnp.float32(0.5), jnp.float32(pasts[i]))
+        if sum(abs(float(past - pasts[i])) < 1e-6 for past in pasts) == 1:
+            assert float(answer.rate_hz) == responses.rate_hz[i]
+            assert float(answer.past) == pytest.approx(float(pasts[i + 1]), abs=1e-6)
 
 
 def test_what_was_recorded_first_follows_silence_and_what_follows_a_burst_is_known_to() -> None:
@@ -105,9 +157,10 @@ def test_what_was_recorded_first_follows_silence_and_what_follows_a_burst_is_kno
     assert responses.last_hz.tolist() == [0.0, 3.0, 4.0, 5.0]
     later = replace(responses, is_burst=np.array([False, True, False, False]), rate_hz=np.array([3.0, 90.0, 5.0, 6.0]))
     np.testing.assert_array_equal(later.last_hz, [0.0, 3.0, np.nan, 5.0])
-    simulator = fit_memory(later)
+    simulator = fit_memory(later, memory=Memory(0.0, 0.0, 0.5))
     assert int(simulator.followers[0]) == 2
-    assert np.asarray(simulator.before_hz)[0].tolist() == [0.0, 5.0, np.inf]
+    # 5 is the second of three, and 6 came after it.
+    assert np.asarray(simulator.before)[0].tolist() == [0.0, 0.5, np.inf]
     assert np.asarray(simulator.after_hz)[0, :2].tolist() == [3.0, 6.0]
     # All that is not a burst is there for whoever does not ask what was before.
     assert np.asarray(simulator.values_hz)[0].tolist() == [3.0, 5.0, 6.0]
@@ -137,12 +190,18 @@ def test_between_the_pulses_of_a_slow_presentation_there_is_no_silence() -> None
 def test_a_known_chain_is_answered_as_it_is() -> None:
     """Two conditions, four chances: the share of high answers after a low and a high one, within chance."""
     low, high = (0.1, 0.5), (0.3, 0.9)
-    simulator = fit_memory(chain(8000, after_low=low, after_high=high))
+    responses = chain(8000, after_low=low, after_high=high)
+    simulator = fit_memory(responses)
+    # The last response is all that it remembers, and all that is found.
+    assert simulator.memory[:2] == (0.0, 0.0)
     uniforms = jnp.linspace(0, 1, 2000, endpoint=False)
     for c in (0, 1):
         for last, chance in ((25.0, low[c]), (75.0, high[c])):
             lasts = jnp.linspace(last - 10, last + 10, 50)
-            x = jax.vmap(lambda at, c=c: jax.vmap(lambda u: simulator.answer(jnp.int32(c), u, at))(uniforms))(lasts)
+            pasts = jnp.mean(responses.rate_hz[:, None] < lasts, axis=0)
+            x = jax.vmap(lambda at, c=c: jax.vmap(lambda u: simulator.answer(jnp.int32(c), u, at).rate_hz)(uniforms))(
+                pasts
+            )
             share = float(jnp.mean(x >= 50))
             # About 1,200 responses lie behind it.
             assert abs(share - chance) < 5 * np.sqrt(chance * (1 - chance) / 1200)
@@ -156,7 +215,7 @@ def test_without_regard_to_the_last_it_is_the_empirical_simulator() -> None:
         ours, theirs = (jax.vmap(s.quantile, (None, 0))(jnp.int32(c), uniforms) for s in (remembering, plain))
         np.testing.assert_array_equal(ours, theirs)
         np.testing.assert_array_equal(
-            jax.vmap(plain.answer, (None, 0, None))(jnp.int32(c), uniforms, jnp.float32(70.0)), theirs
+            jax.vmap(plain.answer, (None, 0, None))(jnp.int32(c), uniforms, jnp.float32(0.7)).rate_hz, theirs
         )
     np.testing.assert_array_equal(remembering.percentiles, plain.percentiles)
 
@@ -174,12 +233,13 @@ def test_simulators_of_recordings_of_different_lengths_stack() -> None:
     timeline = fit_timeline(series, kind="memory")
     alone = fit_memory(series[0])
     uniforms = jnp.linspace(0, 1, 100, endpoint=False)
-    for last in (0.0, 30.0, 80.0, 500.0):
+    for past in (0.0, 0.3, 0.8, 1.0):
         drawn = [
-            jax.vmap(s.answer, (None, 0, None))(jnp.int32(1), uniforms, jnp.float32(last))
+            jax.vmap(s.answer, (None, 0, None))(jnp.int32(1), uniforms, jnp.float32(past))
             for s in (timeline.at(200.0), alone)
         ]
-        np.testing.assert_array_equal(*drawn)
+        np.testing.assert_array_equal(*(each.rate_hz for each in drawn))
+        np.testing.assert_array_equal(*(each.past for each in drawn))
     with pytest.raises(InvalidArgument, match="room"):
         fit_memory(series[1], room=20)
 
@@ -199,12 +259,16 @@ def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> N
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> None:
     said = dict(decisions(replace(paper_study(), simulators=Simulators(kind=kind))))
-    words = {"histogram": "20 bins are percentiles", "empirical": "there are none", "memory": "after a response like"}
+    words = {
+        "histogram": "20 bins are percentiles",
+        "empirical": "there are none",
+        "memory": "past like the present one",
+    }
     for other, sentence in words.items():
         assert any(sentence in text for text in said.values()) == (other == kind)
 
 
-def test_an_animat_remembers_its_last_response() -> None:
+def test_an_animat_remembers() -> None:
     # Whatever is chosen, this culture answers as it did before.
     stubborn = replace(
         responses_of([1.0], [1.0]),
@@ -212,16 +276,20 @@ def test_an_animat_remembers_its_last_response() -> None:
         rate_hz=np.repeat([10.0, 90.0], 100),
         active_ratio=np.full(200, 0.1),
         is_burst=np.zeros(200, bool),
-        before_hz=None,
+        presented=None,
+        place=None,
     )
     simulator = fit_memory(stubborn)
     animat = Animat(Cartpole(), Thresholds(1), 2)
     state = animat.reset(jax.random.key(0))
-    assert float(state.last_hz) == 0.0
-    outcome = animat.step(jax.random.key(1), state._replace(last_hz=jnp.float32(80.0)), jnp.int32(0), simulator)
-    assert float(outcome.rate_hz) == 90.0
-    assert float(outcome.state.last_hz) == 90.0
-    assert float(animat.step(jax.random.key(1), state, jnp.int32(1), simulator).rate_hz) == 10.0
+    assert float(state.past) == 0.5
+    for past, answer in ((0.8, 90.0), (0.2, 10.0)):
+        outcome = animat.step(jax.random.key(1), state._replace(past=jnp.float32(past)), jnp.int32(0), simulator)
+        assert float(outcome.rate_hz) == answer
+        assert float(outcome.state.past) == pytest.approx(0.75 if answer == 90 else 0.25, abs=0.2)
+    # Without neurons nothing changes it.
+    alone = WithoutNeurons(Cartpole(), (-1.0, 1.0))
+    assert float(alone.step(jax.random.key(1), state, jnp.int32(0), None).state.past) == 0.5
 
 
 def persistent(n: int = 10) -> MemorySimulator:
@@ -230,7 +298,7 @@ def persistent(n: int = 10) -> MemorySimulator:
     after = np.array(
         [[0.0] * (n - t) + [1.0] * t + [0.0] * (n - h) + [1.0] * h for t, h in zip(tails, heads, strict=True)]
     )
-    before = np.array([[0.0] * n + [1.0] * n] * 2)
+    before = np.array([[0.5] * n + [0.75] * n] * 2)
     plain = coins(3, 6)
     return MemorySimulator(
         jnp.sort(jnp.asarray(after, jnp.float32), axis=1),
@@ -238,8 +306,10 @@ def persistent(n: int = 10) -> MemorySimulator:
         plain.percentiles,
         jnp.asarray(before, jnp.float32),
         jnp.asarray(after, jnp.float32),
+        jnp.asarray(0.5 + after / 4, jnp.float32),
         jnp.full(2, 2 * n),
         jnp.full(2, n),
+        *(jnp.float32(each) for each in (0.0, 0.0, 0.5)),
     )
 
 
@@ -253,6 +323,7 @@ def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
         down = np.array([[0.0 if s - 1 == 0 else worth[s - 1, 0]] * 2 for s in range(1, 4)])
         of_actions = heads[None] * up[:, :, None] + (1 - heads[None]) * down[:, :, None]
         worth[1:4] = of_actions.max(-1)
+    # An episode begins as after tails.
     found = best_return(Animat(Stairs(limit), Thresholds(1), 2), persistent(), grid=STEPS, episodes=4000)
     # Chances are known to one of 2,048 draws.
     assert found.value == pytest.approx(worth[2, 0], abs=1e-3)
@@ -284,9 +355,9 @@ def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator()
     none = 0
     for seed in range(60):
         simulator = fit_memory(independent(seed))
-        none += bool(np.all(simulator.nearest == simulator.followers))
-    # With memory invented in a part of them; the rule of one standard error keeps that part small.
-    assert none >= 45
+        none += simulator.memory == NO_MEMORY
+    # The best of many memories tells by chance a little more than none: two standard errors keep that part small.
+    assert none >= 54
     assert not any(
         np.all(each.nearest == each.followers)
         for each in (
@@ -302,7 +373,7 @@ def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory
     assert np.all(simulator.nearest == simulator.followers)
     environment = Animat(Navigation(), mapping, 5)
     after, (whole,) = commands_after(environment, simulator), commands_after(environment, plain)[0]
-    assert len(after) == len(after[0]) == 10
+    assert len(after) == len(after[0]) == CLASSES
     means = np.sum(whole.levels * whole.probabilities, axis=1)
     for row in after:
         np.testing.assert_allclose(sum(each.probabilities.sum(axis=1) for each in row), 1.0, atol=1e-9)
@@ -317,7 +388,7 @@ def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 def test_the_controller_that_remembers_gets_what_was_promised(robot: Any, mapping: Any) -> None:
-    """The limit's own controller, on the simulator with its memory of a real number, beside ten classes of it."""
+    """The limit's own controller, on the simulator with its memory of a real number, beside six classes of it."""
     chances = {"after_low": (0.05, 0.2, 0.35, 0.45, 0.5), "after_high": (0.25, 0.5, 0.75, 0.85, 0.9)}
     simulator = fit_memory(chain(2500, **chances))
     found = best_return(Animat(robot, mapping, 5), simulator, resolution=0.8, episodes=4000)
@@ -365,7 +436,7 @@ def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
         for actor in (Uniform(), Constant(jnp.array([0])))
     ]
     for returns in played:
-        # Ten classes stand for a memory of a real number.
+        # Six classes stand for a memory of a real number.
         assert abs(returns.mean() - limit.value) < 5 * returns.std() / np.sqrt(4000) + 0.03
 
 
@@ -412,15 +483,15 @@ def test_gymnasium_environments_remember(tmp_path: Path) -> None:
     assert len(set(rates_hz)) > 1
 
 
-def test_training_through_a_memory_begins_each_episode_after_silence(tmp_path: Path) -> None:
-    """One chance alone to move right: the culture answers high after low and low after high, whatever is chosen."""
-    x = np.tile([10.0, 90.0], 100)
+def test_training_through_a_memory_begins_each_episode_alike(tmp_path: Path) -> None:
+    """The culture answers low, middle, high in turn, whatever is chosen, and each episode begins in the middle."""
+    x = np.tile([10.0, 50.0, 90.0], 80)
     turns = replace(
         responses_of([1.0], [1.0]),
-        condition=np.tile([0, 0, 1, 1], 50),
+        condition=np.tile([0, 0, 0, 1, 1, 1], 40),
         rate_hz=x,
-        active_ratio=np.full(200, 0.1),
-        is_burst=np.zeros(200, bool),
+        active_ratio=np.full(240, 0.1),
+        is_burst=np.zeros(240, bool),
     )
     timeline = fit_timeline([turns, replace(turns, start_min=10.0)], kind="memory")
     training = Training(Navigation(episode_limit=7), Thresholds(1), policies=2, iterations=4_000, duration_min=20.0)

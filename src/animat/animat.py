@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.errors import InvalidArgument
 from animat.mapping import Mapping
-from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.simulator import AT_FIRST, Answer, NeuronSimulator
 from animat.robots.base import Robot
 
 RobotState = TypeVar("RobotState")
@@ -22,18 +22,17 @@ Delivery = Literal["chosen", "shuffled"]
 
 
 class EpisodeState(NamedTuple):
-    """Where an episode stands: the robot's state, the iterations done, and the last response.
+    """Where an episode stands: the robot's state, the iterations done, and what the neurons remember.
 
     Attributes:
         robot: the state of the robot.
         iteration: how many are done.
-        last_hz: the response of the last one, Hz per channel: all that neurons remember; 0 at the start, after silence
-            (NaN without neurons, from the first iteration on).
+        past: in [0, 1], see `animat.neurons.simulator.Answer`.
     """
 
     robot: Any
     iteration: Int[Array, ""]
-    last_hz: Float[Array, ""]
+    past: Float[Array, ""]
 
 
 class Outcome(NamedTuple):
@@ -80,11 +79,11 @@ class Environment(abc.ABC, Generic[RobotState]):
     def actuate(
         self,
         uniforms: Float[Array, " noise"],
-        last_hz: Float[Array, ""],
+        past: Float[Array, ""],
         action: Array,
         simulator: NeuronSimulator | None,
-    ) -> tuple[Array, Float[Array, ""], Float[Array, ""]]:
-        """Turn an action, after a response, into (what was delivered, the response x in Hz, the command in [-1, 1])."""
+    ) -> tuple[Array, Answer, Float[Array, ""]]:
+        """Turn an action into (what was delivered, the answer after a past, the command in [-1, 1])."""
 
     @property
     def n_observations(self) -> int:
@@ -99,7 +98,7 @@ class Environment(abc.ABC, Generic[RobotState]):
     @final
     def reset(self, key: PRNGKeyArray) -> EpisodeState:
         """Start an episode."""
-        return EpisodeState(self.robot.reset(key), jnp.int32(0), jnp.float32(0.0))
+        return EpisodeState(self.robot.reset(key), jnp.int32(0), jnp.float32(AT_FIRST))
 
     @final
     def step(self, key: PRNGKeyArray, state: EpisodeState, action: Array, simulator: NeuronSimulator | None) -> Outcome:
@@ -116,12 +115,12 @@ class Environment(abc.ABC, Generic[RobotState]):
     ) -> Outcome:
         """The same with the random numbers handed in: training draws them for many iterations at once."""
         of_robot = self.robot.noise_size
-        delivered, rate_hz, command = self.actuate(uniforms[of_robot:], state.last_hz, action, simulator)
+        delivered, answer, command = self.actuate(uniforms[of_robot:], state.past, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[:of_robot], state.robot, command)
         iteration = state.iteration + 1
         truncated = (iteration >= self.robot.episode_limit) & ~terminated
-        after = EpisodeState(robot, iteration, rate_hz)
-        return Outcome(after, reward, terminated, truncated, delivered, rate_hz, command)
+        after = EpisodeState(robot, iteration, answer.past)
+        return Outcome(after, reward, terminated, truncated, delivered, answer.rate_hz, command)
 
     @final
     def observe(self, state: EpisodeState) -> Float[Array, " observations"]:
@@ -157,16 +156,16 @@ class Animat(Environment[RobotState]):
     def actuate(
         self,
         uniforms: Float[Array, " noise"],
-        last_hz: Float[Array, ""],
+        past: Float[Array, ""],
         action: Array,
         simulator: NeuronSimulator | None,
-    ) -> tuple[Array, Float[Array, ""], Float[Array, ""]]:
+    ) -> tuple[Array, Answer, Float[Array, ""]]:
         if simulator is None:
             raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
         if self.delivery == "shuffled":
             action = jnp.minimum((uniforms[1] * self.n_conditions).astype(jnp.int32), self.n_conditions - 1)
-        rate_hz = simulator.answer(action, uniforms[0], last_hz)
-        return action, rate_hz, self.mapping.command(rate_hz, simulator.percentiles)
+        answer = simulator.answer(action, uniforms[0], past)
+        return action, answer, self.mapping.command(answer.rate_hz, simulator.percentiles)
 
 
 @dataclass(frozen=True)
@@ -192,9 +191,9 @@ class WithoutNeurons(Environment[RobotState]):
     def actuate(
         self,
         uniforms: Float[Array, " noise"],
-        last_hz: Float[Array, ""],
+        past: Float[Array, ""],
         action: Array,
         simulator: NeuronSimulator | None,
-    ) -> tuple[Array, Float[Array, ""], Float[Array, ""]]:
+    ) -> tuple[Array, Answer, Float[Array, ""]]:
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
-        return action, jnp.float32(jnp.nan), jnp.clip(command, -1.0, 1.0)
+        return action, Answer(jnp.float32(jnp.nan), past), jnp.clip(command, -1.0, 1.0)

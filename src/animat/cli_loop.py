@@ -53,6 +53,8 @@ class Stimulating:
     """A pulse that comes late: continue and log it, or stop"""
     pause_s: float = 2.0
     """Without stimulation before each episode"""
+    lead_in: int = 2
+    """How often each condition is presented before the robot of an episode moves"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
 
@@ -62,6 +64,7 @@ class Stimulating:
             "on_burst": self.on_burst,
             "on_late": self.on_late,
             "pause_s": self.pause_s,
+            "lead_in": self.lead_in,
             "patience_s": self.patience_s,
         }
 

@@ -32,7 +32,7 @@ class Fitting(Responding):
     """How a neuron simulator is made of responses."""
 
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """histogram (the paper, default); empirical: draw a measured value; memory: one measured after one like the last"""
+    """histogram (the paper, default); empirical: draw a measured value; memory: one that had a past like it"""
     bins: int | None = None
     """Bins of a histogram; default: 20"""
     range_hz: float | None = None
@@ -63,11 +63,21 @@ class Fitting(Responding):
 
 
 def fit_as(trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None) -> dict[str, Any]:
-    """How simulators are made: as those that policies were trained on, unless another kind is asked for."""
+    """How simulators are made: as those that policies were trained on, unless another kind is asked for.
+
+    Raises:
+        InvalidArgument: for bins of a kind that has none.
+    """
     usual = {"kind": "histogram", "bins": 20, "range_hz": None}
     asked = {"kind": kind, "bins": bins, "range_hz": range_hz}
     given = (asked,) if kind is not None else (trained, asked)
-    return usual | {name: value for known in given for name, value in known.items() if value is not None}
+    made = usual | {name: value for known in given for name, value in known.items() if value is not None}
+    for option, value in (("--bins", bins), ("--range-hz", range_hz)):
+        if value is not None and made["kind"] != "histogram":
+            raise InvalidArgument(
+                f"{option}: expected none, as a simulator of kind {made['kind']} has no bins; got {value:g}"
+            )
+    return made
 
 
 def say_findings(findings: Sequence[Finding]) -> None:

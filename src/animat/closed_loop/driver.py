@@ -111,13 +111,14 @@ class Driver:
         observation = self._body.reset()
         self._last_command = 0.0
         self._see((), loop.pause_s, self._now_s(), pause=True)
+        # The first pulse comes as if one had been given at the end of the pause.
+        self._last_pulse_s = self._now_s()
+        self._lead_in(contender, episode)
         if self._following is not None and self._following.seen:
             # Between episodes only: within one the robot's world stays as it is, and no tick pays for it.
             self._percentiles = self._following.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
-        # The first pulse comes as if one had been given at the end of the pause.
-        self._last_pulse_s = self._now_s()
         for iteration in range(loop.robot.episode_limit):
             chosen = self._choose(contender, controller, observation)
             repeats = 0
@@ -132,6 +133,14 @@ class Driver:
             if tick.terminated or tick.truncated:
                 break
             observation = np.array(tick.observation)
+
+    def _lead_in(self, contender: Contender, episode: int) -> None:
+        """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
+        if contender.delivery == "silent":
+            return
+        for _ in range(self._loop.lead_in):
+            for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
+                self._present(contender, episode, -1, condition, condition, 0)
 
     def _choose(
         self, contender: Contender, controller: Controller, observation: Float64[np.ndarray, " observations"]
@@ -149,8 +158,11 @@ class Driver:
     def _present(
         self, contender: Contender, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
     ) -> tuple[Tick, bool]:
-        """Present a condition and move the robot by the answer; returns whether to present it once more instead."""
-        loop = self._loop
+        """Present a condition and move the robot by the answer; returns whether to present it once more instead.
+
+        Before iteration 0 the robot stands, whatever the answer.
+        """
+        loop, is_lead_in = self._loop, iteration < 0
         frequency_hz = loop.conditions[delivered].value
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
@@ -175,7 +187,7 @@ class Driver:
         rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
         self._last_pulse_s = self._zero_s + float(after_s[0])
         is_burst = bool(active_ratio[0] > loop.burst_threshold)
-        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats
+        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_lead_in
         tick: dict[str, Any] = {
             "number": self._presented,
             "contender": contender.name,
@@ -191,7 +203,7 @@ class Driver:
             "rate_hz": float(rate_hz[0]),
             "active_ratio": float(active_ratio[0]),
             "is_burst": is_burst,
-            "handled": "repeated" if again else "unfinished",
+            "handled": "lead-in" if is_lead_in else "repeated" if again else "unfinished",
             "command": None,
             "reward": None,
             "observation": (),
@@ -201,14 +213,14 @@ class Driver:
             "decided_s": decided_s,
         }
         self._presented += 1
-        if self._following is not None and stimuli and contender.calibrates and not is_burst:
+        if self._following is not None and stimuli and (contender.calibrates or is_lead_in) and not is_burst:
             self._following.add(delivered, float(rate_hz[0]))
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
-            if not again:
+            if not (again or is_lead_in):
                 tick |= self._move(tick["rate_hz"], is_burst, iteration)
         finally:
             # Whatever happens to the robot, what the culture did is written down.

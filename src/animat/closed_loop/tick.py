@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self
 
-Handled = Literal["used", "repeated", "skipped", "unfinished"]
+Handled = Literal["used", "repeated", "skipped", "lead-in", "unfinished"]
 EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
 
 
@@ -17,7 +17,8 @@ class Tick:
         number: of the presentation in the session, from 0.
         contender: whose episode it is.
         episode: number of the episode in the session, from 0.
-        iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration.
+        iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
+            and what leads in has -1.
         chosen: the condition that was chosen.
         delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
         frequency_hz: of the delivered one.
@@ -28,7 +29,8 @@ class Tick:
         rate_hz: x.
         active_ratio: share of channels that spiked in the window.
         is_burst: whether that is above the threshold.
-        handled: what was done with the response; `"unfinished"` if something went wrong before the robot had moved.
+        handled: what was done with the response; `"lead-in"` before the robot of an episode moves; `"unfinished"` if
+            something went wrong before the robot had moved.
         command: the robot was moved by; None where it was not.
         reward: of the step.
         observation: after the step.

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Float64, Int
 from animat.animat import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.mapping import Mapping, Thresholds
-from animat.neurons.simulator import PERCENTILES, NeuronSimulator, Stored
+from animat.neurons.memory import MemorySimulator
+from animat.neurons.simulator import AT_FIRST, NeuronSimulator, Stored
 
 CONTINUOUS_ACTIONS = 21
 """How many evenly spaced commands stand for a continuous action."""
@@ -25,8 +26,11 @@ _QUANTILES = 2048
 
 _MOST_LEVELS = 12
 
-_LAST_RESPONSES = 8
-"""How many last responses stand for each of their classes."""
+CLASSES = 6
+"""In how many classes a past is remembered."""
+
+_PASTS = 8
+"""How many pasts stand for each of their classes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +113,8 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
             actions = np.arange(environment.n_actions)
         nothing_random = jnp.zeros(environment.noise_size - environment.robot.noise_size)
         leads_to = [
-            float(environment.actuate(nothing_random, jnp.float32(0), jnp.asarray(a), simulator)[2]) for a in actions
+            float(environment.actuate(nothing_random, jnp.float32(AT_FIRST), jnp.asarray(a), simulator)[2])
+            for a in actions
         ]
         return Commands(actions, np.array(leads_to)[:, None], np.ones((len(actions), 1)))
     if simulator is None:
@@ -127,35 +132,34 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 
 
 def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
-    """How many classes of the last response make a difference: one where nothing is remembered."""
-    remembers = isinstance(environment, Animat) and simulator is not None and simulator.has_memory
-    return len(PERCENTILES) - 1 if remembers else 1
+    """How many classes of the past make a difference: one where nothing is remembered."""
+    return CLASSES if isinstance(environment, Animat) and isinstance(simulator, MemorySimulator) else 1
 
 
-def class_of(
-    percentiles: Float[Stored, " percentiles"], rate_hz: Float[Stored, "*responses"]
-) -> Int[Array, "*responses"]:
-    """Which of ten classes a response is remembered in: between which of P10, P20, ..., P90 it lies."""
-    return jnp.sum(jnp.asarray(rate_hz)[..., None] >= percentiles[1:-1], axis=-1)
+def class_of(simulator: MemorySimulator, past: Float[Stored, "*pasts"]) -> Int[Array, "*pasts"]:
+    """Which class of pasts each is remembered in: of the recording's own, equally many are in each."""
+    ends = np.arange(1, CLASSES) / CLASSES
+    return jnp.sum(jnp.asarray(past)[..., None] >= jnp.quantile(_recorded(simulator), ends), axis=-1)
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
-    """What each action leads to after a last response of each class, and of which class the response is then.
+    """What each action leads to after a past of each class, and of which class the past is then.
 
-    A memory in ten steps (`class_of`): 8 responses stand for all of a class, and 2048 draws after each of them for what
-    is answered. Thresholds lie between classes, so that a class has one command.
+    A memory in six steps (`class_of`): 8 pasts stand for all of a class, and 2048 draws after each of them for what is
+    answered.
 
     Args:
         environment, simulator: as in `commands_of`.
 
     Returns:
-        For each class of the last response, for each class of the response to come: the commands, with the
-        probabilities that they come with a response of that class; over all of these they add up to 1. Where nothing is
-        remembered, one class and the commands of `commands_of`.
+        For each class of the past, for each class of the past to come: the commands, with the probabilities that they
+        come with it; over all of these they add up to 1. Where nothing is remembered, one class and the commands of
+        `commands_of`.
     """
-    if simulator is None or not isinstance(environment, Animat) or layers_of(environment, simulator) == 1:
+    if not (isinstance(environment, Animat) and isinstance(simulator, MemorySimulator)):
         return [[commands_of(environment, simulator)]]
-    levels, classes = (np.asarray(x) for x in _answers(environment, simulator, _last_responses(simulator)))
+    levels, pasts = _answers(environment, simulator, _pasts(simulator))
+    levels, classes = np.asarray(levels), np.asarray(class_of(simulator, pasts))
     if environment.delivery == "shuffled":
         # Whatever is chosen, any condition is delivered: one action stands for all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
@@ -167,14 +171,20 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
     ]
 
 
-def _last_responses(simulator: NeuronSimulator) -> Float[Array, "classes responses"]:
-    """A few responses of each class, evenly spaced in rank among all that there can be."""
-    x = jnp.sort(_responses(simulator).ravel())
-    ends = np.searchsorted(np.asarray(class_of(simulator.percentiles, x)), np.arange(len(PERCENTILES)))
-    within = (np.arange(_LAST_RESPONSES) + 0.5) / _LAST_RESPONSES
-    # In a class that no response is of, only an episode's start can be: those next to it stand for it.
+def _recorded(simulator: MemorySimulator) -> Float[Array, " responses"]:
+    """The pasts of all recorded responses, rising."""
+    pasts = jnp.sort(jnp.asarray(simulator.before).ravel())
+    return pasts[: int(jnp.sum(jnp.isfinite(pasts)))]
+
+
+def _pasts(simulator: MemorySimulator) -> Float[Array, "classes pasts"]:
+    """A few pasts of each class, evenly spaced in rank among those that were recorded."""
+    recorded = _recorded(simulator)
+    ends = np.searchsorted(np.asarray(class_of(simulator, recorded)), np.arange(CLASSES + 1))
+    within = (np.arange(_PASTS) + 0.5) / _PASTS
+    # In a class that none is in, only an episode's start can be: those next to it stand for it.
     rows = (ends[:-1, None] + within * np.diff(ends)[:, None]).astype(np.int64)
-    return x[np.minimum(rows, len(x) - 1)]
+    return recorded[np.minimum(rows, len(recorded) - 1)]
 
 
 def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses"]:
@@ -186,16 +196,16 @@ def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses
 
 @partial(jax.jit, static_argnums=0)
 def _answers(
-    environment: Animat[Any], simulator: NeuronSimulator, last_hz: Float[Array, "classes responses"]
-) -> tuple[Float[Array, "classes conditions draws"], Int[Array, "classes conditions draws"]]:
-    """The commands, and the classes of the responses, at evenly spaced quantiles of each condition after each class."""
+    environment: Animat[Any], simulator: MemorySimulator, past: Float[Array, "classes pasts"]
+) -> tuple[Float[Array, "classes conditions draws"], Float[Array, "classes conditions draws"]]:
+    """The commands, and what is remembered then, at evenly spaced quantiles of each condition after each past."""
     uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
 
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
     conditions = jnp.arange(simulator.n_conditions)
-    x = answers(conditions, uniforms, last_hz).reshape(len(last_hz), len(conditions), -1)
-    return environment.mapping.command(x, simulator.percentiles), class_of(simulator.percentiles, x)
+    x, then = (each.reshape(len(past), len(conditions), -1) for each in answers(conditions, uniforms, past))
+    return environment.mapping.command(x, simulator.percentiles), then
 
 
 def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[np.ndarray, " nodes"], bool]:

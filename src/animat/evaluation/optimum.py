@@ -19,7 +19,8 @@ from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
-from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.memory import MemorySimulator
+from animat.neurons.simulator import AT_FIRST, NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.recordings.findings import Finding
 
@@ -40,9 +41,9 @@ class Optimum:
     """The best possible mean return of any controller, and how well it is known.
 
     Attributes:
-        value: by dynamic programming, of a controller that knows the time left, and where neurons remember it the
-            class of the last response (one of ten: `animat.evaluation.commands.class_of`). What the grid cannot resolve
-            raises it more often than it lowers it, as the best of several values is taken: the upper end of a bracket.
+        value: by dynamic programming, of a controller that knows the time left, and where neurons remember it the class
+            of the past (one of six: `animat.evaluation.commands.class_of`). What the grid cannot resolve raises it more
+            often than it lowers it, as the best of several values is taken: the upper end of a bracket.
         grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
         monte_carlo: mean return of that controller, run on the environment itself: a return that can be had, the lower
             end of the bracket; NaN where it was not run, as the three that follow.
@@ -122,7 +123,7 @@ def best_returns(
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 
     with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. Where the
-    neurons remember, s holds the class of the last response too (`commands_after`). V is kept
+    neurons remember, s holds the class of the past too (`commands_after`). V is kept
     at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
     `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
     a return that can be had and cannot lie above the true limit by more than chance.
@@ -267,9 +268,9 @@ class _Programme:
             )
             values, before = before, values
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
-        # An episode starts after silence.
-        silence = [of_case.start + int(self._layer(case, np.zeros(1))[0]) for case, of_case in enumerate(self._layers)]
-        return self._interpolate(values.reshape(shape)[:, silence], starts)
+        first = np.full(1, AT_FIRST)
+        at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
+        return self._interpolate(values.reshape(shape)[:, at_first], starts)
 
     def play(
         self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool
@@ -301,7 +302,7 @@ class _Programme:
                 landings.places[:, :, 0],
                 landings.rewards[:, :, 0],
                 self._grid.row_offsets,
-                self._layer(case, state.last_hz),
+                self._layer(case, state.past),
                 pairs,
                 outcomes.weights,
                 remaining,
@@ -316,12 +317,12 @@ class _Programme:
                 break
         return returns
 
-    def _layer(self, case: int, last_hz: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
-        """In which of a case's layers episodes are, by their last response."""
-        simulator = self._cases[case][1]
-        if simulator is None or layers_of(*self._cases[case]) == 1:
-            return np.zeros(len(last_hz), np.int32)
-        return np.asarray(class_of(simulator.percentiles, last_hz), np.int32)
+    def _layer(self, case: int, past: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
+        """In which of a case's layers episodes are, by their past."""
+        environment, simulator = self._cases[case]
+        if not (isinstance(simulator, MemorySimulator) and layers_of(environment, simulator) > 1):
+            return np.zeros(len(past), np.int32)
+        return np.asarray(class_of(simulator, past), np.int32)
 
     def _interpolate(
         self, values: Float32[np.ndarray, "rows cases nodes"], states: Any

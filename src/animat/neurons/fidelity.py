@@ -96,14 +96,14 @@ def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws"
 
 @jax.jit
 def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions draws"]:
-    """Evenly spaced answers to every condition after each response that came before one of its own."""
+    """Evenly spaced answers to every condition after each past that one of its own responses had."""
     uniforms = (jnp.arange(200) + 0.5) / 200
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
-    rows = jnp.arange(simulator.before_hz.shape[1])
+    rows = jnp.arange(simulator.before.shape[1])
 
     def of_condition(condition: Int[Array, ""]) -> Float[Array, " draws"]:
         # What is padded is stood for by those that are there, over and over.
-        before = simulator.before_hz[condition][rows % simulator.followers[condition]]
-        return answer(condition, uniforms, before).ravel()
+        before = simulator.before[condition][rows % simulator.followers[condition]]
+        return answer(condition, uniforms, before).rate_hz.ravel()
 
     return jax.vmap(of_condition)(jnp.arange(simulator.n_conditions))

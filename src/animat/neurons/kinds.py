@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from animat.errors import InvalidArgument
-from animat.neurons.memory import fit_memory
+from animat.neurons.memory import Memory, fit_memory
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
 
 Kind = Literal["histogram", "empirical", "memory"]
-"""A distribution in bins (the paper); a measured value; one that was measured after a response like the last."""
+"""A distribution in bins (the paper); a measured value; one that was measured after a past like the present one."""
 
 
 def fit_simulator(
@@ -20,8 +20,9 @@ def fit_simulator(
     bins: int = 20,
     range_hz: float | None = None,
     room: int | None = None,
+    memory: Memory | None = None,
 ) -> NeuronSimulator:
-    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others.
+    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others, `memory` of one.
 
     Raises:
         InvalidArgument: for another kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
@@ -32,5 +33,5 @@ def fit_simulator(
     if kind == "empirical":
         return fit_empirical(responses, room=room)
     if kind == "memory":
-        return fit_memory(responses, room=room)
+        return fit_memory(responses, room=room, memory=memory)
     raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")

@@ -1,76 +1,115 @@
-"""A neuron simulator that remembers: what a culture answers depends on what it answered just before."""
+"""A neuron simulator that remembers: what a culture answers depends on what it was given and answered before."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Array, Float, Float64, Int, Int64
 
-from animat.neurons.responses import Responses
-from animat.neurons.simulator import EmpiricalSimulator, Stored, fit_empirical
+from animat.neurons.conditions import NO_CONDITION
+from animat.neurons.responses import Presented, Responses
+from animat.neurons.simulator import AT_FIRST, Answer, EmpiricalSimulator, Stored, fit_empirical
 
+
+class Memory(NamedTuple):
+    """How a past is made of what was presented and answered, and how much of it an answer hangs on.
+
+        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
+
+    with p the past before a response, p' after it, r the response's rank (the share of all responses below it) and m
+    the mean rank of its condition. All are in [0, 1]; 0 after silence.
+
+    Attributes:
+        decay: of the past before; 0: only the last presentation is remembered.
+        weight: of what was presented beside what was answered; 0: only the answer is remembered.
+        reach: of n responses the n^reach with the nearest pasts may be drawn; 1: all of them, whatever the past.
+    """
+
+    decay: float
+    weight: float
+    reach: float
+
+
+NO_MEMORY = Memory(0.0, 0.0, 1.0)
+
+_DECAYS = (0.0, 0.15, 0.3, 0.45)
+_WEIGHTS = (0.0, 0.5, 1.0)
 _REACHES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Of n responses n^reach count as nearest; 1: all of them, no memory."""
+_CERTAIN = 2.0
+"""Standard errors by which a memory must tell responses better than none: the best of many does by chance, a little."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MemorySimulator(EmpiricalSimulator):
-    """Draws one of the measured responses to the condition that came after a response like the last one.
+    """Draws one of the measured responses to the condition that had a past like the present one.
 
-    Of a condition's responses, ordered by the response before each of them, one of the k nearest in that order to the
-    last response is drawn, all equally likely; where more than k came after the very same response, one of these. No
-    distribution and no form of dependence is assumed. With all of them nearest it is the empirical simulator, which its
-    `quantile` always is: what is answered when nothing is known of the last response.
+    Of a condition's responses, ordered by their pasts (see `Memory`), one of the k nearest in that order is drawn, all
+    equally likely; where more than k had the very same past, one of these. No distribution and no form of dependence
+    is assumed. With all of them nearest it is the empirical simulator, which its `quantile` always is: what is answered
+    when nothing is known of the past.
 
     Attributes:
-        before_hz: the response before each of a condition's responses, rising, padded with infinity, shape
-            (conditions, most responses).
+        before: the past of each of a condition's responses, rising, padded with infinity, shape (conditions, most
+            responses).
         after_hz: the response itself, in that order, shape (conditions, most responses).
+        left: what it leaves in the past, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most responses).
         followers: how many of them there are, shape (conditions,): those before which no burst came.
         nearest: k of each condition, shape (conditions,).
+        decay, weight, reach: as in `Memory`.
 
-    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with one response as its
+    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with one number as its
     memory and without its weights.
     """
 
-    before_hz: Float[Stored, "*recordings conditions values"]
+    before: Float[Stored, "*recordings conditions values"]
     after_hz: Float[Stored, "*recordings conditions values"]
+    left: Float[Stored, "*recordings conditions values"]
     followers: Int[Stored, "*recordings conditions"]
     nearest: Int[Stored, "*recordings conditions"]
+    decay: Float[Stored, "*recordings"]
+    weight: Float[Stored, "*recordings"]
+    reach: Float[Stored, "*recordings"]
 
     has_memory: ClassVar[bool] = True
 
-    def answer(
-        self, condition: Int[Array, ""], uniform: Float[Array, ""], last_hz: Float[Array, ""]
-    ) -> Float[Array, ""]:
-        before, count, nearest = self.before_hz[condition], self.followers[condition], self.nearest[condition]
-        smaller, no_larger = jnp.sum(before < last_hz), jnp.sum(before <= last_hz)
+    @property
+    def memory(self) -> Memory:
+        """Of a single recording's simulator, as `fit_memory` takes it."""
+        return Memory(float(self.decay), float(self.weight), float(self.reach))
+
+    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], past: Float[Array, ""]) -> Answer:
+        before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
+        smaller, no_larger = jnp.sum(before < past), jnp.sum(before <= past)
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
-        # Small arrays count few spikes, and many responses came after the same number.
+        # Small arrays count few spikes, and many responses may have the same past.
         first, end = jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
         # float32 rounds a uniform just under 1 times a count up to the count.
         row = jnp.minimum(first + (uniform * (end - first)).astype(jnp.int32), end - 1)
-        return self.after_hz[condition, row]
+        left = jnp.asarray(self.left)[condition, row]
+        return Answer(jnp.asarray(self.after_hz)[condition, row], jnp.asarray(self.decay) * past + left)
 
 
-def fit_memory(responses: Responses, *, room: int | None = None) -> MemorySimulator:
+def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory | None = None) -> MemorySimulator:
     """Keep every condition's non-burst responses, and what was before them, to draw from.
 
-    How far the nearest reach, k = n^reach of a condition's n responses, is the same for all conditions: the largest
-    of 0.5, 0.6, ..., 1 with which a response is told by the mean of its neighbours' as well as with the best, up to one
-    standard error of the difference, each left out in turn. Responses without memory end at 1, where there is none in
-    the simulator either.
+    What is remembered, and how far the nearest reach, is found by leaving out each response in turn and telling it, in
+    rank, by the mean of its neighbours. Of twelve ways to make a past the one with the smallest error is taken, and of
+    its reaches the largest that is as good as the best, up to one standard error of the difference. Where nothing tells
+    responses better than no past at all does, by two standard errors, there is no memory in the simulator either.
 
     Args:
         responses: of one recording, every condition with at least one non-burst response. Those that came after a
             burst, which the simulator never answers itself, are only drawn where a condition has no others.
         room: how many values a condition has room for, so that simulators of several recordings stack; None: as many
             as the largest condition needs.
+        memory: to be used in place of the one that is found: for responses that are drawn from others.
 
     Raises:
         UnusableData: if a condition has no non-burst response.
@@ -79,51 +118,121 @@ def fit_memory(responses: Responses, *, room: int | None = None) -> MemorySimula
     Source: the rule of one standard error, Breiman, Friedman, Olshen and Stone 1984.
     """
     values = fit_empirical(responses, room=room)
+    ranked = _Ranked(responses)
+    memory = memory or _found(ranked)
+    past = ranked.pasts(memory)
     shape = values.values_hz.shape
-    before, after, followers = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape[0], np.int64)
-    last_hz = responses.last_hz
-    for condition in range(len(responses.conditions)):
-        rows = np.flatnonzero(~responses.is_burst & (responses.condition == condition))
-        known = rows[~np.isnan(last_hz[rows])]
-        rows = known if len(known) else rows
-        rows = rows[np.argsort(last_hz[rows], kind="stable")]
-        followers[condition] = len(rows)
-        before[condition, : len(rows)] = np.nan_to_num(last_hz[rows])
-        after[condition, : len(rows)] = responses.rate_hz[rows]
-    reach = _reach([after[condition, :n] for condition, n in enumerate(followers)])
+    before, after, left = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+    for condition, rows in enumerate(ranked.rows):
+        in_order = rows[np.argsort(past[rows], kind="stable")]
+        before[condition, : len(rows)] = past[in_order]
+        after[condition, : len(rows)] = responses.rate_hz[in_order]
+        left[condition, : len(rows)] = _left(ranked.rank[in_order], ranked.means[condition], memory)
+    followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
         values.values_hz,
         values.counts,
         values.percentiles,
         jnp.asarray(before, jnp.float32),
         jnp.asarray(after, jnp.float32),
+        jnp.asarray(left, jnp.float32),
         jnp.asarray(followers, jnp.int32),
-        jnp.asarray(_nearest(followers, reach), jnp.int32),
+        jnp.asarray(np.rint(followers**memory.reach), jnp.int32),
+        *(jnp.float32(each) for each in memory),
     )
 
 
-def _nearest(followers: Int[np.ndarray, " conditions"], reach: float) -> Int[np.ndarray, " conditions"]:
-    return np.rint(followers**reach).astype(np.int64)
+class _Ranked:
+    """Responses by rank.
+
+    Attributes:
+        rank: of each, the share of non-burst responses below it, ties half, shape (responses,).
+        means: the mean rank of each condition's non-burst responses, shape (conditions,).
+        rows: of each condition, the responses that can be drawn.
+    """
+
+    def __init__(self, responses: Responses) -> None:
+        self._presented, self._place = responses.presentations
+        self._sorted_hz = np.sort(responses.non_burst_rate_hz)
+        self.rank = self._ranks(responses.rate_hz)
+        usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in range(_n(responses))]
+        self.means = np.array([self.rank[rows].mean() for rows in usable])
+        known = ~np.isnan(responses.last_hz)
+        self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
+
+    def _ranks(self, rate_hz: Float64[np.ndarray, " values"]) -> Float64[np.ndarray, " values"]:
+        below, no_larger = (np.searchsorted(self._sorted_hz, rate_hz, side=side) for side in ("left", "right"))
+        return np.asarray((below + no_larger) / (2 * len(self._sorted_hz)))
+
+    def pasts(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
+        """What was before each response."""
+        presented: Presented = self._presented
+        # Of what has no condition of its own the middle one's is as good as any.
+        means = np.where(presented.condition == NO_CONDITION, AT_FIRST, self.means[presented.condition])
+        left = _left(self._ranks(presented.rate_hz), means, memory)
+        past, pasts = 0.0, []
+        for is_rested, is_burst, more in zip(
+            presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
+        ):
+            past = 0.0 if is_rested else past
+            pasts.append(past)
+            # What a burst leaves is not known: what comes right after one is not drawn, and begins anew.
+            past = AT_FIRST if is_burst else memory.decay * past + more
+        return np.asarray(np.array(pasts, np.float64)[self._place])
 
 
-def _reach(after_hz: list[Float64[np.ndarray, " followers"]]) -> float:
-    """How far the nearest reach, by each condition's responses in the order of the responses before them."""
-    pooled = np.sort(np.concatenate(after_hz))
-    # In ranks, or the few largest responses would decide.
-    ranks = [np.searchsorted(pooled, x) / len(pooled) for x in after_hz if len(x) > 1]
-    if not ranks:
-        return 1.0
-    errors = np.array([np.concatenate([_errors(x, reach) for x in ranks]) for reach in _REACHES])
-    worse = errors - errors[errors.mean(axis=1).argmin()]
-    allowed = worse.std(axis=1) / np.sqrt(errors.shape[1])
-    return max(reach for reach, row, limit in zip(_REACHES, worse, allowed, strict=True) if row.mean() <= limit)
+def _n(responses: Responses) -> int:
+    return len(responses.conditions)
 
 
-def _errors(ranks: Float64[np.ndarray, " followers"], reach: float) -> Float64[np.ndarray, " followers"]:
-    """Squared differences between each response and the mean of the nearest others."""
-    n = len(ranks)
-    k = int(min(np.rint(n**reach), n - 1))
-    first = np.clip(np.arange(n) - k // 2, 0, n - k - 1)
-    below = np.concatenate([[0.0], np.cumsum(ranks)])
-    others = below[first + k + 1] - below[first] - ranks
-    return np.asarray((ranks - others / k) ** 2)
+def _left(
+    rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
+) -> Float64[np.ndarray, " responses"]:
+    """What responses leave in the past."""
+    return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
+
+
+def _found(ranked: _Ranked) -> Memory:
+    """The memory that tells responses best, as `fit_memory` says."""
+    rows = [rows for rows in ranked.rows if len(rows) > 1]
+    if not rows:
+        return NO_MEMORY
+    errors = {}
+    for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
+        past = ranked.pasts(Memory(decay, weight, 1.0))
+        in_order = [each[np.argsort(past[each], kind="stable")] for each in rows]
+        for reach in _REACHES:
+            errors[Memory(decay, weight, reach)] = _errors(ranked.rank, in_order, reach)
+    best = min(errors, key=lambda memory: float(errors[memory].mean()))
+
+    def is_as_good(memory: Memory, standard_errors: float) -> bool:
+        worse = errors[memory] - errors[best]
+        return bool(worse.mean() <= standard_errors * worse.std() / np.sqrt(len(worse)))
+
+    if is_as_good(NO_MEMORY, _CERTAIN):
+        return NO_MEMORY
+    return max(
+        (best._replace(reach=reach) for reach in _REACHES if is_as_good(best._replace(reach=reach), 1.0)),
+        key=lambda memory: memory.reach,
+    )
+
+
+def _errors(
+    rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], reach: float
+) -> Float64[np.ndarray, " rows"]:
+    """Squared differences between each response's rank and the mean of the nearest others', in a fixed order.
+
+    Args:
+        rank: of all responses.
+        in_order: the responses to each condition in the order of their pasts.
+        reach: of n, n^reach are nearest.
+    """
+    errors = np.full(len(rank), np.nan)
+    for rows in in_order:
+        n = len(rows)
+        k = int(min(np.rint(n**reach), n - 1))
+        first = np.clip(np.arange(n) - k // 2, 0, n - k - 1)
+        below = np.concatenate([[0.0], np.cumsum(rank[rows])])
+        others = below[first + k + 1] - below[first] - rank[rows]
+        errors[rows] = (rank[rows] - others / k) ** 2
+    return np.asarray(errors[~np.isnan(errors)])

@@ -22,6 +22,23 @@ SILENCE_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
+class Presented:
+    """All presentations of a recording, in the order of time: what a culture may remember when it answers.
+
+    Attributes:
+        condition: index of each, `NO_CONDITION` where it has none, shape (presentations,).
+        rate_hz: x of each, shape (presentations,).
+        is_burst: whether the response was one, shape (presentations,).
+        is_rested: whether there was no pulse in the `SILENCE_S` before it, shape (presentations,).
+    """
+
+    condition: Int64[np.ndarray, " presentations"]
+    rate_hz: Float64[np.ndarray, " presentations"]
+    is_burst: Bool[np.ndarray, " presentations"]
+    is_rested: Bool[np.ndarray, " presentations"]
+
+
+@dataclass(frozen=True, eq=False)
 class Responses:
     """Responses to the stimuli of one recording, in the order of time. Arrays are read-only.
 
@@ -40,9 +57,9 @@ class Responses:
         findings: what was noticed about them.
         time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
             responses that come from elsewhere.
-        before_hz: x of the presentation before each one's, whether that has a condition or not: 0 where there was none
-            in the `SILENCE_S` before, NaN where it was a burst; shape (responses,). None: all presentations are here,
-            one soon after the other (see `last_hz`).
+        presented: all presentations of the recording, also those without a condition; None: these responses are all,
+            one soon after the other (see `presentations`).
+        place: where among them each response is, shape (responses,).
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
@@ -61,7 +78,8 @@ class Responses:
     start_min: float = 0.0
     findings: tuple[Finding, ...] = ()
     time_s: Float64[np.ndarray, " responses"] | None = None
-    before_hz: Float64[np.ndarray, " responses"] | None = None
+    presented: Presented | None = None
+    place: Int64[np.ndarray, " responses"] | None = None
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {
@@ -70,7 +88,8 @@ class Responses:
             "active_ratio": np.float64,
             "is_burst": np.bool_,
         }
-        columns |= {name: np.float64 for name in ("time_s", "before_hz") if getattr(self, name) is not None}
+        optional = {"time_s": np.float64, "place": np.int64}
+        columns |= {name: dtype for name, dtype in optional.items() if getattr(self, name) is not None}
         for name, dtype in columns.items():
             array = np.array(getattr(self, name), dtype=dtype)
             if array.shape != (len(self),):
@@ -87,11 +106,19 @@ class Responses:
         return len(self.condition)
 
     @property
+    def presentations(self) -> tuple[Presented, Int64[np.ndarray, " responses"]]:
+        """All presentations of the recording in the order of time, and where among them each response is."""
+        if self.presented is not None and self.place is not None:
+            return self.presented, self.place
+        every = Presented(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
+        return every, np.arange(len(self))
+
+    @property
     def last_hz(self) -> Float64[np.ndarray, " responses"]:
         """x of the response before each one, Hz: 0 after silence, NaN after a burst."""
-        if self.before_hz is not None:
-            return self.before_hz
-        return _before(self.rate_hz, self.is_burst, np.zeros(len(self), bool))
+        presented, place = self.presentations
+        before_hz = np.concatenate([[0.0], np.where(presented.is_burst, np.nan, presented.rate_hz)])[:-1]
+        return np.asarray(np.where(presented.is_rested, 0.0, before_hz)[place])
 
     @property
     def non_burst_rate_hz(self) -> Float64[np.ndarray, " non_bursts"]:
@@ -111,11 +138,12 @@ class Responses:
     def redrawn(self, rng: np.random.Generator) -> Responses:
         """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
 
-        Each keeps the response that was before it. Bursts are left out, and a condition without other responses stays
+        Each keeps what was presented before it. Bursts are left out, and a condition without other responses stays
         without.
         """
         rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
         drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
+        presented, place = self.presentations
         return replace(
             self,
             condition=self.condition[drawn],
@@ -124,7 +152,8 @@ class Responses:
             is_burst=self.is_burst[drawn],
             findings=(),
             time_s=None if self.time_s is None else self.time_s[drawn],
-            before_hz=self.last_hz[drawn],
+            presented=presented,
+            place=place[drawn],
         )
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
@@ -192,16 +221,7 @@ def extract_responses(
         presentation=recording.presentation,
         start_min=recording.start_min,
         time_s=stimuli.time_s[used],
-        before_hz=_before(rate_hz, active_ratio > bursts.threshold, is_rested)[chosen],
+        presented=Presented(assignment.condition[presented], rate_hz, active_ratio > bursts.threshold, is_rested),
+        place=np.flatnonzero(chosen),
     )
     return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))
-
-
-def _before(
-    rate_hz: Float64[np.ndarray, " responses"],
-    is_burst: Bool[np.ndarray, " responses"],
-    is_rested: Bool[np.ndarray, " responses"],
-) -> Float64[np.ndarray, " responses"]:
-    """The response before each one: NaN for a burst, 0 before the first one and where the culture rested."""
-    before_hz = np.concatenate([[0.0], np.where(is_burst, np.nan, rate_hz)])[:-1]
-    return np.where(is_rested, 0.0, before_hz)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias, final
+from typing import Any, ClassVar, NamedTuple, TypeAlias, final
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,29 @@ PERCENTILES = tuple(range(0, 101, 10))
 """Which percentiles of the pooled non-burst responses a simulator carries: P0 (smallest), P10, ..., P100 (largest)."""
 
 
+AT_FIRST = 0.5
+"""The past that an episode begins with: what has led in to it was presented in random order, as in a recording."""
+
+
+class Answer(NamedTuple):
+    """A response, and what is remembered after it.
+
+    Attributes:
+        rate_hz: x, Hz per channel.
+        past: in [0, 1]: 0 after silence, larger the more the culture was driven and has answered of late (see
+            `animat.neurons.memory`).
+    """
+
+    rate_hz: Float[Array, ""]
+    past: Float[Array, ""]
+
+
 class NeuronSimulator(abc.ABC):
     """What a culture answers to each condition, as a pytree of arrays; so a refresh changes data, never code.
 
     Attributes:
         percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,).
-        has_memory: whether what it answers depends on its last answer.
+        has_memory: whether what it answers depends on what was before.
     """
 
     percentiles: Float[Stored, "*recordings percentiles"]
@@ -44,19 +61,17 @@ class NeuronSimulator(abc.ABC):
     def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
         """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies."""
 
-    def answer(
-        self, condition: Int[Array, ""], uniform: Float[Array, ""], last_hz: Float[Array, ""]
-    ) -> Float[Array, ""]:
-        """The response x to a condition after the response `last_hz`, by a uniform in [0, 1); all in Hz per channel.
+    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], past: Float[Array, ""]) -> Answer:
+        """What is answered to a condition, by a uniform in [0, 1), after a past in [0, 1] (0: silence).
 
-        A simulator without memory answers the same whatever was before.
+        A simulator without memory answers the same whatever was before, and leaves the past as it is.
         """
-        return self.quantile(condition, uniform)
+        return Answer(self.quantile(condition, uniform), past)
 
     @final
-    def sample(self, key: PRNGKeyArray, condition: Int[Array, ""], last_hz: float | Array = 0.0) -> Float[Array, ""]:
-        """Draw one response x to a condition after another (0: after silence), both in Hz per channel."""
-        return self.answer(condition, jax.random.uniform(key), jnp.asarray(last_hz, jnp.float32))
+    def sample(self, key: PRNGKeyArray, condition: Int[Array, ""], past: float | Array = AT_FIRST) -> Float[Array, ""]:
+        """Draw one response x to a condition, in Hz per channel, after a past in [0, 1]."""
+        return self.answer(condition, jax.random.uniform(key), jnp.asarray(past, jnp.float32)).rate_hz
 
 
 @jax.tree_util.register_dataclass

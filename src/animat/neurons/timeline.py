@@ -93,7 +93,7 @@ def fit_timeline(
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
         kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one that was measured
-            after a response like the last).
+            after a past like the present one).
         bins: of a histogram.
         range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
             percentiles are the edges (`fit_histogram`).

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
@@ -89,9 +88,11 @@ class Calibration:
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         simulator = timeline.at(start_min)
+        # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
+        memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
         calibration = cls(
             simulator=simulator,
-            redrawn=tuple(_as_near(simulator, fit_simulator(responses.redrawn(rng), **fit)) for _ in range(REDRAWN)),
+            redrawn=tuple(fit_simulator(responses.redrawn(rng), memory=memory, **fit) for _ in range(REDRAWN)),
             responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             start_min=start_min,
@@ -111,11 +112,3 @@ class Calibration:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
         return replace(self, simulator=held(self.simulator), redrawn=tuple(map(held, self.redrawn)))
-
-
-def _as_near(simulator: NeuronSimulator, redrawn: NeuronSimulator) -> NeuronSimulator:
-    """A redrawn simulator whose nearest reach as far as those it was drawn from: a response that was drawn twice is no
-    neighbour that tells of itself."""
-    if not (isinstance(simulator, MemorySimulator) and isinstance(redrawn, MemorySimulator)):
-        return redrawn
-    return replace(redrawn, nearest=jnp.minimum(simulator.nearest, redrawn.followers))

@@ -201,7 +201,7 @@ def _rows(
 ) -> tuple[Row, ...]:
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         whole = [episode for episode in session.episodes if episode.contender in of and episode.is_whole]
-        ticks = [tick for tick in session.ticks if tick.contender in of]
+        ticks = [tick for tick in session.ticks if tick.contender in of and tick.handled != "lead-in"]
         actions = max(1, sum(tick.command is not None for tick in ticks))
         return Row(
             name=name,

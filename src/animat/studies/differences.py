@@ -82,8 +82,8 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
     elif simulators.kind == "memory":
         yield (
             "Memory",
-            "The paper's histogram answers the same whatever was before. Here one of the measured responses that came "
-            "after a response like the last one is drawn, so what a culture remembers from one to the next is in it.",
+            "The paper's histogram answers the same whatever was before. Here one of the measured responses that had a "
+            "past like the present one is drawn, so what a culture remembers is in it.",
         )
     else:
         if simulators.range_hz is None:
