@@ -45,6 +45,7 @@ def loop_at(tmp_path: Path, culture: Culture, pulse: Pulse, chosen: int) -> Sess
         pulses=5,
         pulse=pulse,
         pause_s=0.1,
+        lead_in=0,
         on_late="stop",
     )
     with culture:

@@ -53,8 +53,8 @@ class Stimulating:
     """A pulse that comes late: continue and log it, or stop"""
     pause_s: float = 2.0
     """Without stimulation before each episode"""
-    lead_in: int = 2
-    """How often each condition is presented before the robot of an episode moves"""
+    lead_in: int | None = None
+    """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
 

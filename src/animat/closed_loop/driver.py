@@ -138,7 +138,7 @@ class Driver:
         """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
         if contender.delivery == "silent":
             return
-        for _ in range(self._loop.lead_in):
+        for _ in range(self._loop.lead_in or 0):
             for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
                 self._present(contender, episode, -1, condition, condition, 0)
 

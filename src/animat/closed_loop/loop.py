@@ -73,7 +73,8 @@ class Loop:
         on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: observed without a stimulus before each episode.
         lead_in: how often each condition is presented after that, in random order, before the robot moves: a culture
-            that has rested answers otherwise than in a recording. The responses count where percentiles follow.
+            that has rested answers otherwise than in a recording. The responses count where percentiles follow. None:
+            2 where an action is one pulse, 0 where it is several, which are each other's past.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
@@ -97,7 +98,7 @@ class Loop:
     most_repeats: int = 3
     on_late: OnLate = "continue"
     pause_s: float = 2.0
-    lead_in: int = 2
+    lead_in: int | None = None
     patience_s: float = 10.0
     real_time: bool = False
 
@@ -127,6 +128,8 @@ class Loop:
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
+        if self.lead_in is None:
+            object.__setattr__(self, "lead_in", 2 if self.pulses == 1 else 0)
         for name in ("burst_threshold", "pause_s", "lead_in", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
