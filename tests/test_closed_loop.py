@@ -333,6 +333,22 @@ def test_what_leads_in_counts_for_percentiles_that_follow(tmp_path: Path) -> Non
     )
 
 
+def test_several_pulses_lead_in_by_themselves() -> None:
+    assert [loop_of(pulses=n, lead_in=None).lead_in for n in (1, 2, 5)] == [2, 0, 0]
+    assert loop_of(pulses=5, lead_in=1).lead_in == 1
+
+
+def test_a_budget_that_runs_out_while_leading_in_ends_the_session(tmp_path: Path) -> None:
+    with FakeCulture() as culture:
+        account = Account(Budget(7))
+        session = run_session(culture, loop_of(lead_in=2), [RANDOM], tmp_path, episodes=1, account=account)
+    assert session.ending.by == "budget"
+    assert [tick.handled for tick in session.ticks] == ["lead-in"] * 7
+    (episode,) = session.episodes
+    assert (episode.iterations, episode.is_whole, episode.pulses) == (0, False, 7)
+    assert_read_alike(tmp_path, loop_of())
+
+
 def test_bursts_are_handled_as_chosen(tmp_path: Path) -> None:
     sessions = {}
     for how in ("use", "repeat", "skip"):
