@@ -9,7 +9,9 @@ machine: a loop that does nothing but wait for as long as a decision takes.
 
 Deadlines: a session in real time at 80 Hz, where 2.4 ms are left from the window's end to the next pulse. At the same
 time, on the same core, an idle loop in a process of its own has the same deadlines: it sleeps until each window's end,
-and once more for as long as a decision takes. What it misses too is the machine's: another process, or a hypervisor.
+and once more for as long as a decision takes. A miss of the loop alone is its own. One of both is the machine's
+(another process, a hypervisor) where the loop's process had hardly run meanwhile, which is measured too; a loop that
+computed for so long would have kept the core from both.
 """
 
 from __future__ import annotations
@@ -181,11 +183,13 @@ class OnOneCore(Instant):
         self._window_ends_s = window_ends_s
         self._zero_s = 0.0
         self.ends_s: list[float] = []
+        self.used_ms: list[float] = []
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         if self.number == 0:
             self._zero_s = time.perf_counter()
             stay_on_one_core()
+        self.used_ms.append(1e3 * time.process_time())
         observed = super()._deliver(admitted, duration_s)
         self.ends_s.append(self._zero_s + self.now_s)
         self._window_ends_s.value = self.ends_s[-1]
@@ -219,8 +223,9 @@ def idle_loop(told: Connection, window_ends_s: Synchronized[float]) -> None:
     told.send(late)
 
 
-def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray]:
-    """How late each pulse of a session in real time at 80 Hz came, and how late an idle loop was at the same time."""
+def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each pulse of a session in real time at 80 Hz: how late it came, how late an idle loop was at the same time,
+    and for how long the session's process had run since the pulse before."""
     spawning = multiprocessing.get_context("spawn")
     here, there = spawning.Pipe()
     window_ends_s = spawning.Value("d", 0.0)
@@ -237,7 +242,7 @@ def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray]:
     # A window's end that it never saw, it slept over. The first pulse is an interval after the pause, without hurry.
     ends_s = culture.ends_s[1:-1]
     late = np.array([1e3 * tick.late_s for tick in session.ticks[1:]])
-    return late, np.array([idle_late.get(end_s, 1e3 * PERIOD_S) for end_s in ends_s])
+    return late, np.array([idle_late.get(end_s, 1e3 * PERIOD_S) for end_s in ends_s]), np.diff(culture.used_ms)[1:]
 
 
 def outline(us: np.ndarray) -> dict[str, float]:
@@ -267,7 +272,7 @@ def main() -> None:
     measured: dict[str, Any] = {"decision_us": decided, "idle_us": idle, "ticks": options.ticks}
 
     if options.minutes > 0:
-        late, idle_late = late_ms(round(60 * options.minutes / PERIOD_S))
+        late, idle_late, used = late_ms(round(60 * options.minutes / PERIOD_S))
         alone = (late > 0) & ~(idle_late > 0)
         print(f"deadlines at 80 Hz in {options.minutes:g} min of real time, an idle loop on the same core meanwhile")
         for name, each in (("closed loop", late), ("idle loop", idle_late)):
@@ -275,6 +280,13 @@ def main() -> None:
             print(f"  {name:24} {np.sum(each > 0):6} missed of {len(each):,}; the latest by {each.max():.2f} ms")
         measured["deadlines, closed loop alone"] = {"missed": int(np.sum(alone)), "late_ms": late[alone].tolist()}
         print(f"  {'closed loop alone':24} {np.sum(alone):6} missed that the idle loop did not miss")
+        for name, each in (("missed", used[late > 0]), ("in time", used[late == 0])):
+            if len(each):
+                measured[f"process time, {name}"] = {"median_ms": np.median(each), "largest_ms": each.max()}
+                print(
+                    f"  before a pulse that was {name} the process had run {np.median(each):.2f} ms (median), at most "
+                    f"{each.max():.2f} ms, of {1e3 * PERIOD_S:g}"
+                )
     if options.json:
         options.json.write_text(json.dumps(measured, indent=1) + "\n")
 

@@ -17,18 +17,19 @@ from hypothesis import strategies as st
 
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.mapping import Linear, Thresholds
 from animat.neurons.conditions import Condition, conditions_named
+from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
 from animat.neurons.memory_quality import memory_findings
-from animat.neurons.responses import Responses, extract_responses
-from animat.neurons.simulator import fit_empirical
+from animat.neurons.responses import Presented, Responses, extract_responses
+from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.made_up import make_up_recording
@@ -62,18 +63,27 @@ def chain(
 
 
 def pasts_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
-    """The past of each response as `Memory` says, in fractions; all presentations are among them."""
+    """The past of each response as `Memory` says, in fractions."""
     decay, weight = Fraction(memory.decay), Fraction(memory.weight)
     x, burst, condition = (getattr(responses, name).tolist() for name in ("rate_hz", "is_burst", "condition"))
-    kept = [value for value, is_burst in zip(x, burst, strict=True) if not is_burst]
-    rank = [Fraction(sum(k < v for k in kept) + sum(k <= v for k in kept), 2 * len(kept)) for v in x]
+    kept = [(v, c) for v, is_burst, c in zip(x, burst, condition, strict=True) if not is_burst]
+
+    def rank(value: float) -> Fraction:
+        return Fraction(sum(k < value for k, _ in kept) + sum(k <= value for k, _ in kept), 2 * len(kept))
+
+    def mean(c: int) -> Fraction:
+        alike = [rank(k) for k, of in kept if of == c]
+        return sum(alike, Fraction(0)) / len(alike) if c >= 0 else Fraction(1, 2)
+
+    presented, place = responses.presentations
     past, pasts = Fraction(0), []
-    for r, is_burst, c in zip(rank, burst, condition, strict=True):
+    columns = (presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested)
+    for c, value, is_burst, is_rested in zip(*(column.tolist() for column in columns), strict=True):
+        past = Fraction(0) if is_rested else past
         pasts.append(past)
-        alike = [rank[j] for j in range(len(x)) if condition[j] == c and not burst[j]]
-        mean = sum(alike, Fraction(0)) / len(alike)
-        past = Fraction(1, 2) if is_burst else decay * past + (1 - decay) * (r + weight * mean) / (1 + weight)
-    return pasts
+        left = (1 - decay) * (rank(value) + weight * mean(c)) / (1 + weight)
+        past = Fraction(1, 2) if is_burst else decay * past + left
+    return [pasts[row] for row in place]
 
 
 MEMORIES = st.builds(
@@ -83,19 +93,28 @@ MEMORIES = st.builds(
 
 @settings(max_examples=100, deadline=None)
 @given(
-    st.lists(st.tuples(st.integers(0, 1), st.integers(0, 6), st.booleans()), min_size=3, max_size=40),
+    st.lists(
+        st.tuples(st.sampled_from([0, 1, 0, 1, -1]), st.integers(0, 6), st.booleans(), st.integers(0, 5)),
+        min_size=3,
+        max_size=40,
+    ),
     st.none() | MEMORIES,
     st.integers(0, 16),
 )
-def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], memory: Memory | None, at: int) -> None:
-    """All that had the very same past can be drawn, and nothing beyond the k nearest in rank."""
-    condition, x, burst = (np.array(column) for column in zip(*rows, strict=True))
+def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memory: Memory | None, at: int) -> None:
+    """All that had the very same past can be drawn, and nothing beyond the k nearest in rank; also where presentations
+    have no condition, or come after a rest."""
+    every, every_x, bursts, sixth = (np.array(column) for column in zip(*rows, strict=True))
+    place = np.flatnonzero(every >= 0)
+    condition, x, burst = every[place], every_x[place], bursts[place]
     responses = replace(
         responses_of([1.0], [1.0]),
         condition=condition,
         rate_hz=x.astype(float),
         active_ratio=np.full(len(x), 0.1),
         is_burst=burst,
+        presented=Presented(every, every_x.astype(float), bursts, sixth == 0),
+        place=place,
     )
     if any(not np.any((condition == c) & ~burst) for c in (0, 1)):
         with pytest.raises(UnusableData, match="expected non-burst responses to fit"):
@@ -109,7 +128,7 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], memory: M
     uniforms = jnp.linspace(0, 1, 400, endpoint=False)
     for c in (0, 1):
         mine = [i for i in range(len(x)) if condition[i] == c and not burst[i]]
-        mine = [i for i in mine if i == 0 or not burst[i - 1]] or mine
+        mine = [i for i in mine if sixth[place[i]] == 0 or place[i] == 0 or not bursts[place[i] - 1]] or mine
         k = int(simulator.nearest[c])
         assert k == round(len(mine) ** memory.reach)
         assert 1 <= k <= len(mine) == simulator.followers[c]
@@ -123,7 +142,7 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool]], memory: M
         ]
         assert drawn <= {x[i] for i in near}
         if memory.decay == memory.weight == 0:
-            # Pasts are ranks then, the same to the last bit wherever the last responses are.
+            # Pasts are ranks then, the same to the last bit wherever the responses before are.
             assert drawn >= {x[i] for i in same}
             if len(same) >= k:
                 assert drawn == {x[i] for i in same}
@@ -187,6 +206,21 @@ def test_between_the_pulses_of_a_slow_presentation_there_is_no_silence() -> None
     np.testing.assert_allclose(extract_responses(given, burst_threshold=1.0).last_hz, [0.0, 125.0, 0.0])
 
 
+def test_a_rest_and_what_has_no_condition_are_in_the_past() -> None:
+    """Of a recording only 5 Hz is chosen from: what was 80 Hz in between has its rank, and no condition's mean."""
+    times_s = [0.1, 0.3, 0.5, 0.7, 3.0, 3.2]
+    spikes = [(t + 0.003 + 0.0005 * i, 0) for n, t in enumerate(times_s) for i in range(n)]
+    given = recording(spikes, times_s, n_channels=1, frequency_hz=[5.0, 80.0, 5.0, 80.0, 5.0, 5.0])
+    responses = extract_responses(given, conditions_named("frequency:5"), burst_threshold=1.0)
+    # Four of 5 Hz, of 0, 2, 4 and 5 spikes: ranks 1/8, 3/8, 5/8, 7/8, mean 1/2. One of 80 Hz had 1 spike: rank 1/4.
+    simulator = fit_memory(responses, memory=Memory(0.25, 0.5, 0.5))
+    first = 0.75 * (1 / 8 + 0.5 / 2) / 1.5
+    third = 0.25 * first + 0.75 * (1 / 4 + 0.5 / 2) / 1.5
+    last = 0.75 * (5 / 8 + 0.5 / 2) / 1.5
+    np.testing.assert_allclose(simulator.before[0], [0.0, 0.0, third, last], atol=1e-7)
+    np.testing.assert_allclose(simulator.after_hz[0], np.array([0, 4, 2, 5]) * 125.0)
+
+
 def test_a_known_chain_is_answered_as_it_is() -> None:
     """Two conditions, four chances: the share of high answers after a low and a high one, within chance."""
     low, high = (0.1, 0.5), (0.3, 0.9)
@@ -226,6 +260,17 @@ def test_redrawn_responses_keep_what_was_before_them() -> None:
     pairs = set(zip(responses.last_hz, responses.rate_hz, strict=True))
     assert len(redrawn) == 500
     assert set(zip(redrawn.last_hz, redrawn.rate_hz, strict=True)) <= pairs
+
+
+def test_presentations_that_do_not_fit_are_refused() -> None:
+    responses = chain(20, after_low=(0.1, 0.5), after_high=(0.3, 0.9))
+    presented, place = responses.presentations
+    with pytest.raises(Mismatch, match="expected both or neither"):
+        replace(responses, presented=presented)
+    with pytest.raises(Mismatch, match=r"responses.place: expected rows from 0 to 19, got 1 to 20"):
+        replace(responses, presented=presented, place=place + 1)
+    with pytest.raises(Mismatch, match=r"presented.is_rested: expected 20 values"):
+        Presented(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested[1:])
 
 
 def test_simulators_of_recordings_of_different_lengths_stack() -> None:
@@ -286,7 +331,9 @@ def test_an_animat_remembers() -> None:
     for past, answer in ((0.8, 90.0), (0.2, 10.0)):
         outcome = animat.step(jax.random.key(1), state._replace(past=jnp.float32(past)), jnp.int32(0), simulator)
         assert float(outcome.rate_hz) == answer
-        assert float(outcome.state.past) == pytest.approx(0.75 if answer == 90 else 0.25, abs=0.2)
+        after = float(simulator.answer(jnp.int32(0), jnp.float32(0.5), jnp.float32(past)).past)
+        assert float(outcome.state.past) == after
+        assert after not in (past, 0.5)
     # Without neurons nothing changes it.
     alone = WithoutNeurons(Cartpole(), (-1.0, 1.0))
     assert float(alone.step(jax.random.key(1), state, jnp.int32(0), None).state.past) == 0.5
@@ -364,6 +411,26 @@ def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator()
             fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9), seed=seed)) for seed in range(20)
         )
     )
+
+
+def test_without_memory_none_is_found_where_responses_are_of_few_spikes() -> None:
+    """Many responses are the same then, and pasts too."""
+    found = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        found.append(fit_memory(replace(independent(seed), rate_hz=rng.poisson(1.0, 500).astype(float))).memory)
+    assert all(memory == NO_MEMORY or memory.reach < 1 for memory in found)
+    assert found.count(NO_MEMORY) >= 36
+
+
+def test_the_limit_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
+    class Own(EmpiricalSimulator):
+        has_memory = True
+
+    plain = fit_empirical(independent(0))
+    own = Own(plain.values_hz, plain.counts, plain.percentiles)
+    with pytest.raises(InvalidArgument, match="simulator: expected a MemorySimulator or one without memory, got Own"):
+        best_return(Animat(Stairs(), Thresholds(1), 5), own, grid=STEPS, episodes=0)
 
 
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9), Linear()])
@@ -472,6 +539,18 @@ def test_what_a_simulator_with_memory_keeps_is_told_by_what_it_answers() -> None
     (kept,) = fit_timeline([chain(2000, after_low=(0.1, 0.5), after_high=(0.5, 0.9))], kind="memory").fidelities
     np.testing.assert_allclose(kept.in_simulator, kept.in_data, atol=0.03)
     assert not np.array_equal(kept.in_simulator, kept.in_data)
+
+
+def test_too_few_to_draw_the_nearest_from_is_told() -> None:
+    few = chain(40, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
+    # Always the nearest alone: what had an outlying past is drawn most often.
+    kept = fidelity(few, fit_memory(few, memory=Memory(0.0, 0.0, 0.0)))
+    moved = replace(kept, in_simulator=kept.in_data + np.array([0.06, 0.0]))
+    (found,) = moved.findings(of_memory=True)
+    assert found.name == "few-neighbours"
+    assert found.value == pytest.approx(0.06)
+    assert [finding.name for finding in moved.findings()] == ["binning"]
+    assert all(finding.name != "binning" for finding in fit_timeline([few], kind="memory").findings)
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:

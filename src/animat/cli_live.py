@@ -48,7 +48,7 @@ class Live(Stimulating):
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are held from the first recording"""
     simulator: Literal["histogram", "empirical", "memory"] = "histogram"
-    """histogram: bins (the paper); empirical: a measured value; memory: one that had a past like it"""
+    """histogram: bins (the paper); empirical: a measured value; memory: one with a like past"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
     seed: int = 1

@@ -32,7 +32,7 @@ class Fitting(Responding):
     """How a neuron simulator is made of responses."""
 
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """histogram (the paper, default); empirical: draw a measured value; memory: one that had a past like it"""
+    """histogram (the paper, default); empirical: draw a measured value; memory: one with a like past"""
     bins: int | None = None
     """Bins of a histogram; default: 20"""
     range_hz: float | None = None
@@ -47,6 +47,7 @@ class Fitting(Responding):
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_recordings
 
+        fit = fit_as(trained or {}, self.simulator, self.bins, self.range_hz)
         if not recordings:
             raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
         by = None if self.conditions is None else conditions_named(self.conditions)
@@ -57,7 +58,7 @@ class Fitting(Responding):
             burst_threshold=self.burst_threshold,
             despite=self.despite,
         )
-        timeline = fit_timeline(series, **fit_as(trained or {}, self.simulator, self.bins, self.range_hz))
+        timeline = fit_timeline(series, **fit)
         say_findings(timeline.findings)
         return timeline
 

@@ -115,7 +115,7 @@ class Driver:
         self._last_pulse_s = self._now_s()
         self._lead_in(contender, episode)
         if self._following is not None and self._following.seen:
-            # Between episodes only: within one the robot's world stays as it is, and no tick pays for it.
+            # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
             self._percentiles = self._following.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))

@@ -130,6 +130,8 @@ class Loop:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         if self.lead_in is None:
             object.__setattr__(self, "lead_in", 2 if self.pulses == 1 else 0)
+        if not isinstance(self.lead_in, int):
+            raise InvalidArgument(f"lead_in: expected a whole number from 0, got {self.lead_in!r}")
         for name in ("burst_threshold", "pause_s", "lead_in", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")

@@ -19,7 +19,7 @@ class Tick:
         episode: number of the episode in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
             and what leads in has -1.
-        chosen: the condition that was chosen.
+        chosen: the condition that was chosen, by the contender or, where it leads in, by lot.
         delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
         frequency_hz: of the delivered one.
         patterns: of each pulse, none under the silent control.

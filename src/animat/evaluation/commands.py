@@ -132,8 +132,19 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 
 
 def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
-    """How many classes of the past make a difference: one where nothing is remembered."""
-    return CLASSES if isinstance(environment, Animat) and isinstance(simulator, MemorySimulator) else 1
+    """How many classes of the past make a difference: one where nothing is remembered.
+
+    Raises:
+        InvalidArgument: for a simulator of one's own that remembers: its pasts are not known.
+    """
+    if not isinstance(environment, Animat) or simulator is None or not simulator.has_memory:
+        return 1
+    if not isinstance(simulator, MemorySimulator):
+        raise InvalidArgument(
+            f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: which pasts "
+            "it comes through is not known, and the best possible return is not known without"
+        )
+    return CLASSES
 
 
 def class_of(simulator: MemorySimulator, past: Float[Stored, "*pasts"]) -> Int[Array, "*pasts"]:
@@ -156,7 +167,8 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
         come with it; over all of these they add up to 1. Where nothing is remembered, one class and the commands of
         `commands_of`.
     """
-    if not (isinstance(environment, Animat) and isinstance(simulator, MemorySimulator)):
+    is_one = layers_of(environment, simulator) == 1
+    if is_one or not (isinstance(environment, Animat) and isinstance(simulator, MemorySimulator)):
         return [[commands_of(environment, simulator)]]
     levels, pasts = _answers(environment, simulator, _pasts(simulator))
     levels, classes = np.asarray(levels), np.asarray(class_of(simulator, pasts))

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.animat import Environment
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import class_of, commands_after, layers_of, nodes_for
+from animat.evaluation.commands import CLASSES, class_of, commands_after, layers_of, nodes_for
 from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
@@ -99,7 +99,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
     else:
         told += (
             f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution (or the "
-            "ten classes of what a memory simulator remembers are)"
+            f"{CLASSES} classes of what a memory simulator remembers are)"
         )
     return (Finding("limit", "warning", told, apart),)
 
@@ -319,8 +319,8 @@ class _Programme:
 
     def _layer(self, case: int, past: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
         """In which of a case's layers episodes are, by their past."""
-        environment, simulator = self._cases[case]
-        if not (isinstance(simulator, MemorySimulator) and layers_of(environment, simulator) > 1):
+        simulator = self._cases[case][1]
+        if layers_of(*self._cases[case]) == 1 or not isinstance(simulator, MemorySimulator):
             return np.zeros(len(past), np.int32)
         return np.asarray(class_of(simulator, past), np.int32)
 

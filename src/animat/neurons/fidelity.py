@@ -34,22 +34,30 @@ class Fidelity:
     in_simulator: Float[np.ndarray, " conditions"]
     n_above_range: int
 
-    def findings(self) -> tuple[Finding, ...]:
-        """A warning where binning moves P(x >= P50) by more than `LARGEST_LOSS`, or responses lie above the range."""
+    def findings(self, *, of_memory: bool = False) -> tuple[Finding, ...]:
+        """A warning where binning, or the nearest of too few, moves P(x >= P50) by more than `LARGEST_LOSS`, or where
+        responses lie above the range.
+
+        Args:
+            of_memory: whether the simulator remembers.
+        """
         found = []
         loss = np.abs(self.in_data - self.in_simulator)
         worst = int(np.argmax(loss))
         if loss[worst] > LARGEST_LOSS:
-            found.append(
-                Finding(
-                    "binning",
-                    "warning",
-                    f"the histogram changes P(x >= P50) of {self.labels[worst]} from {self.in_data[worst]:.2f} to "
-                    f"{self.in_simulator[worst]:.2f}: leave the range out (edges are then percentiles), or take "
-                    "more bins or the empirical simulator",
-                    float(loss[worst]),
-                )
+            changed = (
+                f"changes P(x >= P50) of {self.labels[worst]} from {self.in_data[worst]:.2f} to "
+                f"{self.in_simulator[worst]:.2f}"
             )
+            value = float(loss[worst])
+            if of_memory:
+                sentence = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
+                found.append(Finding("few-neighbours", "warning", sentence, value))
+            else:
+                remedy = (
+                    "leave the range out (edges are then percentiles), or take more bins or the empirical simulator"
+                )
+                found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
             found.append(
                 Finding(
@@ -66,7 +74,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     """Compare a simulator with the responses it was fitted to, at the pooled median P50.
 
     The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; of a
-    simulator with memory, of 200 after each response that it knows.
+    simulator with memory, of 200 after each past that it knows.
     """
     median = float(simulator.percentiles[5])
     kept = ~responses.is_burst

@@ -40,7 +40,7 @@ NO_MEMORY = Memory(0.0, 0.0, 1.0)
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0)
-_REACHES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+_REACHES = (0.5, 0.6, 0.7, 0.8, 0.9)
 _CERTAIN = 2.0
 """Standard errors by which a memory must tell responses better than none: the best of many does by chance, a little."""
 
@@ -51,9 +51,9 @@ class MemorySimulator(EmpiricalSimulator):
     """Draws one of the measured responses to the condition that had a past like the present one.
 
     Of a condition's responses, ordered by their pasts (see `Memory`), one of the k nearest in that order is drawn, all
-    equally likely; where more than k had the very same past, one of these. No distribution and no form of dependence
-    is assumed. With all of them nearest it is the empirical simulator, which its `quantile` always is: what is answered
-    when nothing is known of the past.
+    equally likely; where more than k had the very same past, one of these. No distribution is assumed, and no form in
+    which an answer depends on the past. With all of them nearest it is the empirical simulator, which its `quantile`
+    always is: what is answered when nothing is known of the past.
 
     Attributes:
         before: the past of each of a condition's responses, rising, padded with infinity, shape (conditions, most
@@ -155,7 +155,8 @@ class _Ranked:
         self._presented, self._place = responses.presentations
         self._sorted_hz = np.sort(responses.non_burst_rate_hz)
         self.rank = self._ranks(responses.rate_hz)
-        usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in range(_n(responses))]
+        conditions = range(len(responses.conditions))
+        usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in conditions]
         self.means = np.array([self.rank[rows].mean() for rows in usable])
         known = ~np.isnan(responses.last_hz)
         self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
@@ -181,10 +182,6 @@ class _Ranked:
         return np.asarray(np.array(pasts, np.float64)[self._place])
 
 
-def _n(responses: Responses) -> int:
-    return len(responses.conditions)
-
-
 def _left(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
@@ -197,7 +194,8 @@ def _found(ranked: _Ranked) -> Memory:
     rows = [rows for rows in ranked.rows if len(rows) > 1]
     if not rows:
         return NO_MEMORY
-    errors = {}
+    # With all of them nearest, every past is as good as any.
+    errors = {NO_MEMORY: _errors(ranked.rank, rows, 1.0)}
     for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
         past = ranked.pasts(Memory(decay, weight, 1.0))
         in_order = [each[np.argsort(past[each], kind="stable")] for each in rows]
@@ -212,7 +210,7 @@ def _found(ranked: _Ranked) -> Memory:
     if is_as_good(NO_MEMORY, _CERTAIN):
         return NO_MEMORY
     return max(
-        (best._replace(reach=reach) for reach in _REACHES if is_as_good(best._replace(reach=reach), 1.0)),
+        (memory for memory in errors if memory[:2] == best[:2] and memory.reach < 1 and is_as_good(memory, 1.0)),
         key=lambda memory: memory.reach,
     )
 

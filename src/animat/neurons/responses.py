@@ -37,6 +37,14 @@ class Presented:
     is_burst: Bool[np.ndarray, " presentations"]
     is_rested: Bool[np.ndarray, " presentations"]
 
+    def __post_init__(self) -> None:
+        for name in ("condition", "rate_hz", "is_burst", "is_rested"):
+            array = np.array(getattr(self, name))
+            if array.shape != (len(self.condition),):
+                raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
 
 @dataclass(frozen=True, eq=False)
 class Responses:
@@ -96,10 +104,22 @@ class Responses:
                 raise Mismatch(f"responses.{name}: expected {len(self)} values, one a response, got {array.shape}")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        self._check_places()
         if len(self) and not (self.condition.min() >= 0 and self.condition.max() < len(self.conditions)):
             raise Mismatch(
                 f"responses.condition: expected indices of {len(self.conditions)} conditions, "
                 f"got {self.condition.min()} to {self.condition.max()}"
+            )
+
+    def _check_places(self) -> None:
+        if self.presented is None or self.place is None:
+            if (self.presented is None) != (self.place is None):
+                raise Mismatch("responses.presented, responses.place: expected both or neither, got one")
+            return
+        n = len(self.presented.condition)
+        if len(self) and not (self.place.min() >= 0 and self.place.max() < n):
+            raise Mismatch(
+                f"responses.place: expected rows from 0 to {n - 1}, got {self.place.min()} to {self.place.max()}"
             )
 
     def __len__(self) -> int:

@@ -125,7 +125,7 @@ def fit_timeline(
     findings = tuple(
         replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}")
         for responses, kept in zip(ordered, fidelities, strict=True)
-        for finding in (*responses.findings, *kept.findings())
+        for finding in (*responses.findings, *kept.findings(of_memory=kind == "memory"))
     )
     if kind == "memory" and first.presentation is not None and first.presentation.order == "blocked":
         findings += (_MEMORY_OF_BLOCKS,)
