@@ -255,6 +255,19 @@ BAD = {
         ["train", "navigation", *QUICK, "--recordings", "{recordings}", "--out", "{folder}/policies"],
         ["{folder}/policies", "another"],
     ),
+    "a word for a number": (nothing, ["run", "--at-min", "x"], ["animat: --at-min: expected a number, got 'x'; see"]),
+    "a part of a pulse": (
+        nothing,
+        ["run", "--budget-pulses", "1.5"],
+        ["animat: --budget-pulses: expected a whole number, got '1.5'; see animat run"],
+    ),
+    "a word for a seed": (nothing, ["train", "--seed", "y"], ["animat: --seed: expected a whole number, got 'y'; see"]),
+    "a word for a pause": (nothing, ["run", "--pause-s", "z"], ["animat: --pause-s: expected a number, got 'z'; see"]),
+    "a simulator of another name": (
+        nothing,
+        ["run", "--simulator", "foo"],
+        ["animat: --simulator: expected one of empirical, histogram, memory, got 'foo'; see"],
+    ),
     "zero sessions": (
         nothing,
         ["record", "--culture", "made-up", "--sessions", "0", "--out", "{folder}/r"],

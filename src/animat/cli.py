@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import io
+import itertools
 import json
 import math
+import re
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, get_args
@@ -99,10 +101,35 @@ def _parse(
     except SystemExit as stop:
         if not stop.code:
             raise
-        lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()]
-        rules = [i for i, line in enumerate(lines) if set(line) == {"─"}]
-        what = " ".join(line for line in lines[1 : rules[0] if rules else None] if line)
-        raise InvalidArgument(f"{what}; see animat {' '.join(arguments[:1])} --help") from None
+        # A box with a title; where the terminal has no such letters, lines of dashes, one of them under the title.
+        lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()[1:]]
+        parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
+        what = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
+        raise InvalidArgument(f"{_told(what)}; see animat {' '.join(arguments[:1])} --help") from None
+
+
+_WORDS = (
+    (
+        r"Error parsing (\S+): (?:no type matching \{None\}\|INT .*? from|invalid literal .*? 10:) \[?('[^']*').*",
+        "whole number",
+    ),
+    (
+        r"Error parsing (\S+): (?:no type matching \{None\}\|FLOAT .*? from|could not convert .*?:) \[?('[^']*').*",
+        "number",
+    ),
+)
+
+
+def _told(what: str) -> str:
+    """What the parser says, in the words of all other errors: the argument, what was expected, what came."""
+    if wrong := re.fullmatch(r"invalid choice (.+) for argument '(.+)'. Expected one of \((.+)\)\.", what):
+        # The parser lists them in any order.
+        choices = sorted(set(re.findall(r"'([^']+)'", wrong[3])) - {"None"})
+        return f"{wrong[2]}: expected one of {', '.join(choices)}, got {wrong[1]}"
+    for words, kind in _WORDS:
+        if wrong := re.fullmatch(words, what):
+            return f"{wrong[1]}: expected a {kind}, got {wrong[2]}"
+    return what
 
 
 def _say_notes(error: BaseException) -> None:
