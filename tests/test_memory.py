@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
+from animat.cli_train import _memories
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
@@ -551,6 +552,15 @@ def test_too_few_to_draw_the_nearest_from_is_told() -> None:
     assert found.value == pytest.approx(0.06)
     assert [finding.name for finding in moved.findings()] == ["binning"]
     assert all(finding.name != "binning" for finding in fit_timeline([few], kind="memory").findings)
+
+
+def test_training_tells_what_is_remembered() -> None:
+    series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
+    series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
+    first, last = _memories(fit_timeline(series, kind="memory"))
+    assert first.startswith("memory at 0 min: 0 of the past is left by each presentation, which weighs 0 beside its")
+    assert last == "memory at 10 min: none was found"
+    assert not list(_memories(fit_timeline(series)))
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:

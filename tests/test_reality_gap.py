@@ -192,6 +192,37 @@ def test_a_policy_may_have_the_name_of_a_control_that_is_not_run(tmp_path: Path,
     assert gap.rows[0].pulses_per_action == 2
 
 
+def test_what_was_not_lived_is_named(tmp_path: Path, series: list[Responses]) -> None:
+    gap, _ = run(tmp_path, series, with_controls=False)
+    policies, *others = gap.rows
+    none = np.empty(0)
+    no_controls = replace(gap, rows=(policies, *(replace(row, lived=none, p=None) for row in others)))
+    assert no_controls.verdict().startswith("no control was lived to its end")
+    no_policy = replace(gap, rows=(replace(policies, lived=none), *(replace(row, p=None) for row in others)))
+    assert no_policy.verdict().startswith("no episode of a policy was lived to its end")
+
+
+def test_a_prediction_with_memory_is_told_to_lack_a_lead_in(tmp_path: Path, series: list[Responses]) -> None:
+    remembering = Calibration.of_series(series, kind="memory")
+    policies = {"p0": policy_of(0, series)}
+    for pulses, lead_in, told in ((1, 0, True), (1, 1, False), (2, 0, False)):
+        with FakeCulture() as culture:
+            gap = run_policies(
+                policies,
+                culture,
+                remembering,
+                tmp_path / f"{pulses}-{lead_in}",
+                episodes=1,
+                with_controls=False,
+                pulses=pulses,
+                lead_in=lead_in,
+            )
+        assert ("no-lead-in" in {finding.name for finding in gap.findings}) == told
+        assert gap.has_memory
+        less = replace(gap, rows=(replace(gap.rows[0], lived=np.full(9, -1e3)), *gap.rows[1:]))
+        assert less.verdict().endswith("they live less than predicted: a culture tires, which no simulator does")
+
+
 def test_of_one_episode_nothing_is_said_about_the_gap(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, with_controls=False)
     row = replace(gap.rows[0], lived=gap.rows[0].lived[:1] - 100)
@@ -557,7 +588,8 @@ class TestCommand:
             (["--seed", "-1"], "--seed: expected 0 or more"),
             (["--pulses", "0"], "pulses: expected at least 1"),
             (["--pause-s", "-1"], "pause_s: expected a finite number from 0"),
-            (["--lead-in", "-1"], "lead_in: expected a finite number from 0"),
+            (["--lead-in", "-1"], "lead_in: expected a whole number from 0 to 100, got -1"),
+            (["--lead-in", "101"], "lead_in: expected a whole number from 0 to 100, got 101"),
             (["--patience-s", "nan"], "patience_s: expected a finite number from 0"),
             (["--patience-s", "0"], "patience_s: expected above 0 s"),
             (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -179,4 +179,20 @@ def _control(timeline: SimulatorTimeline) -> str:
     shares = timeline.fidelities[0].in_simulator
     told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
     said = next((f.sentence for f in timeline.findings if f.name == "difference"), None)
-    return f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}" + (f"\n{said}" if said else "")
+    first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
+    return "\n".join([first, *([said] if said else []), *_memories(timeline)])
+
+
+def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
+    """What each simulator remembers, where they are of the kind that does."""
+    from animat.neurons.memory import NO_MEMORY, MemorySimulator
+
+    for start_min in timeline.start_min.tolist():
+        simulator = timeline.at(start_min)
+        if isinstance(simulator, MemorySimulator):
+            decay, weight, reach = memory = simulator.memory
+            told = (
+                f"{decay:.2g} of the past is left by each presentation, which weighs {weight:.2g} beside its answer; "
+                f"one of the n^{reach:.2g} responses with the nearest pasts is drawn"
+            )
+            yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

@@ -23,6 +23,9 @@ from animat.robots.registry import robot_to_dict
 OnBurst = Literal["use", "repeat", "skip"]
 OnLate = Literal["continue", "stop"]
 
+MOST_LEAD_IN = 100
+"""Times that each condition leads in: as many as a recording holds; more wears a culture out for nothing."""
+
 
 class Trained(Protocol):
     """What a loop takes from a policy, besides letting it act."""
@@ -130,9 +133,9 @@ class Loop:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         if self.lead_in is None:
             object.__setattr__(self, "lead_in", 2 if self.pulses == 1 else 0)
-        if not isinstance(self.lead_in, int):
-            raise InvalidArgument(f"lead_in: expected a whole number from 0, got {self.lead_in!r}")
-        for name in ("burst_threshold", "pause_s", "lead_in", "patience_s", "most_repeats"):
+        if not (isinstance(self.lead_in, int) and 0 <= self.lead_in <= MOST_LEAD_IN):
+            raise InvalidArgument(f"lead_in: expected a whole number from 0 to {MOST_LEAD_IN}, got {self.lead_in!r}")
+        for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
         if self.patience_s == 0:

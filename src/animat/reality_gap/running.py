@@ -96,6 +96,12 @@ def run_policies(
             "what they choose is delivered"
         )
         findings += (Finding("trained-as-control", "warning", sentence),)
+    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.lead_in:
+        sentence = (
+            "episodes begin after a rest (--lead-in 0), and those of the simulator as after stimuli of all conditions: "
+            "what is lived will be less than predicted"
+        )
+        findings += (Finding("no-lead-in", "warning", sentence),)
     if follow and first.percentiles == "first":
         sentence = (
             "the policies were trained on held percentiles, and in this loop they follow the culture: with "
@@ -162,6 +168,7 @@ def run_policies(
         session,
         account,
         (*noticed, *findings, *calibration.findings),
+        calibration.simulator.has_memory,
     )
 
 

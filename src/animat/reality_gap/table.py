@@ -101,6 +101,7 @@ class RealityGap:
         session: as it was lived.
         account: of the stimulation.
         findings: where loop, recording and policy differ, and what was noticed.
+        has_memory: whether the simulator that predicted remembers.
     """
 
     robot: str
@@ -112,6 +113,7 @@ class RealityGap:
     session: Session
     account: Account
     findings: tuple[Finding, ...]
+    has_memory: bool = False
 
     @property
     def not_beaten(self) -> tuple[str, ...] | None:
@@ -130,7 +132,8 @@ class RealityGap:
         """Whether the policies beat the controls, by how much they do not, and what the gap may come from."""
         names, policies = self.not_beaten, self.rows[0]
         if names is None:
-            return "no control was lived to its end: nothing can be said of the policies beside them"
+            who = "no control" if len(policies.lived) else "no episode of a policy"
+            return f"{who} was lived to its end: nothing can be said of the policies beside the controls"
         fewest = min(len(row.lived) for row in self.rows if row.p is not None)
         if not _can_tell(len(policies.lived), fewest):
             said = (
@@ -147,10 +150,8 @@ class RealityGap:
                 "episodes in which theirs is larger"
             )
         if policies.gap.high < 0:
-            said += (
-                "; they live less than predicted: a culture tires, which no simulator does, and remembers, which only "
-                "one with memory does"
-            )
+            said += "; they live less than predicted: a culture tires, which no simulator does"
+            said += "" if self.has_memory else ", and remembers, which only one with memory does"
         return said
 
     def to_dict(self) -> dict[str, Any]:
@@ -197,7 +198,7 @@ class RealityGap:
             if self.gap_share is None
             else (f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it")
         )
-        lines.append(f"  the best possible return on this simulator is {self.limit:.1f}{share}")
+        lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies live no other returns than this control; stimulation: {self.account}")
