@@ -558,7 +558,11 @@ def test_training_tells_what_is_remembered() -> None:
     series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
-    assert first.startswith("memory at 0 min: 0 of the past is left by each presentation, which weighs 0 beside its")
+    decay, weight, reach = fit_memory(series[0]).memory
+    assert first.startswith(
+        f"memory at 0 min: {decay:.2g} of the past is left by each presentation, which weighs {weight:g} "
+    )
+    assert f"one of the n^{reach:.2g} responses" in first
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 
