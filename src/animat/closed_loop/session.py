@@ -38,9 +38,9 @@ class Episode:
         iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
         is_whole: whether it came to its end; what the session broke off has no return.
-        pulses: that the culture was given.
-        bursts: responses that were bursts.
-        late: pulses that came late.
+        pulses: that the culture was given, what led in among them.
+        bursts: responses that were bursts, also of what led in.
+        late: pulses that came late, also of what led in.
     """
 
     number: int
