@@ -2,6 +2,8 @@
 
     python benchmarks/loop.py [--ticks 100000] [--minutes 10] [--json results.json]
 
+Closing: how long that session takes from its last tick until its recording is written, and the memory of it all.
+
 Decision: from the end of the response window, when a culture of 1,024 channels has handed over its spikes, until the
 next stimulus has passed the guard and is handed to the culture. In between lie the extraction of the response, the
 mapping, the robot's step, the log, the policy, the patterns and the safety limits. Beside it, the jitter of the
@@ -22,6 +24,7 @@ import itertools
 import json
 import multiprocessing
 import os
+import resource
 import tempfile
 import time
 from multiprocessing.connection import Connection
@@ -152,15 +155,20 @@ def loop_of(iterations: int, **settings: Any) -> Loop:
     return Loop(robot, mapping_named("9-thresholds"), CONDITIONS, percentiles, **settings)
 
 
-def decisions_us(ticks: int) -> np.ndarray:
-    """How long each decision took."""
+def decisions_us(ticks: int) -> tuple[np.ndarray, dict[str, float]]:
+    """How long each decision took; and how long the session took to close after its last tick, with how much memory."""
     with tempfile.TemporaryDirectory() as folder, Instant(ticks + 1) as culture:
         contender = Contender("policy", "random weights", Greedy(policy()))
         session = run_session(culture, loop_of(ticks), [contender], folder, episodes=1)
+        closing = {
+            "seconds": (time.perf_counter_ns() - int(culture.answered_ns[-1])) / 1e9,
+            "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+            "log_mb": (Path(folder) / "session.log").stat().st_size / 1e6,
+        }
         assert session.ending.by == "plan", session.ending
-        assert len(session.ticks) == ticks
+        assert session.outline.ticks == ticks
         # Number 0 is the pause, and the first decision is made at its end.
-        return (culture.asked_ns[1:] - culture.answered_ns[:-1]) / 1e3
+        return (culture.asked_ns[1:] - culture.answered_ns[:-1]) / 1e3, closing
 
 
 def idle_us(waits: int, length_us: float) -> np.ndarray:
@@ -263,13 +271,19 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
 
-    decided = outline(decisions_us(options.ticks))
+    decisions, closing = decisions_us(options.ticks)
+    decided = outline(decisions)
     idle = outline(idle_us(options.ticks, decided["median"]))
     print(f"from the window's end to the next stimulus, {CHANNELS} channels, {options.ticks:,} ticks (us)")
     print(f"  {'':24} {'median':>8} {'p99':>8} {'p99.9':>8} {'largest':>9}")
     for name, us in (("closed loop", decided), ("idle, the same median", idle)):
         print(f"  {name:24} {us['median']:8.1f} {us['p99']:8.1f} {us['p99.9']:8.1f} {us['largest']:9.1f}", flush=True)
-    measured: dict[str, Any] = {"decision_us": decided, "idle_us": idle, "ticks": options.ticks}
+    print(
+        f"from the last tick until log, recording and table are closed: {closing['seconds']:.2f} s for "
+        f"{closing['log_mb']:.0f} MB of log; peak memory of the process {closing['peak_mb']:.0f} MB",
+        flush=True,
+    )
+    measured: dict[str, Any] = {"decision_us": decided, "idle_us": idle, "closing": closing, "ticks": options.ticks}
 
     if options.minutes > 0:
         late, idle_late, used = late_ms(round(60 * options.minutes / PERIOD_S))

@@ -1,11 +1,12 @@
 """The headline table: predicted against lived return by how recordings and loop present, over cultures and both robots.
 
     python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation]
-        [--ways paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
+        [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
         [--controls] [--out gap/]
 
-For each virtual culture and way - the paper's blocks with one pulse, mixed with one, mixed with five, and mixed with
-one, recorded five times as long and simulated with its memory, through one threshold and through nine - the culture is
+For each virtual culture and way - the commands without options, as in the README; the paper's blocks with one pulse,
+mixed with one, mixed with five, and mixed with one, recorded five times as long and simulated with its memory, through
+one threshold and through nine - the culture is
 recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same culture from where the last
 recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
 """
@@ -55,12 +56,36 @@ class Way:
 
 
 WAYS = {
+    "default": None,
     "paper": Way(order="blocked"),
     "mixed": Way(),
     "five": Way(pulses=5),
     "memory": Way(presentations=500, simulator="memory"),
     "memory9": Way(presentations=500, simulator="memory", mapping="9-thresholds"),
 }
+
+
+def recording_options(way: Way | None) -> list[str]:
+    """Of `animat record`."""
+    if way is None:
+        return []
+    presented = ["--order", way.order, "--pulses", str(way.pulses), "--presentations", str(way.presentations)]
+    return ["--sessions", "2", *presented]
+
+
+def training_options(way: Way | None, robot: str, policies: int, iterations: int | None) -> list[str]:
+    """Of `animat train`; the paper's iterations, unless asked otherwise."""
+    if way is None:
+        return []
+    given = ["--policies", str(policies), "--simulator", way.simulator, "--mapping", way.mapping]
+    return [*given, "--iterations", str(iterations or {"cartpole": 800_000, "navigation": 500_000}[robot])]
+
+
+def running_options(way: Way | None, thresholds: str, episodes: int, *, controls: bool) -> list[str]:
+    """Of `animat run`."""
+    if way is None:
+        return []
+    return ["--episodes", str(episodes), "--controls", "all" if controls else "random", "--thresholds", thresholds]
 
 
 def main() -> None:
@@ -79,22 +104,19 @@ def main() -> None:
 
     lines: list[str] = []
     for seed, (name, way) in itertools.product(options.seeds, ((name, WAYS[name]) for name in options.ways)):
-        recordings = str(options.out / f"culture{seed}" / f"{way.order}-{way.pulses}-{way.presentations}")
-        presented = ["--order", way.order, "--pulses", str(way.pulses), "--presentations", str(way.presentations)]
-        expect(["record", "--seed", str(seed), "--sessions", "2", *presented, "--out", recordings])
+        of_recording = recording_options(way)
+        recordings = str(options.out / f"culture{seed}" / ("-".join(of_recording[3::2]) or name))
+        expect(["record", "--seed", str(seed), *of_recording, "--out", recordings])
         for robot in options.robots:
             folder = options.out / f"culture{seed}" / name / robot
             policies = str(folder / "policies")
-            given = ["--recordings", recordings, "--policies", str(options.policies), "--duration-min", "20"]
-            given += ["--simulator", way.simulator, "--mapping", way.mapping]
-            given += ["--iterations", str(options.iterations)] if options.iterations else []
-            expect(["train", robot, *given, "--out", policies])
-            for thresholds in options.thresholds:
+            given = training_options(way, robot, options.policies, options.iterations)
+            expect(["train", robot, "--recordings", recordings, *given, "--out", policies])
+            for thresholds in options.thresholds if way else ["follow"]:
                 table = folder / f"{thresholds}.json"
                 if not table.exists():
-                    run = ["run", policies, "--recordings", recordings, "--episodes", str(options.episodes)]
-                    run += ["--controls", "all" if options.controls else "random", "--thresholds", thresholds]
-                    run += ["--out", str(free(folder / thresholds))]
+                    run = ["run", policies, "--recordings", recordings, "--out", str(free(folder / thresholds))]
+                    run += running_options(way, thresholds, options.episodes, controls=options.controls)
                     table.write_text(json.dumps(ran(run)) + "\n")
                 lines.append(told(seed, way, thresholds, json.loads(table.read_text())))
                 print(lines[-1], flush=True)
@@ -102,23 +124,21 @@ def main() -> None:
     print("\n".join(lines))
 
 
-def told(seed: int, way: Way, thresholds: str, ran: dict[str, Any]) -> str:
+def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:
     """A line of the table; the range is from random to the limit, both on the simulator."""
     policies, random = ran["rows"][0], next(row for row in ran["rows"] if row["name"] == "random")
     prediction, gap = policies["prediction"], policies["gap"]
     cells = (
         f"{seed}",
         ran["robot"],
-        way.recorded,
-        way.simulator,
-        way.mapping,
+        *((way.recorded, way.simulator, way.mapping) if way else ("default", "default", ran["mapping"])),
         thresholds,
         f"{random['predicted']:.1f}, {random['lived']:.1f}",
-        f"{ran['limit']:.1f}",
+        "-" if ran["limit"] is None else f"{ran['limit']:.1f}",
         f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})",
         f"{policies['lived']:.1f}",
         f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})",
-        f"{100 * ran['gap_share']:+.0f} %",
+        "-" if ran["gap_share"] is None else f"{100 * ran['gap_share']:+.0f} %",
         f"{policies['pulses_per_action']:.0f}",
     )
     return f"| {' | '.join(cells)} |"

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import settings
@@ -22,6 +26,7 @@ install_import_hook(
 )
 
 from animat.compilation import keep_compilations  # noqa: E402
+from animat.cultures import holding  # noqa: E402
 
 # The same random examples each time; others with --hypothesis-profile=default.
 settings.register_profile("the same", derandomize=True)
@@ -34,6 +39,17 @@ def compilations_kept() -> None:
     keep_compilations()
 
 
+_NUMBERS = itertools.count()
+
+
+@pytest.fixture(autouse=True)
+def devices_of_its_own(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stands in for a device is held by a test, not by all that run on this machine."""
+    folder = tmp_path_factory.getbasetemp() / "devices" / str(next(_NUMBERS))
+    monkeypatch.setattr(holding, "MACHINE", folder)
+    monkeypatch.setattr(holding, "_own_folder", lambda: SimpleNamespace(name=folder))
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real recordings beside the project, or where ANIMAT_REAL_DATA points; skips where it is absent."""
@@ -41,3 +57,12 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}: set ANIMAT_REAL_DATA to the folder that holds them")
     return folder
+
+
+@pytest.fixture
+def in_the_foreground() -> Iterator[None]:
+    """Signals as a program in the foreground of a terminal has them, also where the tests were started by `nohup`."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    for number, handler in zip((signal.SIGINT, signal.SIGHUP), before, strict=True):
+        signal.signal(number, handler)

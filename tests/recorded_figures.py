@@ -15,13 +15,13 @@ from animat.cultures.observed import Spikes
 from animat.cultures.tissue import TissueParameters
 from animat.cultures.virtual import VirtualCulture
 from animat.neurons.responses import Responses, extract_responses
-from animat.recordings.protocol import CLOSED_LOOP, PAPER, Protocol
+from animat.recordings.protocol import PAPER, Protocol
 from animat.recordings.selection import Selection
 
 PRESENTED = {
     "blocked, 1 pulse": PAPER,
     "mixed, 1 pulse": Protocol(order="mixed", pulses=1),
-    "mixed, 5 pulses": CLOSED_LOOP,
+    "mixed, 5 pulses": Protocol(order="mixed", pulses=5),
 }
 REPEATED = 6
 SPONTANEOUS_S = 120.0

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from animat.cultures import holding
+
 GROUNDED = {0, 7, 56, 63}
 
 
@@ -129,4 +131,7 @@ def install(patch: pytest.MonkeyPatch) -> Neurons:
     module.is_simulator = lambda: True
     module.get_system_attributes = lambda: neurons._answer() or {"system_id": "stand-in", "chip_id": "none"}
     patch.setitem(sys.modules, "cl", module)
+    # It is another device: whoever held the one before holds nothing of it.
+    patch.setattr(holding, "MACHINE", holding.MACHINE / "another")
+    patch.setattr(holding, "_own_folder", lambda: SimpleNamespace(name=holding.MACHINE))
     return neurons

@@ -9,6 +9,7 @@ that is not persistent goes with its object. What it says was delivered is read 
 from __future__ import annotations
 
 import sys
+import threading
 from dataclasses import dataclass, field
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from animat.cultures import holding
 from animat.errors import DeviceFailed
 
 LSB_MV = 2.981901
@@ -52,6 +54,8 @@ class Rig:
     dead: bool = False
     is_gone: bool = False
     on_send: Any = None
+    # A sequence that has begun ends before the next command: what power that is cut does to a pulse is not known.
+    at_work: Any = field(default_factory=threading.RLock)
 
     def answer(self) -> None:
         """Nothing can be asked of a server that is not there."""
@@ -225,7 +229,8 @@ def install(patch: pytest.MonkeyPatch) -> Rig:
             rig.sent.append(self.token)
             if rig.on_send is not None:
                 rig.on_send()
-            rig.run(rig.sequences[self.token])
+            with rig.at_work:
+                rig.run(rig.sequences[self.token])
 
         def __del__(self) -> None:
             if not self.persistent:
@@ -238,7 +243,8 @@ def install(patch: pytest.MonkeyPatch) -> Rig:
         elif command.kind == "core":
             if rig.dead and command.on:
                 return "Error"
-            rig.powered = command.on
+            with rig.at_work:
+                rig.powered = command.on
         return "Ok"
 
     def dac(number: int, code: int) -> Any:
@@ -255,4 +261,7 @@ def install(patch: pytest.MonkeyPatch) -> Rig:
     module.query_DAC_lsb_mV = lambda: rig.lsb_mv
     module.initialize = module.offset = module.clear_events = rig.answer
     patch.setitem(sys.modules, "maxlab", module)
+    # It is another device: whoever held the one before holds nothing of it.
+    patch.setattr(holding, "MACHINE", holding.MACHINE / "another")
+    patch.setattr(holding, "_own_folder", lambda: SimpleNamespace(name=holding.MACHINE))
     return rig

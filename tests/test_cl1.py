@@ -31,9 +31,13 @@ def neurons(monkeypatch: pytest.MonkeyPatch) -> Iterator[Neurons]:
 class TestCL1(CultureContract):
     pulse = CL1_PULSE
 
+    @pytest.fixture(autouse=True)
+    def _patch(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.patch = monkeypatch
+
     def make_culture(self) -> Culture:
-        # A device's clock goes on from session to session: a new one is a device that was started anew.
-        sys.modules["cl"].neurons.__init__()
+        # A device's clock goes on from session to session: a new one is another device.
+        install(self.patch)
         return CL1Culture()
 
     def lose(self, culture: Culture) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.cultures.cl1 import NO_STIMULATION
-from animat.cultures.cl1_source import BEFORE, SAMPLES, SimulatedCL1
+from animat.cultures.cl1_source import BEFORE, REAL_TIME_NEURONS, SAMPLES, SimulatedCL1
 from animat.errors import InvalidArgument
 
 
@@ -106,3 +107,9 @@ def test_late_stimuli_act_at_once_and_clash_with_nothing() -> None:
 def test_settings_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(InvalidArgument, match="expected above 0"):
         SimulatedCL1(1, **bad)  # type: ignore[arg-type]
+
+
+def test_unless_told_otherwise_it_is_as_large_as_is_said_that_real_time_carries() -> None:
+    docs = (Path(__file__).parent.parent / "docs" / "hardware.md").read_text()
+    assert f"It has {REAL_TIME_NEURONS} neurons unless you say otherwise" in docs
+    assert len(SimulatedCL1(1)._sees) == REAL_TIME_NEURONS

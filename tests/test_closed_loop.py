@@ -479,7 +479,7 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
     lasted = {}
     for sign in (1, -1):
         body = Body(robot, np.random.default_rng(1))
-        observation, total = body.reset(), 0.0
+        observation, total = body.reset(0), 0.0
         for _ in range(robot.episode_limit):
             moved = body.step(sign * (1.0 if steering(robot, observation) > 0 else -1.0))
             observation, total = moved.observation, total + moved.reward

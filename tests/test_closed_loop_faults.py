@@ -19,14 +19,17 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.contenders import Contender
+from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import LOG_FILE, Session, read_session, recover_session
+from animat.closed_loop.session import Session, read_session, recover_session
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
+from animat.cultures.request import Request
 from animat.cultures.safety import SIMULATED_LIMITS
 from animat.errors import InvalidFile, UnsafeStimulus, UnusableData
 from animat.recordings.reading import read_recording
+from animat.recordings.stimulus import BALANCED_PULSE, Stimulus
 from animat.robots import Navigation
 from fake_culture import FakeCulture, Fault
 from test_closed_loop import RANDOM, assert_read_alike, loop_of
@@ -189,6 +192,7 @@ def test_a_clock_that_hangs(tmp_path: Path, left: int, little_grace: None) -> No
             released.set()
 
 
+@pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("is_interrupted", [False, True])
 def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace: None) -> None:
     released, acted = threading.Event(), [0]
@@ -411,15 +415,30 @@ def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> Non
         assert_safe(session, culture, 0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_a_polite_kill_and_a_terminal_that_is_gone(tmp_path: Path, number: signal.Signals) -> None:
+def pressing(number: signal.Signals) -> Fault:
     def press(culture: FakeCulture, observed: Observed) -> Observed:
         os.kill(os.getpid(), number)
         time.sleep(0.3)
         return observed
 
+    return press
+
+
+@pytest.mark.usefixtures("in_the_foreground")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_what_was_ignored_when_it_started_does_not_end_a_session(tmp_path: Path, number: signal.Signals) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    with FakeCulture(fault=pressing(number), at=8) as culture:
+        session = run(tmp_path, culture)
+    assert session.ending.by == "plan"
+    assert signal.getsignal(number) is signal.SIG_IGN
+
+
+@pytest.mark.usefixtures("in_the_foreground")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_ctrl_c_a_polite_kill_and_a_terminal_that_is_gone(tmp_path: Path, number: signal.Signals) -> None:
     before = signal.getsignal(number)
-    with FakeCulture(fault=press, at=8) as culture:
+    with FakeCulture(fault=pressing(number), at=8) as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "person"
         assert_safe(session, culture, 7)
@@ -453,21 +472,47 @@ def test_a_progress_that_fails_leaves_no_loop_behind(tmp_path: Path, error: Base
         assert_safe(session, culture, 8)
 
 
-@pytest.mark.parametrize("kind", ["pulses", "electrode", "session"])
+@pytest.mark.parametrize("kind", ["pulses", "electrode", "session", "charge"])
 def test_the_budget_runs_out(tmp_path: Path, kind: str) -> None:
     limits = replace(SIMULATED_LIMITS, stimuli_per_session=30) if kind == "session" else None
+    if kind == "charge":
+        # Six times what the published pulse leaves on an electrode.
+        limits = replace(SIMULATED_LIMITS, net_charge_per_session=120.0)
     account = Account(Budget(30 if kind == "pulses" else None, 6 if kind == "electrode" else None))
     with FakeCulture(limits=limits) as culture:
         loop = loop_of(robot=LONG, pulses=4)
         session = run_session(culture, loop, [RANDOM], tmp_path, account=account, episodes=1)
         assert session.ending.by == "budget"
         assert account.pulses == culture.pulses == culture.delivered
-        if kind == "electrode":
+        if kind in ("electrode", "charge"):
             assert 4 < account.most_on_an_electrode <= 6
         else:
             # Four a presentation: the eighth would be over it.
             assert account.pulses == 28
     assert_read_alike(tmp_path, loop_of(pulses=4))
+
+
+def test_what_was_refused_is_not_spent_although_another_delivery_came_between(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requests, of = [], Request.of
+
+    def after_another(stimuli: Any, duration_s: float) -> Request:
+        request = of(stimuli, duration_s)
+        requests.append(len(request.stimuli))
+        if sum(requests) == 8 and request.stimuli:
+            # As another thread's would, it takes the last place of the session.
+            culture.deliver([Stimulus(0.0, (100,), BALANCED_PULSE)], 0.001)
+        return request
+
+    monkeypatch.setattr(Request, "of", staticmethod(after_another))
+    account = Account(Budget())
+    with FakeCulture(limits=replace(SIMULATED_LIMITS, stimuli_per_session=8)) as culture:
+        session = run_session(culture, loop_of(robot=LONG), [RANDOM], tmp_path, account=account, episodes=1)
+        assert session.ending.by == "budget"
+        assert culture.delivered == 8
+    assert account.pulses == len(session.ticks) == 7
+    assert session.unanswered == ()
 
 
 class Disk:
@@ -520,6 +565,24 @@ def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> Non
     assert_read_alike(tmp_path, loop_of())
 
 
+@pytest.mark.parametrize("error", [UnusableData("spikes: expected finite times"), RuntimeError("Can't write data")])
+def test_a_session_comes_back_whatever_its_files_are_like(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def failing(*_: Any) -> None:
+        raise error
+
+    with monkeypatch.context() as patched, FakeCulture() as culture:
+        patched.setattr("animat.closed_loop.gathering.write_nwb", failing)
+        session = run(tmp_path, culture, robot=Navigation(episode_limit=3))
+    assert session.ending.by == "plan"
+    assert str(error) in session.ending.sentence
+    assert f"(animat recover {tmp_path}" in session.ending.sentence
+    assert len(session.episodes) == 5
+    assert recover_session(tmp_path).episodes == session.episodes
+    assert_read_alike(tmp_path, loop_of())
+
+
 def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -541,7 +604,7 @@ def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again
     assert "dead-window" in capsys.readouterr().err
     recorded = tmp_path / "session" / "calibration.nwb"
     before = recorded.read_bytes()
-    assert main([*given, "--despite", "dead-window"]) == 1
+    assert main([*given, "--allow", "dead-window"]) == 1
     assert f"`--recordings {recorded}` to run by that" in capsys.readouterr().err
     assert len(cultures) == 1
     assert main([*given, "--recordings", str(recorded)]) == 0
@@ -676,3 +739,7 @@ def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:
             read_log(other)
     with pytest.raises(InvalidFile):
         read_session(tmp_path / "nowhere")
+    # Who opened a pipe that nobody writes to would wait without end.
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InvalidFile, match="expected a file, got a device or a pipe"):
+        read_log(tmp_path / "pipe")

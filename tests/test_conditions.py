@@ -72,6 +72,17 @@ def test_the_nearer_frequency_wins_where_two_reach() -> None:
     assert assigned(ByInterval((5, 6)), table)[0] == [-1, 0, 1]
 
 
+@pytest.mark.parametrize("percent", [10, 20, 25, 50])
+@pytest.mark.parametrize("frequency_hz", [0.2, 5.0, 7.0, 40.0])
+def test_intervals_on_the_edge_are_within_however_they_are_rounded(percent: int, frequency_hz: float) -> None:
+    for ratio in (1 + percent / 100, 1 / (1 + percent / 100)):
+        times_s = 0.1 + np.arange(126) * ratio / frequency_hz
+        index = conditions_named(f"interval:{frequency_hz}+-{percent}%").assign(stimuli(times_s)).condition
+        assert np.count_nonzero(index == 0) == 125
+        beyond = 0.1 + np.arange(126) * (ratio + np.copysign(1e-4, ratio - 1)) / frequency_hz
+        assert not np.any(ByInterval((frequency_hz,), percent / 100).assign(stimuli(beyond)).condition == 0)
+
+
 def test_simultaneous_pulses_and_empty_tables_have_no_interval() -> None:
     assert assigned(ByInterval((5,)), stimuli([1.0, 1.0]))[0] == [-1, -1]
     assert assigned(ByInterval((5,)), stimuli([]))[0] == []

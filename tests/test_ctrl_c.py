@@ -11,6 +11,8 @@ import pytest
 
 from animat.ctrl_c import heard_everywhere
 
+pytestmark = pytest.mark.usefixtures("in_the_foreground")
+
 
 def interrupt_while_collecting() -> None:
     """One Ctrl-C that comes in a callback of the garbage collector."""
@@ -52,3 +54,10 @@ def test_whoever_handles_it_already_goes_on_to() -> None:
     finally:
         signal.signal(signal.SIGINT, before)
     assert heard
+
+
+def test_where_it_is_ignored_it_stays_so() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with heard_everywhere():
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

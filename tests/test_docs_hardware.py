@@ -69,6 +69,13 @@ def test_the_limits_are_those_of_the_code(row: str, cl1: str, maxone: str) -> No
         ("duration of a phase", lambda limits: f"steps of {limits.phase_step_us:g} us" * bool(limits.phase_step_us)),
         ("charge of a phase", lambda limits: f"{limits.charge_per_phase:g} {limits.units[1]}"),
         ("balance", lambda limits: "0" if limits.net_charge < 1e-5 else f"{limits.net_charge:g} {limits.units[1]}"),
+        (
+            "left on an electrode",
+            lambda limits: (
+                f" {limits.net_charge_per_session:,.{0 if limits.net_charge_per_session > 1 else 3}f} "
+                f"{limits.units[1]} "
+            ),
+        ),
         ("phases of a pulse", lambda limits: f" {limits.phases_per_pulse:,}"),
         ("phases of a pulse", lambda limits: "different signs" * limits.alternates),
         ("electrodes of a stimulus", lambda limits: f" {limits.electrodes_at_once} "),

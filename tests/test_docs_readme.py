@@ -63,11 +63,11 @@ def test_the_examples_in_python_run(
     monkeypatch.chdir(tmp_path)
     write_made_up_series(1, tmp_path / "recordings", sessions=2, interval_min=50, patterns=30, channels=32)
     example = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
-    shorter = example.replace("policies=10, iterations=800_000", "policies=2, iterations=6_400")
+    shorter = example.replace("policies=4, iterations=400_000", "policies=2, iterations=6_400")
     assert shorter != example
     exec(compile(shorter, "README.md", "exec"), {})
     assert capsys.readouterr().out.startswith(
-        "cartpole, 1-threshold, recording at 50 min: 2 policies, 100 episodes each"
+        "cartpole, 9-thresholds, recording at 50 min: 2 policies, 100 episodes each"
     )
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "training.md").read_text(), flags=re.DOTALL)
     exec(compile(example, "training.md", "exec"), {})

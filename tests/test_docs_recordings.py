@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from animat.recordings.reading import read_recording
+from animat.recordings.reading import read_recording, read_source
+from animat.recordings.response_table import ResponseTable
 
 
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[1] / "docs" / "recordings.md").read_text()
     examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(examples) == 7
+    assert len(examples) == 8
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for example in examples:
@@ -24,4 +25,6 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         30.0,
         [[9001, 9320], [9001, -1]],
     )
+    table = read_source("counted.npz")
+    assert isinstance(table, ResponseTable) and table.window_ms == (5.0, 25.0)
     assert read_recording("monday.nwb").provenance["experimenter"] == "Doe, Jane"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +20,12 @@ from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.mapping import Linear, Thresholds
 from animat.neurons.made_up import made_up_simulator
-from animat.neurons.simulator import silenced
+from animat.neurons.simulator import fit_histogram, silenced
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
 from animat.training.policy import Policy
+from test_prospects import answers
 from test_simulator import responses_of
 from test_training import timeline_of
 
@@ -194,10 +196,12 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
     assert np.any(
         wanted != evaluate({"a": moving}, timeline, at_min=14.0, episodes=50, seed=3).rows[0].episodes.returns
     )
-    assert "recording at 10 min, percentiles held from 0 min: 1 policies" in found.to_text()
-    assert found.to_dict()["percentiles_held_from_min"] == 0.0 and not found.findings
+    assert "recording at 10 min, percentiles held from 0 min: 1 policy," in found.to_text()
+    assert found.to_dict()["percentiles_held_from_min"] == 0.0
+    assert "other-percentiles" not in {finding.name for finding in found.findings}
     elsewhere = replace(held, provenance={**held.provenance, "simulators": {"recorded_at_min": [-10.0, 0.0]}})
-    (finding,) = evaluate({"a": elsewhere}, timeline, episodes=50).findings
+    noticed = evaluate({"a": elsewhere}, timeline, episodes=50).findings
+    (finding,) = (each for each in noticed if each.name == "other-percentiles")
     assert "held from the recording at -10 min, which is not the first of these" in finding.sentence
     with pytest.raises(Mismatch, match="b: expected the same percentiles as a"):
         evaluate({"a": moving, "b": held}, timeline)
@@ -222,10 +226,12 @@ def test_simulators_made_otherwise_than_in_training_are_told() -> None:
     timeline = timeline_of()
     trained = {"kind": "histogram", "bins": 40, "range_hz": None, "recorded_at_min": [0.0]}
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
-    (finding,) = evaluate({"a": policy}, timeline, episodes=50).findings
-    assert finding.name == "other-simulator" and finding.sentence.endswith("made otherwise: bins 40, here 20")
+    noticed = evaluate({"a": policy}, timeline, episodes=50).findings
+    (finding,) = (each for each in noticed if each.name == "other-simulator")
+    assert finding.sentence.endswith("made otherwise: bins 40, here 20")
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
-    assert not evaluate({"a": alike}, timeline, episodes=50).findings
+    noticed = evaluate({"a": alike}, timeline, episodes=50).findings
+    assert "other-simulator" not in {each.name for each in noticed}
 
 
 def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> None:
@@ -253,12 +259,13 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=20, seed=3)
     found = evaluate(policies, timeline, at_min=14.0, episodes=20, seed=3, limit_resolution=0.25, progress=Noting())
     environment = Animat(SHORT, Thresholds(1), 3)
-    assert found.limit == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
+    assert found.limit is not None
+    assert replace(found.limit, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
     assert told[-2:] == ["shuffled", "best possible return"]
     assert set(found.limit.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))
-    assert data["limit"] == found.limit.to_dict() and data["no_limit"] is None
+    assert data["limit"] == json.loads(json.dumps(found.limit.to_dict())) and data["no_limit"] is None
     rows = {row["name"]: row for row in data["rows"]}
     random, best = rows["random"]["mean_return"], data["limit"]["value"]
     for name, row in rows.items():
@@ -276,6 +283,21 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
     assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in data["rows"]]
     assert "score" not in plainly.to_text() and "best possible" not in plainly.to_text()
     assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
+
+
+def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows act on these conditions too; the limit is at the thresholds of all responses, as the rows are."""
+    monkeypatch.setattr("animat.evaluation.table.with_intervals", lambda optima, *_, **__: tuple(optima))
+    monkeypatch.setattr("animat.evaluation.table.best_return", partial(best_return, episodes=0))
+    responses = answers([60, 60, 60, 60, 3], 2)
+    lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
+    timeline = fit_timeline([lucky], kind="histogram")
+    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=20, limit_resolution=0.25)
+    assert found.limit is not None and found.limit.left_out == ("80 Hz (3)",)
+    held = replace(fit_histogram(lucky.only([0, 1, 2, 3])), percentiles=timeline.at(0.0).percentiles)
+    assert found.limit.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
+    assert {row["normalised_score"] for row in found.to_dict()["rows"]} == {None}
+    assert "no score, as the best possible return is without conditions" in found.to_text()
 
 
 def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:

@@ -62,7 +62,7 @@ class Door:
                 selection, stream=stand_in_maxlab.Stream(self.rig), settle=False, limits=replace(MAXONE_LIMITS, **FEW)
             )
         else:
-            limits = replace(SIMULATED_LIMITS, **FEW)
+            limits = replace(SIMULATED_LIMITS, **FEW, net_charge_per_session=60.0)
             self.culture = (
                 small_culture(limits=limits)
                 if kind == "virtual"
@@ -201,6 +201,22 @@ def breaches(out: list[Out], limits: Limits, sites: tuple[int, ...]) -> list[str
     return found
 
 
+def left_over(out: list[Out], limits: Limits, left: dict[int, float]) -> list[str]:
+    """Whether pulses left more charge on an electrode, at any time, than a session may; `left` is what was before."""
+    found = False
+    for pulse in sorted(out, key=lambda pulse: pulse.time_s):
+        left[pulse.electrode] += sum(us * amplitude / 1000 for us, amplitude in pulse.phases)
+        found = found or abs(left[pulse.electrode]) > limits.net_charge_per_session + 1e-6
+    return ["net_charge_per_session"] * bool(found)
+
+
+def end_of(request: list[Stimulus]) -> float:
+    """When to end a delivery; the front door itself refuses times that are not before the end."""
+    if math.isnan(request[-1].time_s):
+        return 1.0
+    return max([0.0, *(s.time_s for s in request)]) + 0.0001
+
+
 def go_through(kind: str, number: int, seed: int, patch: pytest.MonkeyPatch) -> tuple[int, int, list[str]]:
     """Requests delivered, requests refused, and limits that were not kept."""
     door, found, done, refused = Door(kind, patch), [], 0, 0
@@ -209,13 +225,11 @@ def go_through(kind: str, number: int, seed: int, patch: pytest.MonkeyPatch) -> 
         requests = Requests(seed, limits, sites)
         door.out()
         out: list[Out] = []
+        left: dict[int, float] = defaultdict(float)
         asked = 0
         for count in range(number):
             request = requests.next()
-            end_s = max([0.0, *(s.time_s for s in request if math.isfinite(s.time_s))]) + 0.0001
-            if math.isnan(request[-1].time_s):
-                # The front door itself refuses times that are not before the end.
-                end_s = 1.0
+            end_s = end_of(request)
             try:
                 culture.deliver(request, end_s)
             except UnsafeStimulus:
@@ -237,6 +251,7 @@ def go_through(kind: str, number: int, seed: int, patch: pytest.MonkeyPatch) -> 
                 # A second of what was before is checked together with what came after it.
                 out = [pulse for pulse in out if pulse.time_s > out[-1].time_s - 1.1] + new
                 found += breaches(out, limits, sites)
+                found += left_over(new, limits, left)
                 asked = 0
     return done, refused, found
 

@@ -6,6 +6,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import jax
@@ -22,7 +23,7 @@ from animat.gym import IDS, register_environments
 from animat.mapping import Linear, mapping_named
 from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.simulator import silenced
-from animat.recordings.made_up import write_made_up_series
+from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.robots import Cartpole, robot_named
 
 assert animat.__doc__  # importing animat registers the environments
@@ -342,6 +343,22 @@ def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
     envs.reset(seed=0)
     envs.step(np.zeros(3, int))
     assert [picture.shape for picture in envs.render()] == [first.shape] * 3
+
+
+def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -> None:
+    for number in range(3):
+        made_up = make_up_recording(number, start_min=30.0 * number, patterns=4, channels=16)
+        made_up.save(tmp_path / f"{number}.nwb")
+    with pytest.warns(UserWarning) as told:
+        gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path)
+    few = [str(each.message) for each in told if "a distribution takes 30 or more" in str(each.message)]
+    assert len(few) == 1
+    assert few[0].endswith("more like it)")
+
+
+def test_a_window_is_refused_with_what_to_do_instead() -> None:
+    with pytest.raises(InvalidArgument, match="make shows these pictures in a window, with pygame"):
+        gymnasium.make_vec("Animat/Cartpole-v0", num_envs=2, render_mode="human")
 
 
 def test_without_a_render_mode_a_picture_is_refused_with_a_warning() -> None:

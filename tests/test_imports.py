@@ -11,12 +11,14 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
-EVERYWHERE = {"differences", "errors", "writing", "progress", "compilation", "ctrl_c"}
+EVERYWHERE = {"brief", "differences", "errors", "plain_file", "writing", "progress", "compilation", "ctrl_c"}
 """What stands under the story and may be used by all of it."""
 
 MAY_IMPORT = {
     "differences": set(),
+    "brief": set(),
     "errors": set(),
+    "plain_file": {"errors"},
     "writing": {"errors"},
     "progress": set(),
     "compilation": set(),
@@ -29,7 +31,7 @@ MAY_IMPORT = {
     "training": {"animat", "neurons", "mapping", "robots", "recordings"},
     "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
     "cultures": {"recordings"},
-    "closed_loop": {"cultures", "neurons", "mapping", "robots", "recordings"},
+    "closed_loop": {"cultures", "evaluation", "neurons", "mapping", "robots", "recordings"},
     "reality_gap": {"closed_loop", "cultures", "evaluation", "training", "animat", "neurons", "robots", "recordings"},
     "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},

@@ -159,8 +159,22 @@ def test_conditions_that_do_not_differ_are_said_to_give_no_control() -> None:
 def test_burst_separation_that_separates_nothing_is_said_so() -> None:
     found = {f.name: f for f in extract_responses(answering({5: 20.0, 10: 20.0}, n=300)).findings}
     assert "bursts" not in found
-    assert found["bursts-not-separable"].severity == "warning"
-    assert "%) are set apart as bursts" in found["bursts-not-separable"].sentence
+    assert found["bursts-not-separable"].severity == "note"
+    assert "no response is set apart as a burst" in found["bursts-not-separable"].sentence
+    responses = extract_responses(answering({5: 20.0, 10: 20.0}, n=300))
+    assert not responses.is_burst.any()
+    assert responses.threshold == 1
+
+
+def test_where_every_response_is_kept_no_separability_is_told_and_no_panel_of_bursts_drawn() -> None:
+    source = answering({5: 20.0, 10: 20.0}, n=300)
+    for threshold, is_known in ((1.0, False), (None, True)):
+        inspection = inspect_recording(source, burst_threshold=threshold)
+        assert "bursts: none is set apart" in inspection_text(inspection)
+        assert "separability 0.00" not in inspection_text(inspection)
+        assert (inspection.to_dict()["burst_separability"] is not None) == is_known
+        titles = [axes.get_title(loc="left") for axes in draw_burst_separation(inspection.responses).axes]
+        assert titles[1:] == ["response against active channels", "no response is set apart as a burst"]
 
 
 def test_many_clear_bursts_may_be_the_responses() -> None:
@@ -175,9 +189,10 @@ def test_organoid(real_data: Path) -> None:
     text = inspection_text(inspection)
     assert "2,775 stimuli" in text
     assert "20.26 spikes in 2-10 ms per stimulus" in text
-    assert inspection.verdict == "usable with care"
+    assert inspection.verdict == "usable"
     found = {f.name: f for f in inspection.findings}
     # One hump of ratios: Otsu would drop more than half of the responses.
+    assert inspection.n_bursts == 0
     assert found["bursts-not-separable"].value == pytest.approx(0.62, abs=0.01)
     assert "P(x >= P50) is" in found["difference"].sentence
     assert inspection.response is not None

@@ -385,7 +385,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--presentations", "0"], "presentations: expected 1 to"),
         (["--pulses", "0"], "at least 1 pulse"),
         (["--episodes", "0"], "episodes: expected at least 1"),
-        (["--policies", "0"], "policies: expected at least 1"),
+        (["--policies", "0"], "policies: expected a whole number from 1"),
         (["--seed", "-1"], "seed"),
         (["--patience-s", "nan"], "patience_s"),
         (["--pause-s", "-1"], "pause_s"),

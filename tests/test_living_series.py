@@ -242,6 +242,7 @@ def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixt
         assert error.startswith("animat: --recordings" if wrong is command else "animat: --selection")
 
 
+@pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_kill_while_it_is_recorded_closes_the_culture(
     tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch

@@ -8,26 +8,34 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors import safe_open
 from safetensors.numpy import load, save
 from scipy import stats
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.animat import Delivery
+from animat.cli_responses import fit_as
+from animat.closed_loop.loop import Loop
+from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.mapping import mapping_named
-from animat.neurons.conditions import Condition
+from animat.neurons.conditions import Condition, conditions_named
+from animat.neurons.kinds import Kind
 from animat.recordings.protocol import Presentation
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.training.policy import Policy, load_policies
+from animat.training.provenance import READ
 from animat.training.sac import Layer, forward
+from animat.training.specification import Percentiles
 
 CONDITIONS = tuple(Condition(f"{f} Hz", float(f), "Hz") for f in (5, 10, 20, 40, 80))
 
@@ -146,6 +154,31 @@ def test_a_policy_comes_back_equal(make: Callable[[], Policy], tmp_path: Path) -
     assert back.act(observation, np.random.default_rng(1)) == policy.act(observation, np.random.default_rng(1))
 
 
+def test_the_file_and_the_docs_are_enough_to_run_the_network_without_this_package(tmp_path: Path) -> None:
+    # As a stranger would: only what the file says, in double precision.
+    policy = through_neurons()
+    policy.save(tmp_path / "p0.safetensors")
+    with safe_open(tmp_path / "p0.safetensors", framework="numpy") as file:
+        assert json.loads(file.metadata()["animat"])["hidden_activation"] == "relu"
+        layers = [(file.get_tensor(f"layer{i}.weight"), file.get_tensor(f"layer{i}.bias")) for i in range(3)]
+        observation = np.linspace(-0.1, 0.2, 4)
+        x = observation / file.get_tensor("scales").astype(np.float64)
+    for i, (weight, bias) in enumerate(layers):
+        x = x @ weight.astype(np.float64) + bias
+        x = np.where(x > 0, x, 0) if i < 2 else x
+    np.testing.assert_allclose(policy.outputs(observation), x, rtol=1e-4, atol=1e-5)
+
+
+def test_a_file_from_before_the_activation_was_said_is_read_and_another_activation_refused(tmp_path: Path) -> None:
+    with safe_open(resaved(tmp_path), framework="numpy") as file:
+        described = json.loads(file.metadata()["animat"])
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    refused(resaved(tmp_path, hidden_activation="tanh"), "expected hidden layers of 'relu', got 'tanh'")
+    del described["hidden_activation"]
+    (tmp_path / "old.safetensors").write_bytes(save(arrays, {"animat": json.dumps(described)}))
+    assert Policy.load(tmp_path / "old.safetensors").robot.name == "cartpole"
+
+
 def test_saving_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         through_neurons().save(tmp_path / name)
@@ -259,6 +292,8 @@ def test_others_safetensors_are_refused(metadata: dict[str, str] | None, tmp_pat
         {"presentation": [1, 2]},
         {"provenance": None},
         {"provenance": [1]},
+        {"provenance": {"simulators": {"range_hz": 10**400}}},
+        {"window_ms": [2, 10**400]},
     ],
     ids=str,
 )
@@ -307,7 +342,153 @@ def test_an_unwritable_place_is_one_line_and_the_old_file_stays(tmp_path: Path) 
 
 
 def test_weights_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(InvalidArgument, match=r"^weights: expected layers from 4 observations of cartpole to 5 output"):
+    with pytest.raises(
+        InvalidArgument, match=r"^weights: expected three layers from 4 observations of cartpole to 5 output"
+    ):
         replace(through_neurons(), **layers(0, 4, 8, 8, 4))
-    with pytest.raises(InvalidArgument, match=r"^weights: expected finite numbers"):
+    with pytest.raises(InvalidArgument, match=r"^biases: expected finite numbers"):
         replace(two_forces(), biases=(*two_forces().biases[:-1], np.array([np.nan, 0], np.float32)))
+
+
+# --- policies made by hand ------------------------------------------------------------------------------------------
+
+STRANGE = (
+    None,
+    True,
+    0,
+    -1,
+    1.5,
+    10**9,
+    10**400,
+    float("nan"),
+    float("inf"),
+    "",
+    "1",
+    "first",
+    "a\nb",
+    [],
+    [0],
+    {},
+    [[]],
+)
+
+
+def places(node: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where every value of a policy's metadata stands."""
+    inner = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    return [place for key, value in inner for place in ((*at, key), *places(value, (*at, key)))]
+
+
+def taken_apart(policy: Policy, tmp_path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays of a policy's file, and its metadata."""
+    policy.save(tmp_path / "whole.safetensors")
+    data = (tmp_path / "whole.safetensors").read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    return load(data), json.loads(header["__metadata__"]["animat"])
+
+
+TRAINED = {
+    "fingerprint": "abc",
+    "training": {"shadowing": True, "duration_min": 60.0, "chunks": 60, "percentiles": "first", "delivery": "chosen"},
+    "simulators": {
+        "kind": "histogram",
+        "bins": 20,
+        "range_hz": None,
+        "by": "frequency:5,10",
+        "burst_threshold": 0.4,
+        "recorded_at_min": [0.0, 10.0],
+    },
+}
+
+
+def used(policy: Policy) -> None:
+    """What a closed loop and an evaluation read of a policy, before a culture is opened."""
+    assert math.isfinite(policy.act(np.zeros(len(policy.scales), np.float32), np.random.default_rng(0)))
+    assert math.isfinite(policy.act_greedily(np.full(len(policy.scales), 10.0, np.float32)))
+    fit_as(policy.fitted, None, None, None)
+    if policy.fitted.get("by") is not None:
+        with suppress(InvalidArgument):
+            conditions_named(policy.fitted["by"])
+    until_min = policy.trained_until_min(0.0)
+    assert until_min is None or math.isfinite(until_min)
+    assert policy.percentiles in ("moving", "first") and policy.delivery in ("chosen", "shuffled")
+    with suppress(UnusableData):
+        loop, _ = Loop.of_policy(policy, np.zeros(11))
+        json.dumps(loop.to_dict())
+
+
+def change_everything(make: Callable[[], Policy], tmp_path: Path, every: int) -> int:
+    """Give values of the metadata, one in so many, another type; returns how many files were refused."""
+    arrays, whole = taken_apart(replace(make(), provenance=TRAINED), tmp_path)
+    path, refusals = tmp_path / "p0.safetensors", 0
+    for place, strange in list(itertools.product(places(whole), ("left out", *STRANGE)))[::every]:
+        told = json.loads(json.dumps(whole))
+        node = told
+        for key in place[:-1]:
+            node = node[key]
+        if strange == "left out":
+            del node[place[-1]]
+        else:
+            node[place[-1]] = strange
+        path.write_bytes(save(arrays, {"animat": json.dumps(told)}))
+        try:
+            loaded = Policy.load(path)
+        except InvalidFile as error:
+            message = str(error)
+            assert str(path) in message and "\n" not in message and len(message) < 1000, (place, strange)
+            refusals += 1
+        else:
+            used(loaded)
+    return refusals
+
+
+MAKES = [through_neurons, two_forces, continuous]
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_metadata_of_another_type_are_refused_or_mean_something(make: Callable[[], Policy], tmp_path: Path) -> None:
+    assert change_everything(make, tmp_path, 5) > 50
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("make", MAKES)
+def test_metadata_of_every_other_type_are_refused_or_mean_something(make: Callable[[], Policy], tmp_path: Path) -> None:
+    assert change_everything(make, tmp_path, 1) > 300
+
+
+@pytest.mark.parametrize(
+    "metadata", ['{"format": ' + "9" * 5000 + "}", "[" * 100_000, '{"format": "animat-policy-1", "a": ' + "[" * 100_000]
+)
+def test_metadata_without_end_are_refused(metadata: str, tmp_path: Path) -> None:
+    arrays, _ = taken_apart(through_neurons(), tmp_path)
+    (tmp_path / "p0.safetensors").write_bytes(save(arrays, {"animat": metadata}))
+    refused(tmp_path / "p0.safetensors", "metadata")
+
+
+@pytest.mark.parametrize("value", [3e38, -3e38, np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["layer0.weight", "layer1.bias", "layer2.weight", "scales"])
+def test_weights_of_which_no_action_can_be_made_are_refused(name: str, value: float, tmp_path: Path) -> None:
+    part = {"weight": "weights", "bias": "biases", "scales": "scales"}[name.rpartition(".")[2]]
+    array = np.ones({"layer0.weight": (4, 64), "layer1.bias": (64,), "layer2.weight": (64, 5), "scales": (4,)}[name])
+    array.flat[-1] = value
+    with np.errstate(over="ignore"):
+        refused(resaved(tmp_path, {name: array.astype(np.float32)}), part)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int32, np.uint8, np.bool_])
+def test_weights_of_another_type_are_refused(dtype: Any, tmp_path: Path) -> None:
+    refused(resaved(tmp_path, {"layer1.weight": np.ones((64, 64), dtype)}), "float32" if dtype == np.float64 else "F32")
+
+
+def test_networks_of_another_build_are_refused(tmp_path: Path) -> None:
+    empty = {"layer0.weight": np.zeros((4, 0)), "layer0.bias": np.zeros(0), "layer1.weight": np.zeros((0, 64))}
+    refused(resaved(tmp_path, {name: array.astype(np.float32) for name, array in empty.items()}), "three layers")
+    refused(resaved(tmp_path, {"more": np.zeros(3, np.float32)}), "expected a policy's arrays", "more")
+    refused(resaved(tmp_path, {"scales": np.full(4, 1e-40, np.float32)}), "scales")
+
+
+def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:
+    names = {name: entry for part in READ.values() for name, entry in part.items()}
+    for name, choices in (("kind", Kind), ("percentiles", Percentiles), ("delivery", Delivery)):
+        assert all(names[name][1](choice) for choice in get_args(choices))
+        assert names[name][0] == f"one of {', '.join(get_args(choices))}"

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from scipy.stats import binom
 
 from animat.animat import Animat
 from animat.cli import main
-from animat.evaluation.optimum import best_return
+from animat.errors import UnusableData
+from animat.evaluation.grid import grid_for
+from animat.evaluation.optimum import Optimum, best_return, rough_values
 from animat.evaluation.prospects import prospects
+from animat.evaluation.resampling import _rough, with_intervals
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.mapping import Thresholds
-from animat.neurons.responses import extract_responses
+from animat.neurons.conditions import NO_CONDITION, Condition
+from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
@@ -26,7 +34,7 @@ ROBOT = Cartpole(episode_limit=60)
 
 def test_it_is_the_limit_of_the_default_simulator_above_random_and_constant_stimuli() -> None:
     responses = extract_responses(make_up_recording(1, patterns=40, channels=64))
-    (found,) = prospects(responses, ROBOT, [Thresholds(9)], resolution=0.25)
+    (found,) = prospects(responses, ROBOT, [Thresholds(9)], resolution=0.25, resamples=0)
     simulator = fit_histogram(responses)
     environment = Animat(ROBOT, Thresholds(9), 5)
     assert (found.robot, found.mapping) == ("cartpole", "9-thresholds")
@@ -43,7 +51,7 @@ def test_it_is_the_limit_of_the_default_simulator_above_random_and_constant_stim
 def test_inspect_tells_the_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rough = partial(prospects, resolution=0.25, episodes=20)
+    rough = partial(prospects, resolution=0.25, episodes=20, resamples=4)
     monkeypatch.setattr("animat.evaluation.prospects.prospects", rough)
     make_up_recording(1, patterns=40, channels=64).save(tmp_path / "a.nwb")
     assert main(["inspect", str(tmp_path / "a.nwb"), "--limit", "cartpole", "--json"]) == 0
@@ -54,6 +62,7 @@ def test_inspect_tells_the_limit(
     simulator = fit_histogram(extract_responses(read_recording(tmp_path / "a.nwb")))
     direct = best_return(Animat(Cartpole(), Thresholds(1), 5), simulator, resolution=0.25, episodes=0)
     assert one["best"]["value"] == pytest.approx(direct.value, abs=0.5)
+    assert one["best"]["interval"]["low"] <= one["best"]["value"] <= one["best"]["interval"]["high"]
     told = next(line for line in said if "1-threshold: random" in line)
     assert f"best possible return {one['best']['value']:.1f}" in told
 
@@ -70,3 +79,112 @@ def test_where_there_is_no_limit_it_is_said(tmp_path: Path, capsys: pytest.Captu
 def test_a_robot_that_is_not_known_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", "a.nwb", "--limit", "submarine"]) != 0
     assert "submarine" in capsys.readouterr().err
+
+
+# Returns of up to 24 iterations: many optima in a second.
+SHORT = Cartpole(episode_limit=24)
+SPREAD = (0.5, 0.8, 1.0, 1.25, 2.0)
+"""Of the medians of five conditions."""
+
+
+def answers(n: Sequence[int], seed: int, spread: Sequence[float] = SPREAD) -> Responses:
+    """n responses to each condition, drawn from gamma distributions of different scales."""
+    rng = np.random.default_rng(seed)
+    condition = np.repeat(np.arange(len(n)), n)
+    return Responses(
+        condition=condition,
+        rate_hz=rng.gamma(3.0, 5.0, len(condition)) * np.array(spread)[condition],
+        active_ratio=np.full(len(condition), 0.1),
+        is_burst=np.zeros(len(condition), bool),
+        conditions=tuple(Condition(f"{f} Hz", f, "Hz") for f in (5, 10, 20, 40, 80)[: len(n)]),
+        window_ms=(2.0, 10.0),
+        n_channels=1024,
+        threshold=1.0,
+        separability=0.5,
+    )
+
+
+def test_three_responses_promise_nothing() -> None:
+    with pytest.raises(UnusableData, match="expected 30 non-burst responses or more to some condition, got 3 at most"):
+        prospects(answers([3] * 5, 1), SHORT)
+
+
+def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
+    responses = answers([60, 60, 60, 60, 3], 2)
+    # The three responses to 80 Hz are lucky: believed, they would make the best condition there is.
+    lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
+    (found,) = prospects(lucky, SHORT, [Thresholds(1)], resolution=0.25, episodes=2, resamples=3)
+    # Of the four others, at the median of all responses: that is the threshold that commands are made by.
+    without = fit_histogram(lucky.only([0, 1, 2, 3]))
+    held = replace(without, percentiles=jnp.asarray(np.percentile(lucky.rate_hz, np.arange(0, 101, 10)), jnp.float32))
+    plain = best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=2)
+    assert found.best.left_out == ("80 Hz (3)",)
+    assert "too few responses to count: 80 Hz (3)" in found.to_text()
+    assert replace(found.best, left_out=(), interval=None) == plain
+    assert best_return(Animat(SHORT, Thresholds(1), 4), without, resolution=0.25, episodes=0).value != plain.value
+    assert best_return(Animat(SHORT, Thresholds(1), 5), fit_histogram(lucky), resolution=0.25, episodes=0).value > (
+        found.best.value + 1
+    )
+
+
+def test_conditions_left_out_leave_the_others_and_their_past_alone() -> None:
+    source = extract_responses(make_up_recording(1, patterns=10, channels=16))
+    kept = source.only([3, 1])
+    assert [c.label for c in kept.conditions] == [source.conditions[3].label, source.conditions[1].label]
+    assert kept.rates_of(0).tolist() == source.rates_of(3).tolist()
+    assert kept.rates_of(1).tolist() == source.rates_of(1).tolist()
+    rows = np.isin(source.condition, [3, 1])
+    np.testing.assert_array_equal(kept.last_hz, source.last_hz[rows])
+    assert set(kept.presentations[0].condition.tolist()) == {NO_CONDITION, 0, 1}
+
+
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
+def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None:
+    environment = Animat(SHORT, mapping, 5)
+    for spread in ((1.0,) * 5, (0.01, 1.0, 1.0, 1.0, 100.0)):
+        responses = answers([30] * 5, 3, spread)
+        best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
+        (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25, resamples=8)
+        assert known.interval is not None
+        # The pole falls in the first iteration, or never.
+        assert -100 <= known.interval.low <= best.value <= known.interval.high <= SHORT.episode_limit
+
+
+def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_redrawn() -> None:
+    """That is what 95 % of 39 are: a value drawn anew falls outside of so many once in twenty."""
+    environment, responses = Animat(SHORT, Thresholds(1), 5), answers([40] * 5, 3)
+    best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
+    (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25)
+    rng = np.random.default_rng(1)
+    simulators = [fit_histogram(each) for each in (responses, *(responses.redrawn(rng) for _ in range(39)))]
+    grid = _rough(grid_for(SHORT), 0.25)
+    values, _ = rough_values([(environment, each) for each in simulators], grid, 1)
+    moved = values[1:] - values[0]
+    low, high = min(moved.min(), -moved.max()), moved.max()
+    assert known.interval is not None
+    assert known.interval.low == pytest.approx(best.value + low - best.grid_error)
+    assert known.interval.high == pytest.approx(best.value + high + best.grid_error)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
+@pytest.mark.parametrize("spread", [SPREAD, (1.0,) * 5, (0.7, 1.4)])
+@pytest.mark.parametrize("n", [30, 100])
+def test_the_interval_holds_the_optimum_of_the_true_distributions(
+    mapping: Thresholds, spread: tuple[float, ...], n: int
+) -> None:
+    environment = Animat(SHORT, mapping, len(spread))
+
+    def best(responses: Responses) -> Optimum:
+        return best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
+
+    true = best(answers([20_000] * len(spread), 0, spread)).value
+    trials, held = 40, 0
+    for seed in range(1, trials + 1):
+        responses = answers([n] * len(spread), seed, spread)
+        (known,) = with_intervals([best(responses)], [environment], responses, fit_histogram, resolution=0.25)
+        assert known.interval is not None
+        held += known.interval.low <= true <= known.interval.high
+    print(f"{mapping.name}, {len(spread)} conditions, n = {n}: {held} of {trials}")
+    # Were it 85 %, fewer would be held by chance once in a thousand.
+    assert held >= binom.ppf(0.001, trials, 0.85)

@@ -41,9 +41,19 @@ def test_the_papers_protocol_is_the_papers() -> None:
     assert len(orders) > 20
 
 
-def test_the_closed_loops_protocol_mixes_and_reads_the_last_of_five() -> None:
-    schedule = make_schedule(CLOSED_LOOP, PATTERNS, seed=1)
-    assert CLOSED_LOOP.presentation == Presentation("mixed", 5)
+def test_the_closed_loops_protocol_presents_as_often_as_a_memory_needs() -> None:
+    assert CLOSED_LOOP.presentation == Presentation("mixed", 1)
+    (block,) = make_schedule(CLOSED_LOOP, PATTERNS, seed=1).blocks
+    frequency_hz = block.stimuli.frequency_hz
+    assert [int(np.sum(frequency_hz == f)) for f in (5, 10, 20, 40, 80)] == [500] * 5
+    # Each of 100 patterns five times at each frequency.
+    pairs, often = np.unique(np.stack([frequency_hz, block.stimuli.pattern]), axis=1, return_counts=True)
+    assert pairs.shape == (2, 500)
+    assert set(often.tolist()) == {5}
+
+
+def test_five_pulses_are_of_one_frequency_and_the_last_is_read() -> None:
+    schedule = make_schedule(Protocol(order="mixed", pulses=5), PATTERNS, seed=1)
     (block,) = schedule.blocks
     stimuli = block.stimuli
     assert len(schedule) == 2500
@@ -206,8 +216,8 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):
         read_protocol(tmp_path / "nothing.json")
-    for name in ("", "binary.json"):
-        with pytest.raises(InvalidFile, match="cannot be read"):
+    for name, words in (("", "expected a file, got a folder"), ("binary.json", "expected text in UTF-8")):
+        with pytest.raises(InvalidFile, match=words):
             read_protocol(tmp_path / name)
 
 

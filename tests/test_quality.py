@@ -97,6 +97,26 @@ def test_a_blanked_stretch_is_told_from_a_quiet_culture(until_ms: float, severit
     assert "blanked-window" not in findings(source)
 
 
+def test_a_condition_whose_window_is_dead_is_told_though_the_others_respond() -> None:
+    rng = np.random.default_rng(7)
+    stimulus_s = 0.5 + 0.5 * np.arange(200)
+    frequency_hz = np.tile([5.0, 10.0], 100)
+    # 250 Hz on all channels together at any time, so 2 spikes in 8 ms: half as many after 5 Hz, more after 10 Hz.
+    spikes = [(t, int(rng.integers(20))) for t in np.sort(rng.uniform(0, 101, 25_250))]
+    since = [(t - stimulus_s[max(np.searchsorted(stimulus_s, t) - 1, 0)]) for t, _ in spikes]
+    low = frequency_hz[np.clip(np.searchsorted(stimulus_s, [t for t, _ in spikes]) - 1, 0, 199)] == 5.0
+    kept = [s for s, d, is_low in zip(spikes, since, low, strict=True) if not (is_low and 0 < d < 0.02 and s[1] % 2)]
+    kept += [(t + rng.uniform(0.03, 0.08), int(rng.integers(20))) for t in stimulus_s[::2] for _ in range(60)]
+    kept += [(t + rng.uniform(0.002, 0.01), int(rng.integers(20))) for t in stimulus_s[1::2] for _ in range(10)]
+    found = findings(recording(kept, stimulus_s, 20, 101.0, frequency_hz=frequency_hz))
+    assert "dead-window" not in found
+    assert found["dead-condition"].severity == "warning"
+    assert "5 Hz (" in found["dead-condition"].sentence
+    assert "10 Hz (" not in found["dead-condition"].sentence
+    assert found["dead-condition"].value == pytest.approx(0.9, abs=0.2)
+    assert "its response is at 30 to 80 ms" in found["dead-condition"].sentence
+
+
 def drifting(change: float, blocked: bool, seed: int = 0) -> Recording:
     """Responses that change by a share from start to end; conditions mixed or one after the other."""
     rng = np.random.default_rng(seed)

@@ -27,6 +27,7 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.verdict import Beside
 from animat.mapping import Linear, Mapping, Thresholds
 from animat.neurons.conditions import Condition
 from animat.neurons.made_up import LABELS, MEANS_HZ
@@ -144,8 +145,9 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
 
     for row in gap.rows[3:]:
         expected = mannwhitneyu(rows["policies"].lived, row.lived, alternative="two-sided", method="asymptotic")
-        assert row.p == pytest.approx(min(1.0, expected.pvalue))
-        assert row.wins == pytest.approx(expected.statistic / (len(rows["policies"].lived) * len(row.lived)))
+        assert row.beside is not None
+        assert row.beside.p == pytest.approx(min(1.0, expected.pvalue))
+        assert row.beside.wins == pytest.approx(expected.statistic / (len(rows["policies"].lived) * len(row.lived)))
     for row in gap.rows:
         assert row.gap.value == pytest.approx(row.lived.mean() - row.predicted.mean())
         assert row.gap.low <= row.gap.value + 1e-9
@@ -154,32 +156,39 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     assert [row["name"] for row in told["rows"]] == list(rows)
     text = gap.to_text()
     assert all(name in text for name in rows)
-    beaten = {row.name for row in gap.rows[3:] if row.p is not None and row.p < 0.01 and row.wins is not None
-              and row.wins > 0.5}  # fmt: skip
-    assert gap.not_beaten is not None
-    assert set(gap.not_beaten) == {row.name for row in gap.rows[3:]} - beaten
+    better = {row["name"] for row in told["rows"][3:] if row["p"] < 0.01 and row["wins"] > 0.5}
+    assert set(told["not_outperformed"]) == {row.name for row in gap.rows[3:]} - better
     assert gap.verdict() in text
 
 
-def test_the_verdict_says_which_controls_are_beaten_and_by_how_much_others_are_not(
+def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
+    tmp_path: Path, series: list[Responses]
+) -> None:
+    calibration = Calibration.of_series(series)
+    few = replace(calibration, responses_hz=(*calibration.responses_hz[:4], calibration.responses_hz[4][:3]))
+    with FakeCulture() as culture:
+        gap = run_policies({"p0": policy_of(0, series)}, culture, few, tmp_path, episodes=1, with_controls=False)
+    told = json.loads(json.dumps(gap.to_dict()))
+    assert (told["limit"], told["gap_share"]) == (None, None)
+    (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-limit"]
+    assert sentence == "no best possible return, as these conditions have too few responses: 80 Hz (3)"
+    assert "best possible return" not in gap.to_text()
+
+
+def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may_come_from(
     tmp_path: Path, series: list[Responses]
 ) -> None:
     gap, _ = run(tmp_path, series, with_controls=False)
     policies, *each, random = gap.rows
 
-    def verdict(p: float, wins: float, lived: float, n: int = 20) -> str:
-        control = replace(random, p=p, wins=wins, lived=np.zeros(n))
-        rows = (replace(policies, lived=np.full(n, lived)), *each, control)
+    def verdict(p: float, wins: float, lived: float) -> str:
+        control = replace(random, beside=Beside(p, wins, 20, 20))
+        rows = (replace(policies, lived=np.full(20, lived)), *each, control)
         return replace(gap, rows=rows).verdict()
 
     high = float(policies.predicted.max()) + 1
-    assert verdict(0.001, 0.9, high) == "the policies live larger returns than each control (p < 0.01)"
-    assert "do not live larger returns (p < 0.01) than: random (60 %)" in verdict(0.02, 0.6, high)
-    # Of four and four even the clearest difference has p = 0.03: that is not the same as none.
-    assert "4 episodes of the policies beside 4 of a control are too few to tell" in verdict(0.03, 1.0, high, n=4)
-    assert "each control" in verdict(0.001, 1.0, high, n=6)
-    # Significantly worse is not beaten.
-    assert "random (10 %)" in verdict(0.001, 0.1, high)
+    assert verdict(0.001, 0.9, high).startswith("the policies outperform every control (p < 0.01; ")
+    assert verdict(0.02, 0.6, high).startswith("the policies do not outperform random (p = 0.02; ")
     assert "they live less than predicted" in verdict(0.001, 0.9, float(policies.predicted.min()) - 1)
 
 
@@ -196,9 +205,9 @@ def test_what_was_not_lived_is_named(tmp_path: Path, series: list[Responses]) ->
     gap, _ = run(tmp_path, series, with_controls=False)
     policies, *others = gap.rows
     none = np.empty(0)
-    no_controls = replace(gap, rows=(policies, *(replace(row, lived=none, p=None) for row in others)))
+    no_controls = replace(gap, rows=(policies, *(replace(row, lived=none, beside=None) for row in others)))
     assert no_controls.verdict().startswith("no control was lived to its end")
-    no_policy = replace(gap, rows=(replace(policies, lived=none), *(replace(row, p=None) for row in others)))
+    no_policy = replace(gap, rows=(replace(policies, lived=none), *(replace(row, beside=None) for row in others)))
     assert no_policy.verdict().startswith("no episode of a policy was lived to its end")
 
 
@@ -283,7 +292,7 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
             {"p": policy}, culture, Calibration.of_series(found), tmp_path / "other", episodes=1, with_controls=False
         )
     (other,) = (f.sentence for f in gap.findings if f.name == "other-simulator")
-    assert "empirical" in other and "histogram" in other
+    assert "kind empirical, here memory" in other
     with pytest.raises(Mismatch, match="the same fitted as p"):
         check_policies({"p": policy, "q": policy_of(0, series)})
 

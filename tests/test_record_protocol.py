@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,12 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
     )
     (tmp_path / "mine.json").write_text('{"frequencies_hz": [5, 20], "setup_s": 0}')
     assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]) == 0
-    assert main(["record", "--order", "mixed", "--pulses", "5", "--out", str(tmp_path / "out")]) == 0
+    assert main(["record", "--pulses", "5", "--out", str(tmp_path / "out")]) == 0
     assert main(["record", "--out", str(tmp_path / "out")]) == 0
-    assert asked == [Protocol((5, 20), setup_s=0), Protocol(order="mixed", pulses=5), Protocol()]
+    assert main(["record", "--paper", "--out", str(tmp_path / "out")]) == 0
+    mixed = Protocol(order="mixed", presentations=500)
+    # What a file leaves out is the paper's.
+    assert asked == [Protocol((5, 20), setup_s=0), replace(mixed, pulses=5), mixed, Protocol()]
 
 
 @pytest.mark.parametrize("culture", ["virtual", "replay"])

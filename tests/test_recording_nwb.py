@@ -146,6 +146,20 @@ def test_nwbinspector_finds_nothing_critical_and_no_violation(made_up: Recording
     assert [m.check_function_name for m in messages if m.importance != Importance.BEST_PRACTICE_SUGGESTION] == []
 
 
+@pytest.mark.oracle
+def test_nwbinspector_finds_nothing_critical_in_what_a_culture_records(made_up: Recording, tmp_path: Path) -> None:
+    pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
+    from nwbinspector import Importance, inspect_nwbfile
+
+    made_up.save(tmp_path / "a.nwb")
+    messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "a.nwb")))
+    grave = (Importance.CRITICAL, Importance.ERROR, Importance.PYNWB_VALIDATION)
+    assert [m.check_function_name for m in messages if m.importance in grave] == []
+    # No species is made up for a culture that nobody named one of.
+    violations = [m.check_function_name for m in messages if m.importance == Importance.BEST_PRACTICE_VIOLATION]
+    assert violations == ["check_subject_species_exists"]
+
+
 def with_subject(recording: Recording) -> Recording:
     import dataclasses
 

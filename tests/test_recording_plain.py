@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import pickle
+import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +50,39 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
     assert recording.presentation is None
     assert recording.stimuli.presentation.tolist() == [0, 1]
     assert names(recording) >= {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
-    assert "1 of 3 spikes came after a later one" in recording.provenance["note: unsorted-spikes"]
+    assert "1 of 3 spikes stand behind a later one" in recording.provenance["note: unsorted-spikes"]
+
+
+@FEW
+@given(times=st.lists(st.integers(-9, 9), min_size=1, max_size=20))
+def test_spikes_out_of_order_are_those_with_a_later_one_anywhere_before_them(times: list[int], tmp_path: Path) -> None:
+    path = npz(tmp_path, spike_time_s=np.array(times), spike_channel=np.zeros(len(times), int), **STIMULI)
+    behind = sum(any(before > time for before in times[:i]) for i, time in enumerate(times))
+    said = read_recording(path).provenance.get("note: unsorted-spikes", "0 of")
+    assert said.startswith(f"{behind} of")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"spike_time_s": np.array([0.0, 1.0, 1e300])}, "spike_time_s: expected times in seconds, within a century"),
+        ({"stimulus_time_s": np.array([0.0, -1e300])}, "stimulus_time_s: expected times in seconds, within a century"),
+        ({"sampling_rate_hz": 1e300}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz"),
+        ({"stimulus_frequency_hz": np.array([1e300, 1])}, "frequency_hz: expected positive frequencies up to 1e.09 Hz"),
+        ({"start_min": -1e300}, "start_min: expected finite minutes, within a century, got -1e.300"),
+        ({"start_s": -1e300}, "start_s, duration_s: expected finite seconds, within a century, got -1e.300"),
+        ({"duration_s": 1e300}, "start_s, duration_s: expected finite seconds, within a century, got -0.25 and 1e.300"),
+        # Each of many rows would have room for it.
+        ({"channel_label": np.array(["3", "x" * 1001])}, "channel_label: expected names of at most 1,000 characters"),
+        ({"spike_channel": np.array(["3", "x" * 1001, "3"])}, "spike_channel: expected names of at most 1,000"),
+        ({"stimulus_pattern": np.array(["3", "x" * 1001])}, "stimulus_pattern: expected names of at most 1,000"),
+    ],
+)
+def test_what_no_recording_is_as_large_as_is_refused_by_name(
+    changed: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InvalidFile, match=rf"a\.npz: .*{words}"):
+        read_recording(npz(tmp_path, **{**SPIKES, **STIMULI, **changed}))
 
 
 def test_every_key_arrives_in_its_place(tmp_path: Path) -> None:
@@ -206,7 +241,10 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
         "2 in channel_label, 3 in channel_electrode",
     ),
     "positions in one column": ({"channel_xy_um": np.zeros(8)}, r"channel_xy_um: expected shape \(8, 2\)"),
-    "negative frequency": ({"stimulus_frequency_hz": np.array([5.0, -5.0])}, "positive frequencies .* got -5"),
+    "negative frequency": (
+        {"stimulus_frequency_hz": np.array([5.0, -5.0])},
+        "positive frequencies .* got -5",
+    ),
     "frequencies of another length": (
         {"stimulus_frequency_hz": np.zeros(3)},
         r"stimulus_frequency_hz: .*\(2,\), got \(3,\)",
@@ -220,8 +258,11 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
     "two rates": ({"sampling_rate_hz": np.ones(2)}, r"sampling_rate_hz: expected one value, got shape \(2,\)"),
-    "no rate": ({"sampling_rate_hz": 0}, "sampling_rate_hz: expected a positive rate in Hz, got 0"),
-    "start that is not finite": ({"start_min": np.nan}, "start_min: expected finite minutes, got nan"),
+    "no rate": ({"sampling_rate_hz": 0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, .*got 0"),
+    "start that is not finite": (
+        {"start_min": np.nan},
+        "start_min: expected finite minutes, within a century, got nan",
+    ),
     "duration too short": ({"duration_s": 1.0}, "expected times within the recording"),
     "negative duration": ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
     "one thing under two names": (
@@ -327,7 +368,36 @@ def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
     assert len(recording.stimuli) == 0
     refusal = next(finding for finding in noticed(recording) if finding.name == "no-stimuli")
     assert refusal.severity == "refuse"
-    assert "1 spikes but no stimulus" in refusal.sentence
+    assert "1 spikes but no stimuli" in refusal.sentence
+    assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.sentence
+
+
+def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tmp_path: Path) -> None:
+    spikes = "Time (s); CHANNEL;\n0,0031;17;\n1,5;21;\n;;\n"
+    recording = read_recording(csv(tmp_path, spikes, "Time [s]\tFrequency-Hz\n0,25\t5\n0,5\t12,5\n"))
+    assert recording.spike_times_s.tolist() == [0.0031, 1.5]
+    assert recording.channels.label.tolist() == ["17", "21"]
+    assert recording.stimuli.time_s.tolist() == [0.25, 0.5]
+    assert recording.stimuli.frequency_hz.tolist() == [5.0, 12.5]
+    read_as = recording.provenance["note: headers-read-as"]
+    assert "'Time (s)' of a_spikes.csv is read as time_s" in read_as
+    assert "'Frequency-Hz' of a_stimuli.csv is read as frequency_hz" in read_as
+    assert "spike_time_s of a_spikes.csv has decimal commas" in recording.provenance["note: decimal-commas"]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 10**7), min_size=1, max_size=8).map(sorted))
+def test_times_of_three_decimals_are_read_where_one_cannot_be_thousands(milliseconds: list[int]) -> None:
+    cells = [f"{ms // 1000},{ms % 1000:03}" for ms in milliseconds]
+    with tempfile.TemporaryDirectory() as folder:
+        path = csv(Path(folder), "time;channel\n" + "".join(f"{cell};5\n" for cell in cells))
+        # Thousands begin with one to three figures, of which the first is no 0.
+        if all(1000 <= ms < 10**6 for ms in milliseconds):
+            with pytest.raises(InvalidFile, match="expected a number with a decimal point"):
+                read_recording(path)
+        else:
+            times_s = [ms / 1000 for ms in milliseconds]
+            assert read_recording(path).spike_times_s.tolist() == pytest.approx(times_s)
 
 
 BAD_CSV = {
@@ -336,23 +406,47 @@ BAD_CSV = {
     "a word for a time": (
         "time,channel\n1,2\nsoon,2\n",
         None,
-        "spike_time_s: expected a number in data line 2, got 'soon'",
+        "a_spikes.csv, line 3: spike_time_s: expected a number, got 'soon'",
     ),
-    "an empty time": ("time,channel\n,2\n", None, "spike_time_s: expected finite times .* got 1 of 1"),
-    "an empty channel": ("time,channel\n1,\n1,2\n", None, "expected a channel for each spike, got 1 without"),
-    "a short line": ("time,channel\n1,2\n1\n", None, "expected 2 columns in each line, got 1 in data line 2"),
+    "an empty time": ("time,channel\n,2\n", None, "line 2: spike_time_s: expected a finite number, got an empty field"),
+    "an empty channel": ("time,channel\n1,\n1,2\n", None, "line 2: .*expected a channel for each spike, got 1 without"),
+    "a short line": ("time,channel\n1,2\n1\n", None, "line 3: expected 2 fields, as in the header, got 1: is a field"),
+    "a long line after a blank one": (
+        "time,channel\n1,2\n\n1,2,3\n",
+        None,
+        "line 4: expected 2 fields, .* got 3: write",
+    ),
+    "decimal commas among commas": (
+        "time,channel\n0,0031,17\n",
+        None,
+        "line 2: .* got 3: .* decimal points, or sep.*semi",
+    ),
+    "text with a comma": ("time,channel\n0.5,left, upper\n", None, "line 2: .* got 3: quote the text"),
+    "commas that may be thousands": ("time;channel\n1,234;5\n", None, "line 2: .* decimal point, got '1,234'"),
+    "commas and points": ("time;channel\n0.5;5\n0,5;5\n", None, "line 3: .* decimal point, got '0,5'"),
+    "two headers of one name": ("Time,TIME,channel\n1,2,3\n", None, "line 1: expected one column time, got 'Time' and"),
+    "spikes that are stimuli": ("time,frequency_hz\n1,5\n", None, "are spikes and stimuli swapped"),
+    "no header": ("0.5,3\n1,2\n", None, "line 1: expected a column .*found 0.5, 3: write the names"),
+    "the answer of a server": ("<html><body>404 not found</body></html>\n", None, "it is a web page, perhaps"),
+    "blanks between columns": ("time channel\n1 2\n", None, "separate the columns by commas, semicolons or tabs"),
+    "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "take this first line out"),
+    "times in milliseconds by name": ("time_ms,channel\n1,5\n", None, "bring the times of time_ms in seconds"),
     "blank": ("\n\n", None, "expected a header line"),
     "stimuli without times": (
         "time,channel\n1,2\n",
         "frequency_hz,x\n5,5\n",
-        "a_stimuli.csv: expected a column named stim",
+        "a_stimuli.csv, line 1: expected a column named stim",
     ),
     "electrodes as words": (
         "time,channel\n1,2\n",
         "time,electrodes\n1,left\n",
         "stimulus_electrodes: expected whole numbers separated by spaces",
     ),
-    "negative frequency": ("time,channel\n1,2\n", "time,frequency_hz\n1,-5\n", "positive frequencies .* got -5"),
+    "negative frequency": (
+        "time,channel\n1,2\n",
+        "time,frequency_hz\n1,-5\n",
+        "a_stimuli.csv, line 2: .*positive frequencies .* got -5",
+    ),
 }
 
 
@@ -381,14 +475,26 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros(3))
     (tmp_path / "empty.nwb").touch()
     for name in ("b.nwb", "b.bin"):
-        (tmp_path / name).write_bytes(b"\xff\xfe\x00binary")
+        (tmp_path / name).write_bytes(b"\x89PNG\x00binary")
+    for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
+        (tmp_path / f"p{protocol}.pkl").write_bytes(pickle.dumps({"a": 1}, protocol))
+    (tmp_path / "latin.csv").write_bytes("time,channel,µV\n1,2,3\n".encode("latin-1"))
+    (tmp_path / "sheet.csv").write_text("time,channel\n1,2\n", "utf-16")
+    (tmp_path / "m.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x01IM" + bytes(64))
+    with zipfile.ZipFile(tmp_path / "sheet.xlsx", "w") as book:
+        book.writestr("[Content_Types].xml", "<Types/>")
     (tmp_path / "a_stimuli.csv").write_text("1\n")
     for path, message in {
         "none.nwb": "no such file",
         "a.npy": "expected NPZ .* got NPY",
         "empty.nwb": "got an empty file",
         "b.nwb": "expected HDF5 in a file of this name, got something else",
-        "b.bin": "expected CSV .text in UTF-8., got something else",
+        "b.bin": "expected a recording .NWB, MaxWell, CL1, NPZ or CSV., got a file of another kind",
+        **{f"p{protocol}.pkl": "got a Python pickle, which is never read.*numpy.savez" for protocol in range(2, 6)},
+        "latin.csv": "expected CSV .text in UTF-8., .* save it as CSV in UTF-8",
+        "sheet.csv": "got text in UTF-16; save it as CSV in UTF-8",
+        "m.mat": "got a MATLAB file; save its columns as CSV or NPZ",
+        "sheet.xlsx": "got a spreadsheet; save its tables as CSV",
         "a_stimuli.csv": "expected a file of spikes, got the stimuli beside it",
         ".": "got a folder; read_recordings reads folders",
     }.items():

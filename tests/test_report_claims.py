@@ -23,7 +23,7 @@ from animat.studies.paper import paper_study
 from animat.studies.places import limits_file, table_file, write_table
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper
-from animat.studies.shown import controllability_shown
+from animat.studies.shown import comparisons_shown, controllability_shown, limits_shown
 from animat.studies.specification import Body, Simulators, Source, Study, StudyCondition
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
@@ -58,8 +58,32 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     assert "cannot be told" in _as_in_paper([ROW | {"as_in_paper": "cannot tell"}] * 2)
 
 
+def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
+    every = {"p_exact": 0.5, "effect": 0.0, "effect_low_95": -1.0, "effect_high_95": 1.0}
+    rows = [
+        ROW | every | {"outcome": outcome, "p_holm": p_holm}
+        for outcome, p_holm in ((SECOND, 0.005), (SECOND, 0.05), (FIRST, 0.05), (NONE, 1.0))
+    ]
+    shown = comparisons_shown(rows)
+    outcomes = [row[shown.head.index("outcome")] for row in shown.rows]
+    assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
+
+
 def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
+
+
+def test_limits_of_conditions_with_few_responses_are_not_taken_for_promises() -> None:
+    limit = {
+        "robot": "cartpole", "mapping": "1-threshold", "percentiles": "moving", "at_min": 0.0, "best_return": 18.9,
+        "grid_error": 0.1, "monte_carlo": 18.5, "standard_error": 0.5, "without_clock": 18.0,
+        "without_clock_standard_error": 0.5, "nodes": "1 x 2",
+    }  # fmt: skip
+    few = {"severity": "warning", "name": "few-samples", "sentence": "at 0 min: 3 responses to 5 Hz"}
+    other = {"severity": "note", "name": "drift", "sentence": "responses fall"}
+    assert "promise too much" not in limits_shown([limit], [other]).note
+    assert limits_shown([limit], [other, few]).note.endswith("where responses are few: at 0 min: 3 responses to 5 Hz.")
+    assert limits_shown([limit], [few, few, few]).note.endswith("5 Hz (and 2 more like it).")
 
 
 # --- what a limit says ----------------------------------------------------------------------------------------------

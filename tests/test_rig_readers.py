@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from animat.cultures.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.noticed import noticed
 from animat.recordings.protocol import Presentation
@@ -162,7 +163,7 @@ def test_cl1_spikes_and_stimuli_with_what_the_data_stream_says(tmp_path: Path, s
     mark = tmp_path / "unpickled"
     path = write_cl1(
         tmp_path / "a",
-        spikes=[(start + 50_000, 8), (start + 25_000, 63)],
+        spikes=[(start + 50_000, 8), (start + 25_000, 62)],
         stims=[(start + 1000, 9), (start + 1000, 12), (start + 6000, 9), (start + 11_000, 20)],
         stream=[(start + 990, packed_text(said(5, 0))), (start + 10_000, packed_text(said(40, 1)))],
         start=start,
@@ -171,8 +172,7 @@ def test_cl1_spikes_and_stimuli_with_what_the_data_stream_says(tmp_path: Path, s
     recording = read_recording(path)
     assert not mark.exists()
     assert recording.spike_times_s.tolist() == [1.0, 2.0]
-    assert recording.channels.electrode[recording.spike_channels].tolist() == [63, 8]
-    assert len(recording.channels) == 64
+    assert recording.channels.electrode[recording.spike_channels].tolist() == [62, 8]
     stimuli = recording.stimuli
     assert stimuli.time_s.tolist() == [0.04, 0.24, 0.44]
     assert stimuli.electrodes.tolist() == [[9, 12], [9, -1], [20, -1]]
@@ -180,6 +180,18 @@ def test_cl1_spikes_and_stimuli_with_what_the_data_stream_says(tmp_path: Path, s
     assert stimuli.is_last_of_presentation.tolist() == [False, True, True]
     assert recording.presentation == Presentation("mixed", 2)
     assert (recording.sampling_rate_hz, recording.duration_s) == (25_000.0, 10.0)
+
+
+def test_cl1_ground_and_reference_count_neither_in_files_nor_in_animats_own_recordings(tmp_path: Path) -> None:
+    spikes = [(5, 1), (6, 0), (7, 4), (8, 63), (9, 63), (10, 62)]
+    recording = read_recording(write_cl1(tmp_path / "a.h5", spikes=spikes, stims=[(1, 2)]))
+    own = CL1Culture().channels
+    for name in ("label", "electrode"):
+        assert getattr(recording.channels, name).tolist() == getattr(own, name).tolist()
+    assert len(recording.channels) == 64 - 5
+    assert recording.channels.electrode[recording.spike_channels].tolist() == [1, 62]
+    said = found(recording)["spikes-not-on-electrodes"]
+    assert said.startswith("4 of 6 spikes are on channels 0 (ground), 4 (reference), 63 (ground)")
 
 
 def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:

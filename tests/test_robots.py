@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.robots import ROBOTS, Navigation, Robot, robot_from_dict, robot_named, robot_to_dict
+from animat.robots import ROBOTS, Cartpole, Navigation, Robot, robot_from_dict, robot_named, robot_to_dict
 
 VARIANTS = [
     *(robot_named(name) for name in ROBOTS),
@@ -154,3 +154,20 @@ def test_bad_parameters_are_refused_with_what_was_expected(name, parameters, mes
 def test_data_of_another_form_are_refused(data: object) -> None:
     with pytest.raises(InvalidArgument, match="robot: expected"):
         robot_from_dict(data)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "robot", [Cartpole(episode_limit=12), Navigation(episode_limit=40), Cartpole(reward_upright=-1, episode_limit=12)]
+)
+def test_no_return_is_outside_of_its_range(robot: Robot) -> None:
+    low, high = robot.return_range
+    for seed in range(60):
+        key, total = jax.random.key(seed), 0.0
+        state = robot.reset(key)
+        for iteration in range(min(robot.episode_limit, 40)):
+            u = jnp.float32(1.0 if seed % 3 == 0 else np.sin(seed * iteration))
+            state, reward, terminated = robot.step(jax.random.fold_in(key, iteration), state, u)
+            total += float(reward)
+            if terminated:
+                break
+        assert low - 1e-4 <= total <= high + 1e-4

@@ -160,7 +160,8 @@ def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
 @pytest.mark.parametrize(
     ("trained", "asked", "kind", "numbers"),
     [
-        ({}, (), HistogramSimulator, 21),
+        ({}, (), MemorySimulator, None),
+        ({"kind": "histogram"}, (), HistogramSimulator, 21),
         ({"kind": "histogram", "bins": 10, "range_hz": 60.0}, (), HistogramSimulator, 11),
         ({"kind": "histogram", "bins": 10, "range_hz": 60.0}, ("--bins", "5"), HistogramSimulator, 6),
         ({"kind": "empirical", "bins": None, "range_hz": None}, (), EmpiricalSimulator, None),

@@ -25,6 +25,7 @@ LIMITS = Limits(
     phase_us=(100.0, 500.0),
     charge_per_phase=75.0,
     net_charge=10.0,
+    net_charge_per_session=90.0,
     electrodes_at_once=3,
     stimuli_per_electrode_s=4,
     stimuli_per_s=6,
@@ -51,11 +52,32 @@ def as_made(phase: Phase, limits: Limits) -> Fraction:
     return size if amplitude > 0 else -size
 
 
+def left_after(limits: Limits, left: dict[int, Fraction], stimuli: list[Stimulus]) -> list[dict[int, Fraction]]:
+    """What is left on each electrode after each of the stimuli."""
+    after = []
+    for stimulus in stimuli:
+        net = sum((as_made(p, limits) * Fraction(p.duration_us) for p in stimulus.pulse.phases), Fraction(0)) / 1000
+        left = left | {e: left.get(e, Fraction(0)) + net for e in stimulus.electrodes}
+        after.append(left)
+    return after
+
+
 def is_safe(
-    limits: Limits, sites: Sequence[int], past: list[Stimulus], request: list[Stimulus], in_session: int
+    limits: Limits,
+    sites: Sequence[int],
+    past: list[Stimulus],
+    request: list[Stimulus],
+    in_session: int,
+    left: dict[int, Fraction],
 ) -> bool:
     """Whether every limit holds for all that was delivered before and the request together, `time_s` on one clock."""
     if in_session + len(request) > limits.stimuli_per_session and request:
+        return False
+    if any(
+        abs(q) > Fraction(limits.net_charge_per_session)
+        for on in left_after(limits, left, request)
+        for q in on.values()
+    ):
         return False
     for stimulus in request:
         electrodes = list(stimulus.electrodes)
@@ -72,7 +94,7 @@ def is_safe(
             amplitude, duration = Fraction(phase.amplitude), Fraction(phase.duration_us)
             charge = as_made(phase, limits) * duration / 1000
             net += charge
-            if max(amplitude, -amplitude) > Fraction(limits.amplitude):
+            if max(abs(amplitude), abs(as_made(phase, limits))) > Fraction(limits.amplitude):
                 return False
             if duration < Fraction(limits.phase_us[0]) or duration > Fraction(limits.phase_us[1]):
                 return False
@@ -81,9 +103,9 @@ def is_safe(
             if max(charge, -charge) > Fraction(limits.charge_per_phase):
                 return False
         for before, after in itertools.pairwise(phases):
-            up, down = before.amplitude > 0 and after.amplitude > 0, before.amplitude < 0 and after.amplitude < 0
-            if limits.alternates and (up or down or before.amplitude == after.amplitude == 0):
-                return False
+            for a, b in ((before.amplitude, after.amplitude), (as_made(before, limits), as_made(after, limits))):
+                if limits.alternates and ((a > 0 and b > 0) or (a < 0 and b < 0) or a == b == 0):
+                    return False
         if max(net, -net) > Fraction(limits.net_charge):
             return False
     everything = [*past, *request]
@@ -152,18 +174,18 @@ class Requests:
         return request
 
 
-def try_requests(limits: Limits, seed: int, number: int) -> tuple[int, Counter[str]]:
+def try_requests(limits: Limits, seed: int, number: int, start_us: int = 0) -> tuple[int, Counter[str]]:
     """Put random requests before guards and the oracle; returns how many were safe, and how many not, by limit."""
     requests, safe, unsafe = Requests(seed), 0, Counter[str]()
-    history, past, now_us = History(), [], 0
-    guard = Guard(limits, SITES, history)
+    history, past, now_us = History(), list[Stimulus](), start_us
+    guard, left = Guard(limits, SITES, history), dict[int, Fraction]()
     for _ in range(number):
         if requests.rng.random() < 0.04:
-            guard = Guard(limits, SITES, history, now_us / 1_000_000)
+            guard, left = Guard(limits, SITES, history, now_us / 1_000_000), {}
         request = requests.stimuli()
         shifted = [replace(s, time_s=float(Fraction(now_us, 1_000_000) + Fraction(s.time_s))) for s in request]
         before = guard.delivered
-        expected = is_safe(limits, SITES, past, shifted, before)
+        expected = is_safe(limits, SITES, past, shifted, before, left)
         try:
             admitted = guard.admit(request, now_us / 1_000_000)
         except UnsafeStimulus as error:
@@ -176,6 +198,7 @@ def try_requests(limits: Limits, seed: int, number: int) -> tuple[int, Counter[s
             assert guard.delivered == before + len(request)
             # All that is less than a second back is among the last of them.
             past = [*past, *shifted][-3 * limits.stimuli_per_s :]
+            left = left_after(limits, left, request)[-1] if request else left
             safe += 1
         last_us = round(request[-1].time_s * 1_000_000) if request else 0
         now_us += last_us + int(requests.pick(750, 1000, 100_000, 200_000, 500_000, 1_000_000))
@@ -194,7 +217,7 @@ def check_counts(limits: Limits, safe: int, unsafe: Counter[str], least: int) ->
         "sites",
         "overlap",
     }
-    known |= {"stimuli_per_s", "stimuli_per_session"}
+    known |= {"stimuli_per_s", "stimuli_per_session", "net_charge_per_session"}
     # On a device an interval keeps the rate on an electrode, and rounding is part of the limits on charge.
     known |= {"stimuli_per_electrode_s"} if limits is LIMITS else {
         "phases_per_pulse", "phase_step_us", "alternates", "interval_us", "gap_us",
@@ -206,6 +229,13 @@ def check_counts(limits: Limits, safe: int, unsafe: Counter[str], least: int) ->
 def test_no_unsafe_request_passes_and_no_safe_one_is_refused(limits: Limits) -> None:
     safe, unsafe = try_requests(limits, 0, 5_000)
     check_counts(limits, safe, unsafe, 1_000)
+
+
+@pytest.mark.parametrize("limits", [LIMITS, DEVICE], ids=["simulated", "device"])
+@pytest.mark.parametrize("start_s", [10_000, 100_000])
+def test_its_arithmetic_holds_after_long_sessions(limits: Limits, start_s: int) -> None:
+    safe, unsafe = try_requests(limits, start_s, 1_000, start_us=1_000_000 * start_s + 7)
+    assert min(safe, unsafe.total()) > 200
 
 
 @pytest.mark.oracle

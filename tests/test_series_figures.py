@@ -54,12 +54,29 @@ def test_the_array_shows_every_site_and_counts_what_it_cannot_place(recordings: 
     assert len(axes.collections[0].get_offsets()) == 64
     # Made-up cultures stimulate electrodes that no channel reads.
     assert len(axes.collections) == 1
-    assert "32 stimulated electrodes that no channel reads are not drawn" in axes.get_title(loc="left")
+    assert "32 stimulated electrodes that no channel reads are not drawn" in axes.figure.get_suptitle()
     unknown = recordings[0].channels.x_um.copy()
     unknown[:3] = np.nan
     some = draw_array(replace(recordings[0], channels=replace(recordings[0].channels, x_um=unknown))).axes[0]
     assert len(some.collections[0].get_offsets()) == 61
-    assert "3 channels of unknown position" in some.get_title(loc="left")
+    assert "3 channels of unknown position" in some.figure.get_suptitle()
+
+
+@pytest.mark.parametrize(("width_um", "height_um"), [(3800, 2100), (1200, 1800), (700, 2100), (0, 0)])
+def test_the_arrays_title_is_whole_and_little_of_the_figure_is_empty(
+    recordings: list[Recording], width_um: float, height_um: float
+) -> None:
+    rng = np.random.default_rng(0)
+    channels = replace(recordings[0].channels, x_um=width_um * rng.random(64), y_um=height_um * rng.random(64))
+    figure = draw_array(replace(recordings[0], channels=channels))
+    figure.canvas.draw()
+    whole = figure.bbox
+    title = figure._suptitle.get_window_extent()
+    assert title.x0 >= whole.x0 and title.x1 <= whole.x1
+    assert title.y1 <= whole.y1
+    if width_um:
+        drawn = figure.axes[0].get_tightbbox().width + figure.axes[1].get_tightbbox().width
+        assert drawn > 0.45 * whole.width
 
 
 def test_a_selection_shows_its_sites_with_their_numbers() -> None:

@@ -162,3 +162,11 @@ def test_refusals_name_the_argument() -> None:
         holm({"a": 1.5})
     with pytest.raises(InvalidArgument, match="u:"):
         p_of_u(101, 10, 10)
+
+
+def test_the_interval_ends_where_the_numbers_can_be_no_larger() -> None:
+    free, bound = (interquartile_mean([100.0, 118.0, 119.0, 120.0], **on) for on in ({}, {"within": (-100.0, 120.0)}))
+    assert free.high > 120 == bound.high
+    assert (bound.low, bound.value) == (free.low, free.value)
+    assert interquartile_mean([3.0], within=(0.0, 5.0)).low == 0.0
+    assert interquartile_mean([3.0], within=(0.0, 5.0)).high == 5.0

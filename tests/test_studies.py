@@ -562,7 +562,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
         assert f"<dt>{decision}</dt>" in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
-        "scores", "comparisons", "controls", "learning-curves", "limits", "controllability", "findings",
+        "scores", "comparisons", "controls", "heuristic", "learning-curves", "limits", "controllability", "findings",
         "culture-array", "culture-psth", "culture-bursts", "culture-conditions", "culture-drift",
         "navigation-learning", "navigation-over-time",
     }  # fmt: skip
@@ -751,8 +751,48 @@ COMPARED = (
         ("[simulators]\nrange_hz = -5", "simulators.range_hz: expected a positive number, got -5"),
         ("[simulators]\nwindow_ms = [10, 2]", "simulators.window_ms: expected 0 <= start < end"),
         ("[simulators]\nburst_threshold = 7", "simulators.burst_threshold: expected a share of channels from 0 to 1"),
-        ("[simulators]\ndespite = ['drift']", "simulators.despite: expected findings among no-stimuli"),
+        (
+            "[simulators]\ndespite = ['drift']\nallow = []",
+            "simulators.despite: expected allow alone, which it was called before, got both",
+        ),
+        ("[simulators]\ndespite = ['drift']", "simulators.allow: expected findings among no-stimuli"),
         ("[simulators]\nconditions = 'bogus'", "simulators.conditions: expected one of all, frequency"),
+        *[
+            (f"{table}{name} = {10**18}", f"{name}: expected at most")
+            for table, name in (
+                ("", "policies"),
+                ("", "episodes"),
+                ("", "episodes_over_time"),
+                ("", "limit_episodes"),
+                ("[culture]\n", "sessions"),
+                ("[culture]\n", "presentations"),
+                ("[culture]\nkind = 'made-up'\n", "channels"),
+                ("[[robots]]\nname = 'cartpole'\n", "iterations"),
+                ("[algorithm]\n", "hidden"),
+                ("[algorithm]\n", "environments"),
+            )
+        ],
+        ("policies = 1000\nepisodes = 5001", "episodes: expected at most 5,000,000 of all policies together"),
+        (
+            "policies = 1000\nconditions = [{name = 'a'}, {name = 'b'}]\nrobots = ["
+            + ", ".join(f"{{name = 'r{i}', kind = 'cartpole'}}" for i in range(11))
+            + "]",
+            "policies: expected at most 20,000 in a study, got 22,000",
+        ),
+        ("limit_resolution = 3.0", "limit_resolution: expected a number from 0.1 to 2, got 3"),
+        ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
+        ("[culture]\nkind = 'made-up'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
+        (f"policies = {'9' * 5000}", "expected TOML, got a mistake: Exceeds the limit (4300 digits)"),
+        (f"policies = 0x{'f' * 5000}", "policies: expected at most 1,000, got a number of 20,000 bits"),
+        (f"training_min = 0x{'f' * 5000}", "training_min: expected a number, got a number of 20,000 bits"),
+        (f"title = {'[' * 20_000}", "nested without end"),
+        (f"title = {'{a=' * 20_000}", "nested without end"),
+        (f"{'a.' * 20_000}b = 1", "a: no such setting at the top"),
+        ("'a\\nb' = 1", "a\\nb"),
+        (f"robots = [{'1,' * 1001}]", "robots: expected at most 1,000 entries, got 1,001"),
+        ("#" * 2**20 + "\n", "expected at most 1,048,576 bytes"),
+        ("[culture]\nkind = 'files'\nfiles = ['']", "culture.files: expected names of files, got ''"),
+        ('[culture]\nkind = "files"\nfiles = ["a\\u0000b"]', "culture.files: expected names of files"),
         (COMPARED.format("nan"), "comparisons.at_min: expected finite minutes, got nan"),
         (COMPARED.format("500"), "comparisons.at_min: expected a minute of the recordings, from 0 to 140, got 500"),
         (COMPARED.format("-20"), "comparisons.at_min: expected a minute of the recordings, from 0 to 140, got -20"),
@@ -768,6 +808,25 @@ def test_mistakes_in_a_specification_are_told_in_one_line(
     assert said in error and "study.toml: " in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("file", ["/dev/zero", "pipe", "folder", "none.nwb", "a" * 5000])
+def test_files_that_cannot_be_recordings_are_told_in_one_line(
+    file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / "study.toml"
+    path.write_text(f"[culture]\nkind = 'files'\nfiles = ['{file}']")
+    assert main(["study", str(path), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and file[:100] in error and not (tmp_path / "out").exists()
+
+
+def test_the_page_states_the_bounds_of_a_study() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
+    for stated in ("1,000", "20,000", "10,000", "5,000,000", "1,000,000", "1,024", "2,000,000,000", "a year", "1 MiB"):
+        assert stated in page
 
 
 def test_choices_are_checked_from_python_too() -> None:
@@ -821,7 +880,7 @@ def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> 
     Record(tmp_path).run(one, tmp_path / "study", lambda share, words: None)
     with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more .* got one \(all\)"):
         Fit().run(one, tmp_path / "study", lambda share, words: None)
-    knowing = replace(one, simulators=Simulators(conditions="all", despite=("one-condition",)))
+    knowing = replace(one, simulators=Simulators(conditions="all", allow=("one-condition",)))
     kept, _ = Fit().run(knowing, tmp_path / "study", lambda share, words: None)
     assert len(load_timeline(kept).conditions) == 1
 

@@ -28,7 +28,7 @@ from animat.writing import alone_in
 from test_simulator import responses_of
 
 SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
-SHORT = Training(Cartpole(), Thresholds(1), policies=3, iterations=6_000, algorithm=SMALL)
+SHORT = Training(Cartpole(), Thresholds(1), policies=3, iterations=6_000, duration_min=60.0, algorithm=SMALL)
 
 
 def timeline_of(minutes: tuple[float, ...] = (0.0, 10.0, 20.0), seed: int = 0, **fit: Any) -> SimulatorTimeline:

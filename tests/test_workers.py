@@ -13,14 +13,15 @@ from animat.studies.executor import Event, Processes
 from animat.studies.jobs import Job, Task
 from animat.studies.specification import Study
 from animat.studies.toml import read_study
-from worker_tasks import Die, Fail, Stumble, TellProcess
+from worker_tasks import Die, Fail, Starve, Stumble, TellProcess
 
 STUDY = Study()
 
 
 @pytest.fixture
 def tasks_importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    found = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(Path(__file__).parent), *found])))
 
 
 def run(at: Processes, task: Task, folder: Path) -> list[Event]:
@@ -57,6 +58,17 @@ def test_an_error_that_nobody_foresaw_is_told_in_one_line_and_the_worker_goes_on
         assert run(at, TellProcess(), tmp_path)[-1].kind == "done"
     finally:
         at.close()
+
+
+@pytest.mark.usefixtures("tasks_importable")
+def test_where_memory_is_too_little_the_settings_that_ask_for_it_are_named(tmp_path: Path) -> None:
+    at = Processes(workers=1)
+    try:
+        failed = run(at, Starve(), tmp_path)[-1]
+    finally:
+        at.close()
+    expected = "out of memory (256. PiB more were asked for): it grows with policies (10), culture.channels (256): ask"
+    assert failed.kind == "failed" and failed.words.startswith(expected)
 
 
 @pytest.mark.usefixtures("tasks_importable")

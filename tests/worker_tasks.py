@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from animat.errors import InvalidFile
 from animat.studies.jobs import Report, Task
 from animat.studies.specification import Study
@@ -50,3 +52,14 @@ class Stumble(Task):
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         raise TypeError("expected an int, got a float\nand so on")
+
+
+@dataclass(frozen=True)
+class Starve(Task):
+    """Asks numpy for more memory than any machine has."""
+
+    grows_with = ("policies", "culture.channels")
+
+    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        np.zeros(2**58, np.uint8)
+        return []

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import io
 import itertools
 import json
 import math
+import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, cast, get_args
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, subcommand
+from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from animat.cli_convert import Convert
 from animat.cli_inspect import Inspect
@@ -24,7 +27,7 @@ from animat.cli_record import Record
 from animat.cli_studies import Reproduce, StudyFile
 from animat.cli_train import Evaluate, Train
 from animat.ctrl_c import heard_everywhere
-from animat.errors import AnimatError, InvalidArgument
+from animat.errors import AnimatError, InvalidArgument, out_of_memory
 
 Command = (
     Annotated[Record, subcommand("record")]
@@ -42,9 +45,42 @@ Command = (
 COMMANDS = tuple(command.__metadata__[0].name for command in get_args(Command))
 
 
+_LESS: dict[type, str] = {
+    Evaluate: "ask for fewer episodes (--episodes {episodes})",
+    Run: "ask for fewer episodes (--episodes {episodes})",
+    Live: "ask for fewer episodes (--episodes {episodes}) or policies (--policies {policies})",
+    Record: "ask for fewer presentations or pulses (--presentations, --pulses, or those of --protocol)",
+    Train: "ask for fewer bins (--bins), or give fewer recordings (--recordings)",
+    Inspect: "inspect fewer recordings at once",
+}
+"""What a command's memory grows with, and what was asked for."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    # Streams that were closed are None, which the parser and others do not expect: what is written goes nowhere.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    try:
+        try:
+            return _run(sys.argv[1:] if arguments is None else list(arguments))
+        finally:
+            # Here, where it can be caught, rather than as Python exits: help ends with SystemExit.
+            sys.stdout.flush()
+    except OSError as error:
+        is_closed = isinstance(error, BrokenPipeError)
+        # That of a file has its name, and that of a connection a type of its own.
+        if not is_closed and (type(error) is not OSError or error.filename is not None):
+            raise
+        # What is still to be written goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if is_closed:
+            return 141
+        print(f"animat: standard output: cannot be written: {error.strerror or error}", file=sys.stderr)
+        return 1
+
+
+def _run(given: list[str]) -> int:
     if given == ["--version"]:
         print(f"animat {importlib.metadata.version('animat')}")
         return 0
@@ -61,23 +97,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say_notes(error)
         return 1
     except KeyboardInterrupt as error:
+        kept = "" if isinstance(command, Inspect | Convert | Evaluate) else "; what was finished is kept"
         again = "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile) else ""
-        print(f"animat: interrupted; what was finished is kept{again}", file=sys.stderr)
+        print(f"animat: interrupted{kept}{again}", file=sys.stderr)
         _say_notes(error)
         return 130
     except BrokenPipeError:
-        # Whoever read the output closed it; Python would complain once more while exiting.
-        sys.stderr.close()
-        return 141
+        raise
     except Exception as error:
-        # JAX has an error of its own for it, which is not imported for this.
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+        words = out_of_memory(error)
+        if words is None:
             raise
-        print("animat: out of memory: ask for fewer episodes, policies or stimuli at once", file=sys.stderr)
+        remedy = _LESS.get(type(command), "use a machine with more memory").format(**vars(command))
+        print(f"animat: {words}: {remedy}", file=sys.stderr)
         return 1
     if command.json:
         print(json.dumps(_as_json(results)))
-    return 0
+    # Of several files, some of which could not be read, as was said on the way.
+    return 1 if results.get("unreadable") else 0
 
 
 def _parse(
@@ -96,7 +133,8 @@ def _parse(
                 prog="animat",
                 description="Drive a robot with a living neuronal culture.",
                 args=arguments,
-                config=(FlagCreatePairsOff, OmitArgPrefixes),
+                config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
+                registry=_options(),
             )
     except SystemExit as stop:
         if not stop.code:
@@ -108,13 +146,39 @@ def _parse(
         raise InvalidArgument(f"{_told(what)}; see animat {' '.join(arguments[:1])} --help") from None
 
 
+def _options() -> ConstructorRegistry:
+    """Rules by which options are read and told: of one that need not be given, the help says what is done without."""
+    registry = ConstructorRegistry()
+    within = False
+
+    @registry.struct_rule
+    def rule(command: StructTypeInfo) -> StructConstructorSpec | None:
+        nonlocal within
+        if within or not dataclasses.is_dataclass(command.type):
+            return None
+        within = True  # What else would ask this rule again.
+        spec = ConstructorRegistry.get_struct_spec(command)
+        within = False
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        fields = (
+            dataclasses.replace(field, type=cast(Any, Annotated[field.type, arg(help_behavior_hint="")]))
+            if field.default is None or field.default == ()
+            else field
+            for field in spec.fields
+        )
+        return dataclasses.replace(spec, fields=tuple(fields))
+
+    return registry
+
+
 _WORDS = (
     (
-        r"Error parsing (\S+): (?:no type matching \{None\}\|INT .*? from|invalid literal .*? 10:) \[?('[^']*').*",
+        r"Error parsing (\S+): (?:no type matching INT .*? from|invalid literal .*? 10:) \[?('[^']*').*",
         "whole number",
     ),
     (
-        r"Error parsing (\S+): (?:no type matching \{None\}\|FLOAT .*? from|could not convert .*?:) \[?('[^']*').*",
+        r"Error parsing (\S+): (?:no type matching FLOAT .*? from|could not convert .*?:) \[?('[^']*').*",
         "number",
     ),
 )

@@ -8,6 +8,8 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from animat.writing import expect_writable
+
 
 @dataclass(frozen=True)
 class Convert:
@@ -50,7 +52,7 @@ class Convert:
     raw: bool = False
     """Find the spikes in the raw traces, in place of those that the rig found"""
     reader: str | None = None
-    """Find the spikes in traces of another format, by its name in SpikeInterface (animat[raw]), such as intan"""
+    """Find the spikes in traces of another format, by its name in SpikeInterface (to be installed), such as intan"""
     band_hz: tuple[float, float] = (100.0, 3000.0)
     """Pass band of the filter for finding spikes; 0 0: the traces are filtered already"""
     threshold: float = 5.0
@@ -71,6 +73,7 @@ class Convert:
         from animat.recordings.detection.settings import Detection
         from animat.recordings.noticed import noticed
 
+        expect_writable(self.out.parent)
         detection = Detection(
             band_hz=None if self.band_hz == (0, 0) else self.band_hz,
             threshold=self.threshold,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli_responses import Responding, say_findings
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
+from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.conditions import Conditions
+    from animat.neurons.inspection import Inspection
     from animat.neurons.responses import Responses
     from animat.progress import Progress
+    from animat.recordings.recording import Recording
+    from animat.recordings.response_table import ResponseTable
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,19 @@ class Inspect(Responding):
 
     def run(self) -> dict[str, Any]:
         """Inspect each file."""
+        from animat.neurons.bursts import check_threshold
         from animat.neurons.conditions import conditions_named
+        from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings
         from animat.report.inspection import figure_stem
 
+        if self.out is not None:
+            expect_writable(self.out)
         by = None if self.conditions is None else conditions_named(self.conditions)
+        window_ms = self.window_ms or DEFAULT_WINDOW_MS
+        check_window(window_ms)
+        check_threshold(self.burst_threshold)
         files = list_recordings(self.recordings)
         # The figures of the series have a name of their own.
         stems = ["series", *(figure_stem(file.name) for file in files)]
@@ -55,25 +67,32 @@ class Inspect(Responding):
                 "inspect them apart, or rename one"
             )
         with Bar("inspecting") as progress:
-            return self._inspect(files, by, progress)
+            return self._inspect(files, by, window_ms, progress)
 
-    def _inspect(self, files: Sequence[Path], by: Conditions | None, progress: Progress) -> dict[str, Any]:
-        from animat.neurons.inspection import inspect_recording
-        from animat.recordings.reading import read_recording
+    def _inspect(
+        self, files: Sequence[Path], by: Conditions | None, window_ms: tuple[float, float], progress: Progress
+    ) -> dict[str, Any]:
+        from animat.recordings.reading import read_source
+        from animat.recordings.recording import Recording
         from animat.report.inspection import draw_inspection, inspection_text
         from animat.report.series import draw_series
 
-        inspected, series = [], []
+        inspected, series, unreadable = [], [], []
         # Reading is one step of each file, drawing another, and the figures of the series are the last.
         steps = 1 if self.out is None else 2
         total = steps * len(files) + (self.out is not None)
         for number, file in enumerate(files):
             progress.update(steps * number, total, file.name)
-            recording = read_recording(file, stimuli=self.stimuli, part=self.part)
             try:
-                inspection = inspect_recording(recording, by, self.window_ms, self.burst_threshold, file.name)
-            except UnusableData as error:
-                raise UnusableData(f"{file}: {error}") from error
+                source = read_source(file, stimuli=self.stimuli, part=self.part)
+                inspection = _inspected(source, by, window_ms, self.burst_threshold, file)
+            except AnimatError as error:
+                if len(files) == 1:
+                    raise
+                # The others may be whole.
+                print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+                unreadable.append(str(file))
+                continue
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.limit is not None:
@@ -81,21 +100,44 @@ class Inspect(Responding):
                 inspected[-1]["limits"] = _limits(self.limit, inspection.responses)
             if self.out is not None:
                 progress.update(steps * number + 1, total, f"{file.name}, figures")
-                figures = [str(figure) for figure in draw_inspection(recording, inspection, self.out, self.format)]
+                figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
                 print(f"figures: {', '.join(figures)}\n")
                 inspected[-1]["figures"] = figures
-                series.append((recording.start_min, file, inspection.responses))
-        if self.out is None or not series:
-            return {"recordings": inspected}
-        progress.update(total - 1, total, "figures of the series")
-        first = read_recording(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
-        try:
-            figures = [str(figure) for figure in draw_series(first, [one[2] for one in series], self.out, self.format)]
-        except Mismatch as unlike:
-            print(f"no figures of the series: {unlike}")
-            return {"recordings": inspected}
-        print(f"figures of the series: {', '.join(figures)}")
-        return {"recordings": inspected, "figures": figures}
+                series.append((source.start_min, file, inspection.responses))
+        told: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable}
+        if self.out is not None and series:
+            progress.update(total - 1, total, "figures of the series")
+            first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
+            try:
+                drawn = draw_series(
+                    first if isinstance(first, Recording) else None, [one[2] for one in series], self.out, self.format
+                )
+            except Mismatch as unlike:
+                print(f"no figures of the series: {unlike}")
+            else:
+                if drawn:
+                    print(f"figures of the series: {', '.join(map(str, drawn))}")
+                told["figures"] = [str(figure) for figure in drawn]
+        if unreadable:
+            others = "; the others were" if inspected else ""
+            count = f"{len(unreadable)} of {len(files)} files could not be inspected"
+            print(f"animat: {count}, as said above{others}", file=sys.stderr)
+        return told
+
+
+def _inspected(
+    source: Recording | ResponseTable,
+    by: Conditions | None,
+    window_ms: tuple[float, float],
+    burst_threshold: float | None,
+    file: Path,
+) -> Inspection:
+    from animat.neurons.inspection import inspect_recording
+
+    try:
+        return inspect_recording(source, by, window_ms, burst_threshold, file.name)
+    except (UnusableData, Mismatch) as error:
+        raise type(error)(f"{file}: {error}") from error
 
 
 def _limits(robot: str, responses: Responses) -> list[dict[str, Any]] | None:

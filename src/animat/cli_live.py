@@ -25,15 +25,15 @@ class Live(Stimulating):
 
     robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
     """The robot to drive"""
-    mapping: Literal["1-threshold", "9-thresholds", "linear"] = "1-threshold"
+    mapping: Literal["1-threshold", "9-thresholds", "linear"] = "9-thresholds"
     """From responses to motor commands"""
-    policies: int = 5
+    policies: int = 4
     """How many policies, each from its own random numbers"""
     order: Literal["mixed", "blocked"] = "mixed"
     """How recordings are presented; mixed is how a closed loop presents"""
-    pulses: int = 5
+    pulses: int = 1
     """Pulses a presentation, the last one read"""
-    presentations: int = 100
+    presentations: int = 500
     """Of each frequency in a recording"""
     interval_min: float = 10.0
     """Minutes of the culture's clock from one recording to the next"""
@@ -43,12 +43,13 @@ class Live(Stimulating):
     """Minutes of the culture's clock in one of ours; default: 30 for a simulated culture, 1 for a living one"""
     episodes: int = 5
     """Of each policy in closed loop, at the end"""
-    controls: Literal["all", "random"] = "random"
+    controls: Literal["all", "random"] = "all"
     """Run between the policies' episodes"""
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are held from the first recording"""
-    simulator: Literal["histogram", "empirical", "memory"] = "histogram"
-    """histogram: bins (the paper); empirical: a measured value; memory: one with a like past"""
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """memory: draw a response that was measured after a like past, the default but for recordings in blocks; histogram:
+    the paper's; empirical: draw any measured value"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
     seed: int = 1

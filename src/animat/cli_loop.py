@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -94,8 +94,8 @@ class Run(Stimulating):
     range_hz: float | None = None
     """Bins equally wide from 0 to here, in Hz (the paper: 120); default: as the policies were trained"""
     burst_threshold: float | None = None
-    """Share of active channels above which a response is a burst; 1: none is; default: as in the recording"""
-    despite: tuple[str, ...] = ()
+    """Share of active channels above which a response is a burst; 1: none is; default: as the policies were trained"""
+    allow: tuple[str, ...] = ()
     """Findings on the recordings to go on in spite of, by name"""
     real_time: bool = False
     """Hold a simulated culture back to real time; a living one always runs in it"""
@@ -114,6 +114,7 @@ class Run(Stimulating):
 
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
+        from animat.closed_loop.running import check_episodes
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.mapping import N_PERCENTILES
@@ -124,14 +125,13 @@ class Run(Stimulating):
         from animat.training.policy import load_policies
 
         # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
-        if self.episodes < 1:
-            raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
+        check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         policies = load_policies(self.policies)
         first = check_policies(policies)
         fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
-        if fit["kind"] == "histogram":
+        if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
         Loop.of_policy(first, np.zeros(N_PERCENTILES), **settings)
@@ -220,12 +220,12 @@ class Run(Stimulating):
         """The culture as it is now, presented as the policies' recordings were."""
         from animat.cultures.kinds import pulse_for
         from animat.live.recording import record_within
-        from animat.recordings.protocol import Presentation, Protocol
+        from animat.recordings.protocol import CLOSED_LOOP, PAPER
 
-        presentation = first.presentation or Presentation("mixed")
-        protocol = Protocol(
-            tuple(condition.value for condition in first.conditions),
-            order=presentation.order,
+        presentation = first.presentation or CLOSED_LOOP.presentation
+        protocol = replace(
+            PAPER if presentation.order == "blocked" else CLOSED_LOOP,
+            frequencies_hz=tuple(condition.value for condition in first.conditions),
             pulses=presentation.pulses,
             patterns=min(100, len(culture.patterns)),
             pulse=pulse_for(self.culture),
@@ -237,14 +237,16 @@ class Run(Stimulating):
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:
         from animat.neurons.series import extract_series
+        from animat.neurons.windows import DEFAULT_WINDOW_MS
         from animat.reality_gap import Calibration
 
+        trained = first.fitted.get("burst_threshold")
         series = extract_series(
             recordings,
             _frequencies(recordings, first),
-            window_ms=first.window_ms or (2.0, 10.0),
-            burst_threshold=self.burst_threshold,
-            despite=self.despite,
+            window_ms=first.window_ms or DEFAULT_WINDOW_MS,
+            burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
+            allow=self.allow,
         )
         return Calibration.of_series(
             series, first, at_min=at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
@@ -263,8 +265,10 @@ class Recover:
     def run(self) -> dict[str, Any]:
         """Recover."""
         from animat.closed_loop.session import recover_session, told_unanswered
+        from animat.progress import Bar
 
-        session = recover_session(self.session)
+        with Bar("reading the log") as progress:
+            session = recover_session(self.session, progress)
         told = session.to_dict()
         print(
             f"{session.recording_file} and {session.ticks_file.name}: {told['ticks']} ticks, {told['pulses']} pulses; "

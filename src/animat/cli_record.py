@@ -28,18 +28,21 @@ class Record:
     """For a maxone: the file of its electrodes"""
     seed: int = 1
     """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
-    sessions: int = 15
-    """How many recordings"""
+    paper: bool = False
+    """The paper's protocol: blocks of one frequency, 100 presentations of each, 15 recordings; default: what a closed
+    loop needs, frequencies mixed, 500 presentations of each, 2 recordings"""
+    sessions: int | None = None
+    """How many recordings; default: 2, with --paper 15"""
     interval_min: float = 10.0
     """Minutes from one recording to the next"""
     order: Literal["blocked", "mixed"] | None = None
-    """blocked: all stimuli of a frequency together (the paper), the default; mixed: shuffled, as in a closed loop"""
+    """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
-    """Pulses a presentation, the last one read; for a closed loop: mixed with 5; default: 1"""
+    """Pulses a presentation, the last one read; default: 1"""
     presentations: int | None = None
-    """Presentations at each frequency; default: 100"""
+    """Presentations at each frequency; default: 500, with --paper 100"""
     protocol: Path | None = None
-    """A file of JSON in place of these three, as Protocol.to_json writes it, with frequencies, times and pulse too"""
+    """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too"""
     out: Path = Path("recordings")
     """Folder for the files"""
     json: bool = False
@@ -63,6 +66,7 @@ class Record:
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         asked = [f"--{name}" for name in ("order", "pulses", "presentations") if getattr(self, name) is not None]
+        asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
         if self.protocol is not None and self.culture != "made-up":
@@ -86,7 +90,7 @@ class Record:
             )
         with alone_in(self.out):
             return write_made_up_series(
-                self.seed, self.out, sessions=self.sessions, interval_min=self.interval_min, progress=progress
+                self.seed, self.out, sessions=self._sessions, interval_min=self.interval_min, progress=progress
             )
 
     def _virtual(self, progress: Progress) -> list[Path]:
@@ -97,7 +101,7 @@ class Record:
             lambda: VirtualCulture(self.seed, progress=progress),
             self._protocol(),
             self.out,
-            sessions=self.sessions,
+            sessions=self._sessions,
             interval_min=self.interval_min,
             progress=progress,
         )
@@ -111,7 +115,7 @@ class Record:
 
         assert self.culture != "made-up"
         # What can be refused is refused before a culture is opened, whose patterns are not known until then.
-        check_interval(self._protocol(), self.sessions, self.interval_min)
+        check_interval(self._protocol(), self._sessions, self.interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
         with (
             # Held before a device is opened, which stops whatever another run has it do.
@@ -123,7 +127,7 @@ class Record:
                 culture,
                 self._protocol(len(culture.patterns)),
                 self.out,
-                sessions=self.sessions,
+                sessions=self._sessions,
                 interval_min=self.interval_min,
                 seed=self.seed,
                 progress=progress,
@@ -132,13 +136,22 @@ class Record:
             print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
         return series.files
 
+    @property
+    def _sessions(self) -> int:
+        if self.sessions is not None:
+            return self.sessions
+        # Made-up recordings are the paper's.
+        return 15 if self.paper or self.culture == "made-up" else 2
+
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
         from animat.cultures.kinds import pulse_for
-        from animat.recordings.protocol import Protocol, read_protocol
+        from animat.recordings.protocol import CLOSED_LOOP, PAPER, read_protocol
 
         assert self.culture != "made-up"
-        usual = Protocol(patterns=min(100, patterns), pulse=pulse_for(self.culture))
+        # What a file leaves out is the paper's: it stands alone.
+        paper = self.paper or self.protocol is not None
+        usual = replace(PAPER if paper else CLOSED_LOOP, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
         asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}

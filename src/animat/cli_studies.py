@@ -61,6 +61,7 @@ class StudyFile:
 
 def _run(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
     from animat.progress import Bar
+    from animat.studies.heuristic import not_outperforming
     from animat.studies.places import read_table, table_file
     from animat.studies.run import run_study
 
@@ -84,6 +85,9 @@ def _run(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, 
             f"{row['robot']:11} {row['comparison']:28} {row['mean_first']:8.1f} {row['mean_second']:8.1f}  "
             f"U {row['u']:<4g} p {row['p_normal']:<9.3g} {row['outcome']}{paper}"
         )
+    beside = not_outperforming(ran.folder)
+    for sentence in beside:
+        print(sentence)
     if ran.done_now:
         print(f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s; report: {ran.report}")
     else:
@@ -94,4 +98,5 @@ def _run(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, 
         "jobs": ran.jobs,
         "done_now_cpu_s": ran.done_now,
         "comparisons": comparisons,
+        "not_outperforming_the_heuristic": beside,
     }

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,6 +12,7 @@ from tyro.conf import Positional
 
 from animat.cli_responses import Fitting, say_findings
 from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
@@ -26,18 +26,21 @@ class Train(Fitting):
     """The robot to drive"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""
-    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] = "1-threshold"
-    """From responses to motor commands; none: the baseline without neurons"""
-    policies: int = 10
-    """How many policies, each from its own random numbers"""
+    paper: bool = False
+    """The paper's setting: 1-threshold, histogram, 10 policies, 60 minutes; default: what works in a closed loop"""
+    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] | None = None
+    """From responses to motor commands; none: the baseline without neurons; default: 9-thresholds, with --paper
+    1-threshold"""
+    policies: int | None = None
+    """How many policies, each from its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
-    """Training iterations of each; default: the paper's, 800000 for cartpole and 500000 for navigation"""
+    """Training iterations of each; default: 400000 for cartpole, 250000 for navigation, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
     shadowing: Literal["on", "off"] = "on"
     """on: refresh the simulators during training (parameter shadowing); off: the first one throughout"""
-    duration_min: float = 60.0
-    """Minutes of the culture's clock that training stands for"""
+    duration_min: float | None = None
+    """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are held from the first recording"""
     delivery: Literal["chosen", "shuffled"] = "chosen"
@@ -61,28 +64,33 @@ class Train(Fitting):
         # What can be refused is refused before recordings are read, which can take a while.
         if self.workers is not None and self.workers < 1:
             raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
+        if not self.out.is_dir():
+            expect_writable(self.out)
         robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
+        usual = _PAPER if self.paper else _USUAL
+        mapping = self.mapping or usual["mapping"]
         training = Training(
             robot=robot,
-            mapping=None if self.mapping == "none" else mapping_named(self.mapping),
-            policies=self.policies,
-            iterations=robot.paper_iterations if self.iterations is None else self.iterations,
+            mapping=None if mapping == "none" else mapping_named(mapping),
+            policies=usual["policies"] if self.policies is None else self.policies,
+            iterations=usual["share"] * robot.paper_iterations // 100 if self.iterations is None else self.iterations,
             seed=self.seed,
             shadowing=self.shadowing == "on",
-            duration_min=self.duration_min,
+            duration_min=usual["duration_min"] if self.duration_min is None else self.duration_min,
             percentiles=self.percentiles,
             delivery=self.delivery,
-            commands=(-1.0, 1.0) if self.mapping == "none" and self.robot == "cartpole" else None,
+            commands=(-1.0, 1.0) if mapping == "none" and self.robot == "cartpole" else None,
         )
         for caveat in robot.caveats():
             print(f"warning: {caveat}", file=sys.stderr)
-        timeline = None if self.mapping == "none" else self.timeline(self.recordings)
+        fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
+        timeline = None if mapping == "none" else fitting.timeline(self.recordings)
 
-        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.despite:
+        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.allow:
             raise UnusableData(
                 "--conditions: expected two or more for an agent to choose from, got one "
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
-                "(to go on in spite of it: --despite one-condition)"
+                "(to go on in spite of it: --allow one-condition)"
             )
         from animat.training.trainer import train
 
@@ -97,11 +105,30 @@ class Train(Fitting):
                 progress=progress,
                 sources=[str(path) for path in self.recordings],
             )
-        last = {name: policy.learning_curve[-1, 2].item() for name, policy in trained.items()}
-        known = [mean for mean in last.values() if math.isfinite(mean)]
-        ended = f"{sum(known) / len(known):.1f}" if known else "not known, as no episode ended then"
-        print(f"{len(trained)} policies in {self.out}; mean return at the end of training, over policies: {ended}")
-        return {"policies": [str(self.out / f"{name}.safetensors") for name in trained], "last_returns": last}
+        from animat.evaluation.table import evaluate
+
+        first = next(iter(trained.values()))
+        until = None if timeline is None else first.trained_until_min(float(timeline.start_min[0]))
+        evaluation = evaluate(trained, timeline, at_min=until, controls=("random",))
+        say_findings(evaluation.findings)
+        policies, random = (row.to_dict() for row in evaluation.rows)
+        on = "" if evaluation.recorded_at_min is None else f" on the simulator at {evaluation.recorded_at_min:g} min"
+        error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
+        counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
+        mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{random['mean_return']:.1f}"
+        print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
+        return {
+            "policies": [str(self.out / f"{name}.safetensors") for name in trained],
+            "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
+            "random": random["mean_return"],
+            "recorded_at_min": evaluation.recorded_at_min,
+            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in evaluation.findings],
+        }
+
+
+_USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
+"""What works in a closed loop; `share`: of the paper's iterations, in per cent."""
+_PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
 
 
 @dataclass(frozen=True)
@@ -130,18 +157,18 @@ class Evaluate(Fitting):
     def run(self) -> dict[str, Any]:
         """Evaluate."""
         from animat.compilation import keep_compilations
+        from animat.evaluation.rollouts import check_at_once
         from animat.progress import Bar
         from animat.training.policy import load_policies
 
-        if self.episodes < 1:
-            raise InvalidArgument(f"--episodes: expected at least 1, got {self.episodes}")
         policies = load_policies(self.policies)
+        check_at_once("--episodes", self.episodes, len(policies))
         for name, policy in policies.items():
             if self.robot is not None and policy.robot.name != self.robot:
                 raise Mismatch(f"{name}: expected a policy for {self.robot}, got one for {policy.robot.name}")
         through_neurons = any(policy.mapping is not None for policy in policies.values())
         # On what they were trained on, unless asked otherwise.
-        trained = next((policy.fitted for policy in policies.values() if policy.mapping is not None), None)
+        trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
         timeline = self.timeline(self.recordings, trained) if through_neurons else None
 
         from animat.evaluation.table import evaluate

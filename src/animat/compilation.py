@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_parallel_codegen_split_count": 1}
 """For programs of loops over small networks, as options of `jax.jit`: a fifth less time to compile, and as fast.
@@ -16,11 +20,13 @@ At level 2 LLVM looks longer at what XLA made, and finds nothing; several parts 
 def cache_folder() -> Path:
     """Where compiled programs are kept: `JAX_COMPILATION_CACHE_DIR`, or a folder of ours in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "animat" / "xla"
+    return Path(chosen) if chosen else _usual_cache() / "animat" / "xla"
 
 
 def keep_compilations() -> None:
     """Let JAX keep what it compiles in `cache_folder()`, if that can be written; for a process that will compile.
+
+    Where it cannot, each process compiles anew, a few seconds each.
 
     What is imported by now is taken out of the garbage collector's view, too: looking through all of JAX, again and
     again, was a quarter of the time of tracing.
@@ -33,6 +39,60 @@ def keep_compilations() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return
+    if not os.access(folder, os.W_OK | os.X_OK):
+        # JAX would warn of every program that it cannot keep.
+        return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextmanager
+def user_cache() -> Iterator[None]:
+    """Have a folder for the user's cache: the usual one, or where that cannot be written to, one for as long as this.
+
+    For libraries that cannot be imported without (pynwb).
+    """
+    usual = _usual_cache()
+    with suppress(OSError):
+        usual.mkdir(parents=True, exist_ok=True)
+    if os.access(usual, os.W_OK | os.X_OK):
+        yield
+        return
+    before = os.environ.get("XDG_CACHE_HOME")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["XDG_CACHE_HOME"]
+            else:
+                os.environ["XDG_CACHE_HOME"] = before
+
+
+def kept_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit` that keeps what it compiles beside the source or in the user's cache.
+
+    Where neither can be written (a package of the system's, no home), each process compiles anew, instead of failing.
+
+    Args:
+        options: of `numba.njit`.
+    """
+    import numba
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:
+            return numba.njit(**options)(function)
+
+    return compiled
+
+
+def _usual_cache() -> Path:
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        # Nobody's home is known: a place that nothing can be written to.
+        return Path(os.devnull)

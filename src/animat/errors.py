@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import re
+
 
 class AnimatError(Exception):
     """Base of every error that a user can cause and mend; the command line prints it in one line.
 
     The message names the argument or file, what was expected, what came, and what to do.
+
+    Attributes:
+        is_admitted: of an error of `Culture.deliver`: its guard had admitted stimuli, which may have been delivered.
     """
+
+    is_admitted = False
 
 
 class InvalidArgument(AnimatError, ValueError):
@@ -48,3 +55,24 @@ class LoopEnded(AnimatError):
 
 class DeviceFailed(AnimatError):
     """A device cannot be used or failed while it was (no driver, no connection, a pulse that did not come)."""
+
+
+def shown(value: object, most: int = 80) -> str:
+    """A value as a message shows it: in one line, and cut where it is longer than anyone reads."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
+        text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"
+    return text if len(text) <= most else f"{text[:most]}... ({len(text):,} characters)"
+
+
+def out_of_memory(error: BaseException) -> str | None:
+    """That memory was too little, with how much was asked for at the last where that is told; None for another error.
+
+    JAX has an error of its own for it (RESOURCE_EXHAUSTED), which is known by its words: it is not imported for this.
+    """
+    if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+        return None
+    asked = re.search(r"llocat\w+ ([\d.]+ ?\w*)", str(error))
+    return f"out of memory ({asked[1]} more were asked for)" if asked else "out of memory"

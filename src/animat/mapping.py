@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 
 N_PERCENTILES = 11
 """P0 (the smallest response), P10, ..., P90, P100 (the largest): what every mapping is given."""
@@ -136,7 +136,42 @@ def mapping_named(name: str) -> Mapping:
     try:
         return _KNOWN[name]
     except (KeyError, TypeError):
-        raise InvalidArgument(f"mapping: expected one of {', '.join(MAPPING_NAMES)}, got {name!r}") from None
+        raise InvalidArgument(f"mapping: expected one of {', '.join(MAPPING_NAMES)}, got {shown(name)}") from None
+
+
+def expect_loadable_mapping(mapping: Mapping) -> None:
+    """Refuse a mapping that a file could name and nothing could give back.
+
+    Raises:
+        InvalidArgument: for a mapping of one's own, which cannot be registered yet.
+    """
+    if _KNOWN.get(mapping.name) != mapping:
+        raise InvalidArgument(
+            f"mapping: expected one that a policy's file can name ({', '.join(MAPPING_NAMES)}), got one of one's own "
+            f"({type(mapping).__name__}), with which no policy could be loaded again; until mappings can be "
+            "registered, train in memory: train(training, timeline, None)"
+        )
+
+
+def check_mapping(mapping: Mapping) -> None:
+    """Ask a mapping for a few commands, and refuse it if they are none.
+
+    Raises:
+        InvalidArgument: naming what was expected and what came.
+    """
+    kind = type(mapping).__name__
+    if not isinstance(mapping, Mapping):
+        raise InvalidArgument(f"mapping: expected a mapping or the name of one, got {shown(mapping)}")
+    x, percentiles = np.linspace(0.0, 12.0, 25, dtype=np.float32), np.linspace(1.0, 11.0, 11, dtype=np.float32)
+    try:
+        u = np.asarray(mapping.command(x, percentiles))
+        hash(mapping)
+    except Exception as error:
+        # Anything may go wrong in somebody else's mapping.
+        said = (str(error).strip().splitlines() or ["no more is known"])[0]
+        raise InvalidArgument(f"{kind}.command: expected commands, got {type(error).__name__}: {said}") from error
+    if u.shape != x.shape or not np.all(np.abs(u) <= 1):
+        raise InvalidArgument(f"{kind}.command: expected {len(x)} commands from -1 to 1, got {shown(u.tolist())}")
 
 
 def _namespace(*arrays: Numbers) -> Any:

@@ -53,6 +53,24 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
+def expect_writable(folder: str | os.PathLike[str]) -> None:
+    """Refuse a folder that could not be written to, or not be made, before any work; nothing is left of the trial.
+
+    Raises:
+        InvalidFile: naming the folder, and what stands in its way.
+    """
+    there = folder = Path(folder)
+    try:
+        while not there.exists() and there != there.parent:
+            there = there.parent
+        # Asking for permissions would not tell a full disk or a file system that is read only.
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        what = f"{there} is no folder" if there.is_file() else (error.strerror or str(error))
+        raise InvalidFile(f"{folder}: cannot be written: {what}; choose another --out") from error
+
+
 @contextmanager
 def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep other runs out of a folder, made where it is missing, until the block ends or the process does.
@@ -64,12 +82,15 @@ def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
 
     Raises:
         Mismatch: if another run is at work in it.
-        InvalidFile: if it cannot be made.
+        InvalidFile: if it cannot be made, or is empty and cannot be written to.
     """
     folder = Path(folder)
     try:
         made = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(parents=True, exist_ok=True)
+        if not any(folder.iterdir()):
+            # One that holds a finished run may be read only; in a new one nothing could be done.
+            expect_writable(folder)
         descriptors = [os.open(folder, os.O_RDONLY)]
     except OSError as error:
         raise InvalidFile(f"{folder}: cannot be made or read: {error.strerror or error}") from error

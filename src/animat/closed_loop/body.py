@@ -29,7 +29,7 @@ class Body:
 
     Args:
         robot: that is moved.
-        rng: source of the robot's noise.
+        rng: source of the robot's noise, and of where its episodes start.
     """
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
@@ -39,19 +39,25 @@ class Body:
             after, reward, terminated = robot.advance(uniforms, state, u)
             return after, reward, terminated, robot.observe(after)
 
-        self.robot, self._rng = robot, rng
-        self._step = jax.jit(stepped)
-        self._start = jax.device_get(robot.reset(jax.random.key(int(rng.integers(2**31)))))
-        self._seen_at_start = np.asarray(robot.observe(self._start), np.float64)
-        self._state = self._start
-        # Compiled now: in the middle of an episode it would cost some hundred milliseconds.
-        self.step(0.0)
-        self.reset()
+        def started(key: Any, number: int) -> tuple[Any, Any]:
+            state = robot.reset(jax.random.fold_in(key, number))
+            return state, robot.observe(state)
 
-    def reset(self) -> Float64[np.ndarray, " observations"]:
-        """Start an episode; returns what is observed."""
-        self._state = self._start
-        return self._seen_at_start
+        self.robot, self._rng = robot, rng
+        self._step, self._start = jax.jit(stepped), jax.jit(started)
+        self._key = jax.random.key(int(rng.integers(2**31)))
+        # Compiled now: in the middle of an episode it would cost some hundred milliseconds.
+        self.reset(0)
+        self.step(0.0)
+
+    def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
+        """Start an episode where the robot draws it; returns what is observed.
+
+        Args:
+            number: the same number starts in the same state.
+        """
+        self._state, observation = self._start(self._key, number)
+        return np.asarray(observation, np.float64)
 
     def step(self, u: float) -> Moved:
         """Move by a command in [-1, 1]."""

@@ -22,7 +22,7 @@ from animat.closed_loop.timing import Clock
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
-from animat.errors import BudgetSpent, UnsafeStimulus
+from animat.errors import AnimatError, BudgetSpent, UnsafeStimulus
 from animat.neurons.windows import read_windows
 from animat.recordings.recording import UNKNOWN
 from animat.recordings.schedule import TICK_S, on_ticks
@@ -106,9 +106,10 @@ class Driver:
 
     def _run_episode(self, episode: int, contender: Contender) -> None:
         loop = self._loop
-        controller = contender.acting(self._begun[contender.name])
+        turn = self._begun[contender.name]
         self._begun[contender.name] += 1
-        observation = self._body.reset()
+        controller = contender.acting(turn)
+        observation = self._start(episode, turn)
         self._last_command = 0.0
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
@@ -133,6 +134,18 @@ class Driver:
             if tick.terminated or tick.truncated:
                 break
             observation = np.array(tick.observation)
+
+    def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
+        """Put the robot where it starts: in a round of all contenders each meets the same start."""
+        self._expect("the robot")
+        try:
+            observation = self._body.reset(turn)
+        except Exception as error:
+            raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
+        if not np.all(np.isfinite(observation)):
+            raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
+        self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
+        return observation
 
     def _lead_in(self, contender: Contender, episode: int) -> None:
         """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
@@ -287,12 +300,13 @@ class Driver:
         self._stretches += 1
         # Spent from now on: whether pulses that are never answered came is not known.
         account.spend(stimuli)
-        before, self.under_way = culture.delivered, asked
+        self.under_way = asked
         self._expect("the culture", duration_s)
         try:
             observed = culture.deliver(stimuli, duration_s, since_s=since_s)
         except Exception as error:
-            is_admitted = culture.delivered > before
+            # Not what the culture counts: another thread may have stimuli delivered meanwhile.
+            is_admitted = not isinstance(error, AnimatError) or error.is_admitted
             if not is_admitted:
                 account.take_back(stimuli)
             # Whoever stopped the culture ended the session, not the culture's refusal that follows.
@@ -365,7 +379,7 @@ def _seen(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | 
 def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
     if is_stopped:
         return Ending("person", "stopped by a person")
-    if isinstance(error, UnsafeStimulus) and error.limit == "stimuli_per_session":
+    if isinstance(error, UnsafeStimulus) and error.limit in ("stimuli_per_session", "net_charge_per_session"):
         return Ending("budget", str(error))
     if isinstance(error, UnsafeStimulus) and culture.is_stopped:
         return Ending("culture", f"the culture was stopped: {error}")

@@ -1,4 +1,8 @@
-"""Ctrl-C, a polite kill and a terminal that is gone: whoever asks for an end must not leave a culture as it is."""
+"""Ctrl-C, a polite kill and a terminal that is gone: whoever asks for an end must not leave a culture as it is.
+
+What is ignored when the program starts stays ignored: `nohup` has it go on when the terminal is gone, and a script has
+its jobs in the background go on when Ctrl-C ends what is in front. SIGTERM always ends it.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,10 @@ ASKING = (signal.SIGINT, *_KILLS)
 
 @contextmanager
 def told_instead(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` for Ctrl-C, SIGTERM and SIGHUP, in place of raising somewhere; nothing outside of the main thread."""
+    """Call `stop` for Ctrl-C, SIGTERM and SIGHUP, in place of raising somewhere; nothing outside of the main thread.
+
+    Ctrl-C and SIGHUP are left alone where they are ignored.
+    """
     with _handled(ASKING, lambda *_: stop()):
         yield
 
@@ -36,8 +43,7 @@ def _handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    # `nohup` has a hang-up ignored: it stays so.
-    numbers = tuple(n for n in numbers if n.name != "SIGHUP" or signal.getsignal(n) != signal.SIG_IGN)
+    numbers = tuple(n for n in numbers if n == signal.SIGTERM or signal.getsignal(n) != signal.SIG_IGN)
     before = [signal.signal(number, handler) for number in numbers]
     try:
         yield

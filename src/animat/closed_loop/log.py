@@ -10,24 +10,31 @@ read and what is lost is counted.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, overload
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int, Int64
 
 from animat.errors import InvalidArgument, InvalidFile
+from animat.plain_file import expect_plain_file
 from animat.writing import keep_name
 
 MAGIC = b"ANIMATL1"
 _RECORD = b"REC1"
 _HEAD = struct.Struct("<4sIII")
+_BUFFER_BYTES = 2**18
+_BLOCK_BYTES = 2**24
+"""Of the log, that spikes are read from in one go."""
 _NO_TIMES, _NO_CHANNELS = np.empty(0, np.float64), np.empty(0, np.int64)
 
 
@@ -53,6 +60,7 @@ class LogWriter:
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
         self.path = path
+        self._header, self._places = dict(header), array("Q")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
@@ -63,7 +71,7 @@ class LogWriter:
         self._whole = 0
         try:
             self._write(MAGIC)
-            self.append(Record(dict(header)))
+            self.append(Record(self._header))
             self.sync()
             keep_name(path.parent)
         except OSError as error:
@@ -80,6 +88,11 @@ class LogWriter:
         spikes = record.spike_times_s.astype("<f8").tobytes() + record.spike_channels.astype("<i4").tobytes()
         body = words + spikes
         self._write(_HEAD.pack(_RECORD, len(words), len(record.spike_times_s), zlib.crc32(body)) + body)
+        self._places.append(self._whole)
+
+    def written(self) -> Log:
+        """What was written up to now, to be read."""
+        return Log(self._header, Records(self.path, self._places), 0)
 
     def sync(self) -> None:
         """Have what was written put on the disk itself, against a power cut."""
@@ -101,6 +114,67 @@ class LogWriter:
         self._whole += len(data)
 
 
+class Records(Sequence[Record]):
+    """The records of a log but the first, read from its file as they are asked for: memory may be smaller than it.
+
+    Args:
+        path: of the log.
+        places: in the file, where each record begins, and where the last one ends.
+    """
+
+    def __init__(self, path: Path, places: array[int]) -> None:
+        self._path, self._places = path, places
+
+    def __len__(self) -> int:
+        return len(self._places) - 1
+
+    @overload
+    def __getitem__(self, index: int) -> Record: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Record, ...]: ...
+    def __getitem__(self, index: int | slice) -> Record | tuple[Record, ...]:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(len(self))[index])
+        number = range(len(self))[index]
+        with opened_log(self._path) as file:
+            file.seek(self._places[number])
+            return _record(self._path, file.read(self._places[number + 1] - self._places[number]))
+
+    def __iter__(self) -> Iterator[Record]:
+        return (_record(self._path, data) for data in self._data())
+
+    def words(self) -> Iterator[dict[str, Any]]:
+        """The words of each record, without the spikes."""
+        return (_words(self._path, data) for data in self._data())
+
+    def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int[np.ndarray, " spikes"]]]:
+        """All spikes, their times in s and their channels, some million at a time, in the order they were written."""
+        places = np.frombuffer(self._places, np.uint64).astype(np.int64)
+        with opened_log(self._path) as file:
+            first = 0
+            while first < len(self):
+                last = max(first + 1, int(np.searchsorted(places, places[first] + _BLOCK_BYTES)) - 1)
+                file.seek(places[first])
+                data = memoryview(file.read(places[last] - places[first]))
+                times, channels = [], []
+                for at in (places[first:last] - places[first]).tolist():
+                    _, n_words, n_spikes, _ = _HEAD.unpack_from(data, at)
+                    if n_spikes:
+                        at += _HEAD.size + n_words
+                        times.append(data[at : at + 8 * n_spikes])
+                        channels.append(data[at + 8 * n_spikes : at + 12 * n_spikes])
+                first = last
+                if times:
+                    times_s = np.frombuffer(b"".join(times), "<f8").astype(np.float64, copy=False)
+                    yield times_s, np.frombuffer(b"".join(channels), "<i4")
+
+    def _data(self) -> Iterator[bytes]:
+        with opened_log(self._path) as file:
+            file.seek(self._places[0])
+            for place, end in itertools.pairwise(self._places):
+                yield file.read(end - place)
+
+
 @dataclass(frozen=True, eq=False)
 class Log:
     """What a log file holds.
@@ -112,42 +186,74 @@ class Log:
     """
 
     header: dict[str, Any]
-    records: tuple[Record, ...]
+    records: Records
     lost_bytes: int
 
 
 def read_log(path: str | os.PathLike[str]) -> Log:
-    """Read a log, also one whose program was killed.
+    """Read a log, also one whose program was killed: every checksum is looked at, and what it holds is read later.
 
     Raises:
         InvalidFile: if it is missing, something else, or has no whole first record.
     """
-    path = Path(path)
+    path = expect_plain_file(path)
+    with opened_log(path) as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise InvalidFile(f"{path}: expected the log of a closed-loop session, got something else")
+        places, n_bytes = array("Q", [len(MAGIC)]), os.fstat(file.fileno()).st_size
+        while (end := _end_of_whole(file, places[-1], n_bytes)) is not None:
+            places.append(end)
+        if len(places) < 2:
+            raise InvalidFile(
+                f"{path}: expected the log of a closed-loop session, got one that ends in its first record"
+            )
+        file.seek(places[0])
+        header = _words(path, file.read(places[1] - places[0]))
+    return Log(header, Records(path, places[1:]), n_bytes - places[-1])
+
+
+@contextmanager
+def opened_log(path: Path) -> Iterator[BinaryIO]:
+    """A log file, open for reading.
+
+    Raises:
+        InvalidFile: if it cannot be read.
+    """
     try:
-        data = path.read_bytes()
+        with path.open("rb", buffering=_BUFFER_BYTES) as file:
+            yield file
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not data.startswith(MAGIC):
-        raise InvalidFile(f"{path}: expected the log of a closed-loop session, got something else")
-    at, records = len(MAGIC), []
-    while (record := _read_record(data, at)) is not None:
-        at, found = record
-        records.append(found)
-    if not records:
-        raise InvalidFile(f"{path}: expected the log of a closed-loop session, got one that ends in its first record")
-    return Log(records[0].words, tuple(records[1:]), len(data) - at)
 
 
-def _read_record(data: bytes, at: int) -> tuple[int, Record] | None:
-    """The record at a place and the place after it; None where there is no whole one."""
-    start = at + _HEAD.size
-    if start > len(data):
+def _end_of_whole(file: BinaryIO, at: int, n_bytes: int) -> int | None:
+    """Where the record ends that begins at a place, which the file stands at; None where there is no whole one."""
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
         return None
-    mark, n_words, n_spikes, checksum = _HEAD.unpack_from(data, at)
-    end = start + n_words + 12 * n_spikes
-    if mark != _RECORD or end > len(data) or zlib.crc32(memoryview(data)[start:end]) != checksum:
+    mark, n_words, n_spikes, checksum = _HEAD.unpack(head)
+    length = n_words + 12 * n_spikes
+    end = at + _HEAD.size + length
+    # Looked at first: a damaged length must not have gigabytes read.
+    if mark != _RECORD or end > n_bytes or zlib.crc32(file.read(length)) != checksum:
         return None
-    times_at = start + n_words
+    return int(end)
+
+
+def _record(path: Path, data: bytes) -> Record:
+    _, n_words, n_spikes, _ = _HEAD.unpack_from(data)
+    times_at = _HEAD.size + n_words
     times_s = np.frombuffer(data, "<f8", n_spikes, times_at).astype(np.float64)
     channels = np.frombuffer(data, "<i4", n_spikes, times_at + 8 * n_spikes).astype(np.int64)
-    return end, Record(json.loads(data[start:times_at]), times_s, channels)
+    return Record(_words(path, data), times_s, channels)
+
+
+def _words(path: Path, data: bytes) -> dict[str, Any]:
+    _, n_words, _, _ = _HEAD.unpack_from(data)
+    try:
+        words = json.loads(data[_HEAD.size : _HEAD.size + n_words])
+    except (ValueError, RecursionError) as error:
+        raise InvalidFile(f"{path}: expected JSON in every record, got {error}") from error
+    if not isinstance(words, dict):
+        raise InvalidFile(f"{path}: expected names and values in every record, got {type(words).__name__}")
+    return words

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64
 from numpy.typing import ArrayLike
 
 from animat.errors import InvalidArgument, UnusableData
+from animat.evaluation.transfer import other_presentation
 from animat.mapping import N_PERCENTILES, Mapping
 from animat.neurons.conditions import Condition
 from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window
@@ -25,6 +26,8 @@ OnLate = Literal["continue", "stop"]
 
 MOST_LEAD_IN = 100
 """Times that each condition leads in: as many as a recording holds; more wears a culture out for nothing."""
+SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
+"""Frequencies that a presentation may have: a quarter of an hour is waited for a pulse at most."""
 
 
 class Trained(Protocol):
@@ -116,10 +119,10 @@ class Loop:
         if not self.conditions:
             raise InvalidArgument("conditions: expected at least one, got none")
         for condition in self.conditions:
-            if condition.unit != "Hz" or not condition.value > 0:
+            if condition.unit != "Hz" or not SLOWEST_HZ <= condition.value <= FASTEST_HZ:
                 raise UnusableData(
-                    f"condition {condition.label}: expected a frequency, as a closed loop presents by frequency; train "
-                    "on recordings whose conditions are frequencies"
+                    f"condition {condition.label}: expected a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, as a "
+                    "closed loop presents by frequency; train on recordings whose conditions are frequencies"
                 )
         if self.following is not None and (
             len(self.following) != len(self.conditions) or not all(len(x) for x in self.following)
@@ -194,25 +197,7 @@ class Loop:
 
 
 def _differences(policy: Trained, loop: Loop) -> tuple[Finding, ...]:
-    recorded, found = policy.presentation, []
-    if recorded is None:
-        found.append(
-            f"how the policy's recordings were presented is not known; the loop presents {loop.presentation}, and a "
-            "culture answers otherwise to another presentation"
-        )
-    else:
-        if recorded.order != "mixed":
-            found.append(
-                f"the policy's recordings were {recorded.order}: all stimuli of a frequency together; a closed loop "
-                "presents them mixed, and a culture answers otherwise then: expect less than predicted (record with "
-                "--order mixed for a closed loop)"
-            )
-        if recorded.pulses != loop.pulses:
-            found.append(
-                f"the policy's recordings had {recorded.pulses} pulse(s) a presentation, the loop has {loop.pulses}; "
-                "the response after another number of pulses is another"
-            )
-    findings = [Finding("other-presentation", "warning", sentence) for sentence in found]
+    findings = list(other_presentation(policy.presentation, loop.presentation))
     if policy.window_ms is not None and policy.window_ms != loop.window_ms:
         sentence = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
         findings.append(Finding("other-window", "warning", sentence))

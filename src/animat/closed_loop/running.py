@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import json
 import os
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,18 +20,23 @@ import numpy as np
 
 from animat.closed_loop.contenders import Contender, InTurn, interleaved
 from animat.closed_loop.driver import Driver
+from animat.closed_loop.gathering import LOG_FILE, SessionFiles
+from animat.closed_loop.header import FORMAT, observed_columns, read_header
 from animat.closed_loop.interrupts import told_instead
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import FORMAT, LOG_FILE, Session, expect_no_session, read_session
+from animat.closed_loop.session import Session, expect_no_session
 from animat.closed_loop.tick import Ending
 from animat.closed_loop.timing import Clock, WallClock
-from animat.cultures.base import Culture, more_left_out
+from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
-from animat.errors import InvalidArgument, InvalidFile
+from animat.cultures.observed import more_left_out
+from animat.errors import AnimatError, InvalidArgument, shown
 from animat.progress import Progress, Silent
 
+MOST_EPISODES = 100_000
+"""Of each contender in a session."""
 _POLL_S = 0.02
 _BATCH, _PAUSE_S = 4, 1e-4
 """Records written in a row, some 0.2 ms, and the pause after them: the loop's thread may have a deadline."""
@@ -82,27 +89,45 @@ def run_session(
     account, progress = account or Account(), progress or Silent()
     turns = interleaved(len(contenders), episodes, np.random.default_rng([seed, 20]))
     driver = Driver(culture, loop, contenders, turns, account, clock or WallClock(), seed)
-    log = LogWriter(Path(folder) / LOG_FILE, _header(culture, loop, contenders, turns, seed))
-    supervisor = _Supervisor(culture, loop, driver, log, progress, len(turns))
-    try:
+    file = Path(folder) / LOG_FILE
+    # As whoever reads the log has it.
+    header = json.loads(json.dumps(_header(culture, loop, contenders, turns, seed)))
+    with ExitStack() as stack:
+        files = stack.enter_context(SessionFiles(file.parent, read_header(file, header)))
+        log = LogWriter(file, header)
+        stack.callback(log.close)
+        supervisor = _Supervisor(culture, loop, driver, log, files, progress, len(turns))
         ending = supervisor.run()
-    finally:
-        log.close()
-    session = replace(read_session(log.path), ending=ending)
-    try:
-        session.write()
-    except InvalidFile as error:
-        sentence = f"{ending.sentence}; and {error} (animat recover {folder} writes it when there is room)"
-        session = replace(session, ending=replace(ending, sentence=sentence))
+        gathered = files.gathered if supervisor.is_gathered else None
+        session = Session(file.parent, log.written(), ending, gathered)
+        try:
+            if gathered is None:
+                session.write()
+            else:
+                files.finish(session.log.records, ending)
+        except Exception as error:
+            # What was lived comes back, whatever its files are like.
+            told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
+            sentence = f"{ending.sentence}; and {told} (animat recover {folder} makes them again)"
+            session = replace(session, ending=replace(ending, sentence=sentence))
     return session
 
 
 class _Supervisor:
     def __init__(
-        self, culture: Culture, loop: Loop, driver: Driver, log: LogWriter, progress: Progress, episodes: int
+        self,
+        culture: Culture,
+        loop: Loop,
+        driver: Driver,
+        log: LogWriter,
+        files: SessionFiles,
+        progress: Progress,
+        episodes: int,
     ) -> None:
+        self.is_gathered = True
+        """Whether `files` has all that is in the log."""
         self._culture, self._loop, self._driver = culture, loop, driver
-        self._log, self._progress, self._episodes = log, progress, episodes
+        self._log, self._files, self._progress, self._episodes = log, files, progress, episodes
         self._synced = time.monotonic()
         self._ending: Ending | None = None
         self._noted = self._seen = -1
@@ -162,7 +187,7 @@ class _Supervisor:
         records = self._driver.records
         # No more than are there now: a loop that is as fast as the log must not keep this thread from watching it.
         for number in range(len(records)):
-            self._log.append(records[0])
+            self._append(records[0])
             # Taken away only once it is written: a full disk loses none that could be written later.
             written = records.popleft().words
             self._seen = written["stretch"] if written["kind"] == "seen" else self._seen
@@ -172,11 +197,22 @@ class _Supervisor:
         asked = self._driver.under_way
         if asked is not None and asked.stretch > self._noted:
             # If the answer never comes, or the program is killed meanwhile, it is known what was asked for.
-            self._log.append(Record({"kind": "asked", **asked.to_dict()}))
+            self._append(Record({"kind": "asked", **asked.to_dict()}))
             self._noted = asked.stretch
         if time.monotonic() - self._synced > _SYNC_S:
             self._log.sync()
             self._synced = time.monotonic()
+
+    def _append(self, record: Record) -> None:
+        """Write a record, and take it in for the files that come of it."""
+        self._log.append(record)
+        if self.is_gathered:
+            try:
+                self._files.add(record)
+            except Exception:
+                # The log is what counts: they are made of it in the end, or it is said then why they cannot be.
+                self.is_gathered = False
+                self._files.give_up()
 
     def _finish(self, ending: Ending) -> Ending:
         """Write what is left, and how it ended."""
@@ -188,10 +224,10 @@ class _Supervisor:
             unfinished = self._driver.unfinished
             self._write()
             if unfinished is not None and unfinished.words["stretch"] > self._seen:
-                self._log.append(unfinished)
+                self._append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
             words = {"kind": "end", "by": ending.by, "sentence": ending.sentence, "left_out": left_out}
-            self._log.append(Record(words))
+            self._append(Record(words))
             self._log.sync()
         except OSError as error:
             left = len(self._driver.records)
@@ -258,6 +294,7 @@ def _header(
         "provenance": culture.provenance,
         "limits": asdict(culture.limits),
         "loop": loop.to_dict(),
+        "observed": observed_columns(loop.robot),
         "contenders": [_told(contender) for contender in contenders],
         "turns": [contenders[turn].name for turn in turns],
         "seed": seed,
@@ -272,14 +309,24 @@ def _told(contender: Contender) -> dict[str, Any]:
     return told
 
 
+def check_episodes(name: str, episodes: int) -> None:
+    """Refuse episodes that are none, or more than a session can plan: whose turn each is is drawn before the first.
+
+    Raises:
+        InvalidArgument: by the name of the argument or option.
+    """
+    if not 1 <= episodes <= MOST_EPISODES:
+        expected = "at least 1" if episodes < 1 else f"at most {MOST_EPISODES:,}"
+        raise InvalidArgument(f"{name}: expected {expected}, got {shown(episodes)}")
+
+
 def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episodes: int, seed: int) -> None:
     if not culture.is_open or culture.is_stopped:
         state = "stopped" if culture.is_open else "closed"
         raise InvalidArgument(f"culture: expected an open one that may stimulate, got one that is {state}")
     if not contenders or len({contender.name for contender in contenders}) < len(contenders):
         raise InvalidArgument("contenders: expected at least one, each name once")
-    if episodes < 1:
-        raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    check_episodes("episodes", episodes)
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if loop.patterns is not None and loop.patterns > len(culture.patterns):

@@ -2,71 +2,85 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
-from animat.closed_loop.log import Log, read_log
+from animat.closed_loop.gathering import (
+    LOG_FILE,
+    RECORDING_FILE,
+    TICKS_FILE,
+    Gathered,
+    SessionFiles,
+    expecting_a_session,
+    unanswered_pulses,
+)
+from animat.closed_loop.header import Header, read_header
+from animat.closed_loop.log import Log, Records, read_log
+from animat.closed_loop.outline import Episode, Outline
 from animat.closed_loop.tick import Ending, Tick
-from animat.closed_loop.tick_table import write_ticks
 from animat.errors import InvalidArgument, InvalidFile
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
-from animat.robots.registry import robot_from_dict
-from animat.writing import alone_in
+from animat.progress import Progress
+from animat.recordings.recording import Recording
+from animat.writing import alone_in, clear_away, is_unfinished
 
-LOG_FILE = "session.log"
-RECORDING_FILE = "session.nwb"
-TICKS_FILE = "ticks.csv"
-FORMAT = "animat closed-loop session 1"
+_TOLD_EVERY = 1000
 
 
-@dataclass(frozen=True)
-class Episode:
-    """One episode of a contender.
+class Ticks(Sequence[Tick]):
+    """Every tick of a log, in the order of time, read from it as they are asked for."""
 
-    Attributes:
-        number: in the session, from 0.
-        contender: who acted.
-        total: the sum of rewards, in the task's own units.
-        iterations: of the robot.
-        terminated: whether it ended by itself and not at the limit.
-        is_whole: whether it came to its end; what the session broke off has no return.
-        pulses: that the culture was given, what led in among them.
-        bursts: responses that were bursts, also of what led in.
-        late: pulses that came late, also of what led in.
-    """
+    def __init__(self, records: Records) -> None:
+        self._records = records
 
-    number: int
-    contender: str
-    total: float
-    iterations: int
-    terminated: bool
-    is_whole: bool
-    pulses: int
-    bursts: int
-    late: int
+    def __iter__(self) -> Iterator[Tick]:
+        return (Tick.from_dict(words["tick"]) for words in self._records.words() if words.get("tick"))
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, index: int) -> Tick: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Tick, ...]: ...
+    def __getitem__(self, index: int | slice) -> Tick | tuple[Tick, ...]:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(len(self))[index])
+        return Tick.from_dict(self._records[self._numbers[index]].words["tick"])
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Sequence) or len(self) != len(other):
+            return False
+        return all(a == b for a, b in zip(self, other, strict=True))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @cached_property
+    def _numbers(self) -> array[int]:
+        return array("Q", (number for number, words in enumerate(self._records.words()) if words.get("tick")))
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What a log file says of a session.
+    """What a log file says of a session; what is long is read when it is asked for.
 
     Attributes:
         folder: where it is.
         log: all that was written.
         ending: how it ended.
+        gathered: what the log's records come to, where that is known already.
     """
 
     folder: Path
     log: Log
     ending: Ending
+    gathered: Gathered | None = field(default=None, repr=False)
 
     @property
     def recording_file(self) -> Path:
@@ -79,136 +93,113 @@ class Session:
         return self.folder / TICKS_FILE
 
     @cached_property
-    def ticks(self) -> tuple[Tick, ...]:
+    def ticks(self) -> Ticks:
         """Every tick, in the order of time."""
-        return tuple(Tick.from_dict(r.words["tick"]) for r in self.log.records if r.words.get("tick"))
+        return Ticks(self.log.records)
 
-    @cached_property
+    @property
     def episodes(self) -> tuple[Episode, ...]:
         """Every episode that was begun, in the order of time."""
-        by_number: dict[int, list[Tick]] = {}
-        for tick in self.ticks:
-            by_number.setdefault(tick.episode, []).append(tick)
-        return tuple(_episode(number, ticks) for number, ticks in sorted(by_number.items()))
+        return self.outline.episodes
 
-    @cached_property
+    @property
     def unanswered(self) -> tuple[dict[str, Any], ...]:
         """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
         known, and they are in no recording. The words of its record: when, which stimuli."""
-        answered = {r.words.get("stretch") for r in self.log.records if r.words["kind"] == "seen"}
-        found = {
-            r.words["stretch"]: r.words
-            for r in self.log.records
-            # Sessions that were logged before this was have events without.
-            if r.words["kind"] in ("asked", "event") and r.words.get("stretch") not in answered | {None}
-        }
-        return tuple(words for words in found.values() if words["stimuli"] and words.get("is_admitted", True))
+        return self.outline.unanswered
 
-    @cached_property
+    @property
     def left_out(self) -> dict[str, int]:
         """What the culture's device reported and the session does not have, by what it is; known once it has ended."""
-        return next((r.words.get("left_out", {}) for r in self.log.records if r.words["kind"] == "end"), {})
+        return self.outline.left_out
+
+    @property
+    def outline(self) -> Outline:
+        """What it came to, in numbers."""
+        return self._gathered.outline
 
     def recording(self) -> Recording:
         """The session as a recording: all that was seen, and every pulse as a stimulus of its presentation.
 
-        The responses that are extracted from it are, bit for bit, those that the loop acted on.
+        The responses that are extracted from it are, bit for bit, those that the loop acted on. All spikes are read
+        into memory; of a long session rather read `recording_file`.
 
         Raises:
             InvalidFile: if the log does not fit together.
         """
-        header, seen = self.log.header, [r for r in self.log.records if r.words["kind"] == "seen"]
-        try:
-            channels = Channels(**{name: np.array(column) for name, column in header["channels"].items()})
-            rows = [row for r in seen for row in r.words["stimuli"]]
-            pulse_s = [t for r in seen if r.words["tick"] for t in r.words["tick"]["pulse_time_s"]]
-            electrodes = np.full((len(rows), max((len(row[3]) for row in rows), default=1)), UNKNOWN)
-            for place, row in zip(electrodes, rows, strict=True):
-                place[: len(row[3])] = row[3]
-            times_s = np.concatenate([np.empty(0), *(r.spike_times_s for r in seen)])
-            spike_channels = np.concatenate([np.empty(0, np.int64), *(r.spike_channels for r in seen)])
+        with expecting_a_session(self.folder / LOG_FILE):
+            blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.records.spike_blocks()]
+            times_s, channels = (np.concatenate(each) for each in zip(*blocks, strict=True))
             # Stretches may touch, and times on samples then overlap by one.
             order = np.argsort(times_s, kind="stable")
-            ends_s = [r.words["start_s"] + r.words["duration_s"] for r in seen]
-            watched_s = sum(r.words["duration_s"] for r in seen)
-            duration_s = max([0.0, *ends_s, *times_s[order[-1:]].tolist(), *pulse_s[-1:]])
-            return Recording(
-                spike_times_s=times_s[order],
-                spike_channels=spike_channels[order],
-                channels=channels,
-                stimuli=Stimuli(
-                    time_s=np.array(pulse_s, np.float64),
-                    frequency_hz=np.array([row[0] for row in rows], np.float64),
-                    pattern=np.array([row[1] for row in rows], np.int64),
-                    electrodes=electrodes,
-                    presentation=np.array([row[2] for row in rows], np.int64),
-                ),
-                sampling_rate_hz=header["sampling_rate_hz"],
-                start_s=0.0,
-                duration_s=duration_s,
-                start_min=header["start_min"],
-                presentation=Presentation("mixed", header["loop"]["pulses"]),
-                provenance={
-                    **header["provenance"],
-                    "session_description": _described([each["name"] for each in header["contenders"]]),
-                    "recorded_at": header["recorded_at"],
-                    "closed_loop": json.dumps(header["loop"]),
-                    "closed_loop_ended": f"{self.ending.by}: {self.ending.sentence}",
-                    "closed_loop_unwatched_s": f"{max(0.0, duration_s - watched_s):.6f}",
-                    **({"left_out": told_left_out(self)} if self.left_out else {}),
-                    "closed_loop_unanswered_pulses": str(_pulses(self.unanswered)),
-                },
-            )
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InvalidFile(f"{self.folder / LOG_FILE}: expected a session's log, got {error!r}") from error
+            empty = self._gathered.recording_without_spikes(self.ending)
+            return replace(empty, spike_times_s=times_s[order], spike_channels=channels[order])
 
-    def write(self) -> None:
+    def write(self, progress: Progress | None = None) -> None:
         """Write the ticks as a table, and the recording after it: once it is there, so are both.
+
+        Args:
+            progress: told how many records are read.
 
         Raises:
             InvalidFile: if the log does not fit together, or a file cannot be written.
         """
-        try:
-            loop = self.log.header["loop"]
-            conditions, quantities = loop["conditions"], robot_from_dict(loop["robot"]).quantities
-            write_ticks(self.ticks_file, self.ticks, conditions, quantities)
-        except (KeyError, TypeError, IndexError, InvalidArgument) as error:
-            raise InvalidFile(f"{self.folder / LOG_FILE}: expected a session's log, got {error!r}") from error
-        self.recording().save(self.recording_file)
+        with expecting_a_session(self.folder / LOG_FILE), SessionFiles(self.folder, self._header) as files:
+            for number, record in enumerate(self.log.records):
+                files.add(record)
+                if progress is not None and number % _TOLD_EVERY == 0:
+                    progress.update(number, len(self.log.records))
+            files.finish(self.log.records, self.ending)
+        object.__setattr__(self, "gathered", files.gathered)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
-        late_ms = [1000 * tick.late_s for tick in self.ticks]
+        outline = self.outline
         return {
             "ended_by": self.ending.by,
             "ended": self.ending.sentence,
-            "episodes": len(self.episodes),
-            "ticks": len(self.ticks),
-            "pulses": sum(len(tick.pulse_time_s) for tick in self.ticks),
-            "bursts": sum(tick.is_burst for tick in self.ticks),
-            "late_pulses": sum(ms > 0 for ms in late_ms),
-            "latest_ms": max(late_ms, default=0.0),
-            "unanswered_pulses": _pulses(self.unanswered),
-            "left_out": self.left_out,
+            "episodes": len(outline.episodes),
+            "ticks": outline.ticks,
+            "pulses": outline.pulses,
+            "bursts": outline.bursts,
+            "late_pulses": outline.late,
+            "latest_ms": 1000 * outline.latest_s,
+            "unanswered_pulses": unanswered_pulses(outline),
+            "left_out": outline.left_out,
             "lost_bytes": self.log.lost_bytes,
         }
+
+    @property
+    def _header(self) -> Header:
+        return read_header(self.folder / LOG_FILE, self.log.header)
+
+    @property
+    def _gathered(self) -> Gathered:
+        if self.gathered is None:
+            gathered = Gathered(self._header)
+            with expecting_a_session(self.folder / LOG_FILE):
+                for record in self.log.records:
+                    gathered.add(record)
+            object.__setattr__(self, "gathered", gathered)
+        return self.gathered  # type: ignore[return-value]
 
 
 def read_session(path: str | os.PathLike[str]) -> Session:
     """Read a session from its folder or its log, whatever ended it.
 
     Raises:
-        InvalidFile: if the log is missing, or something else.
+        InvalidFile: if the log is missing, or something else, or its header cannot be.
     """
     path = Path(path)
     file = path / LOG_FILE if path.is_dir() else path
     log = read_log(file)
-    if log.header.get("format") != FORMAT:
-        raise InvalidFile(f"{file}: expected {FORMAT!r}, got {log.header.get('format')!r}")
+    read_header(file, log.header)
     ending = Ending("crash", "nothing was written about its end: the program was killed, or still runs")
-    for record in log.records:
-        if record.words["kind"] == "end":
-            ending = Ending(record.words["by"], record.words["sentence"])
+    # Nothing is written after it.
+    last = log.records[-1].words if len(log.records) else {}
+    with expecting_a_session(file):
+        if last.get("kind") == "end":
+            ending = Ending(last["by"], last["sentence"])
     return Session(file.parent, log, ending)
 
 
@@ -242,8 +233,12 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
         raise InvalidFile(f"{folder}: cannot be written to: permission denied")
 
 
-def recover_session(path: str | os.PathLike[str]) -> Session:
+def recover_session(path: str | os.PathLike[str], progress: Progress | None = None) -> Session:
     """Read a session whose program was killed, and write the recording and the table that it did not come to write.
+
+    Args:
+        path: of its folder or its log.
+        progress: told how many records are read.
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
@@ -252,44 +247,17 @@ def recover_session(path: str | os.PathLike[str]) -> Session:
     # What is no session is told before its folder is held.
     with alone_in(read_session(path).folder):
         session = read_session(path)
-        session.write()
+        for leftover in session.folder.glob(".*"):
+            # What the killed program was just writing.
+            if is_unfinished(leftover) and leftover.name.startswith((f".{RECORDING_FILE}.", f".{TICKS_FILE}.")):
+                clear_away(leftover)
+        session.write(progress)
     return session
 
 
 def told_unanswered(session: Session) -> str:
     """What is to be known of pulses that were never answered, in a sentence."""
     return (
-        f"{_pulses(session.unanswered)} pulses were asked for and never answered: whether they came is not known; "
-        f"{LOG_FILE} has their times and electrodes"
-    )
-
-
-def told_left_out(session: Session) -> str:
-    """What the session does not have, in words."""
-    return ", ".join(f"{count} {what}" for what, count in session.left_out.items())
-
-
-def _described(contenders: Sequence[str]) -> str:
-    return (
-        "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
-        f"from episode to episode ({', '.join(contenders)}): {TICKS_FILE} beside this file tells whose each stimulus "
-        "was, and what came of it."
-    )
-
-
-def _pulses(asked: Sequence[dict[str, Any]]) -> int:
-    return sum(len(words["stimuli"]) for words in asked)
-
-
-def _episode(number: int, ticks: list[Tick]) -> Episode:
-    return Episode(
-        number=number,
-        contender=ticks[0].contender,
-        total=sum(tick.reward for tick in ticks if tick.reward is not None),
-        iterations=sum(tick.reward is not None for tick in ticks),
-        terminated=ticks[-1].terminated,
-        is_whole=ticks[-1].terminated or ticks[-1].truncated,
-        pulses=sum(len(tick.pulse_time_s) for tick in ticks),
-        bursts=sum(tick.is_burst for tick in ticks),
-        late=sum(tick.late_s > 0 for tick in ticks),
+        f"{unanswered_pulses(session.outline)} pulses were asked for and never answered: whether they came is not "
+        f"known; {LOG_FILE} has their times and electrodes"
     )

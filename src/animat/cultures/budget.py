@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from animat.errors import BudgetSpent, InvalidArgument
+from animat.recordings.plain import whole_number
 from animat.recordings.stimulus import Stimulus
 
 
@@ -20,7 +21,7 @@ class Budget:
         pulses_per_electrode: on any one electrode.
 
     Raises:
-        InvalidArgument: for a number below 0.
+        InvalidArgument: for a number below 0, or one that is not whole.
     """
 
     pulses: int | None = None
@@ -28,9 +29,11 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("pulses", "pulses_per_electrode"):
-            value = getattr(self, name)
-            if value is not None and value < 0:
-                raise InvalidArgument(f"budget.{name}: expected 0 or more, got {value}")
+            if (given := getattr(self, name)) is not None:
+                value = whole_number(f"budget.{name}", given)
+                if value < 0:
+                    raise InvalidArgument(f"budget.{name}: expected 0 or more, got {value}")
+                object.__setattr__(self, name, value)
 
 
 class Account:

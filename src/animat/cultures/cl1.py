@@ -18,24 +18,19 @@ from animat.cultures.base import Culture
 from animat.cultures.cl1_delivery import FRAMES_PER_S, LEAD_US, Delivery
 from animat.cultures.failing import as_device_failure, in_words
 from animat.cultures.history import History
+from animat.cultures.holding import of_the_machine, of_the_program
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
 from animat.recordings.array import ElectrodeArray
+from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
 from animat.recordings.patterns import draw_patterns
 from animat.recordings.recording import UNKNOWN, Channels
 from animat.recordings.stimulus import Phase, Pulse
 
-CHANNELS = 64
-NO_STIMULATION = {0: "ground", 4: "reference", 7: "ground", 56: "ground", 63: "ground"}
-"""Channels that are no stimulation electrodes, and what they are. The SDK says nothing of a stimulus on them: version
-1.0.0 leaves the ground channels out in silence, and its simulator does as if the reference could stimulate."""
-SITES = tuple(channel for channel in range(CHANNELS) if channel not in NO_STIMULATION)
 HAND_OVER_S = 0.5
 """How long a stop waits for a pulse that is being handed over."""
-STIMULUS_STREAM = "animat_stimuli"
-"""The data stream beside the SDK's own recording, which keeps no parameters of stimuli."""
 
 CL1_LIMITS = Limits(
     kind="current",
@@ -44,6 +39,7 @@ CL1_LIMITS = Limits(
     charge_per_phase=3.0,
     # The SDK does not look at balance; a culture does. What is left is rounding: a femtocoulomb.
     net_charge=1e-6,
+    net_charge_per_session=1e-3,
     electrodes_at_once=len(SITES),
     stimuli_per_electrode_s=200,
     stimuli_per_s=200,
@@ -143,6 +139,11 @@ class CL1Culture(Culture):
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
         """Channels of each pattern."""
         return self._patterns
+
+    @property
+    def device(self) -> Path:
+        """The CL1 that this runs on; of the SDK's simulator each program has its own."""
+        return of_the_program("cl1-simulator") if _sdk().is_simulator() else of_the_machine("cl1")
 
     @property
     def device_limits(self) -> Limits:
@@ -304,7 +305,7 @@ def _sdk() -> ModuleType:
         import cl
     except ImportError as error:
         raise DeviceFailed(
-            "cl: expected the vendor's package cl-sdk, got none: on Python 3.12 or later `pip install 'animat[cl1]'` "
+            "cl: expected the vendor's package cl-sdk, got none: on Python 3.12 or later `pip install cl-sdk` "
             "(its licence is CC BY-NC 4.0); on a CL1 it is there"
         ) from error
     found: ModuleType = cl

@@ -13,16 +13,18 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int16
 
-from animat.cultures.cl1 import CHANNELS, NO_STIMULATION
 from animat.cultures.cl1_delivery import FRAMES_PER_S
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
 from animat.cultures.virtual import WARM_UP_S
 from animat.cultures.visibility import amplitudes_at_soma_uv
 from animat.errors import InvalidArgument
+from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION
 
 FACTORY = "animat.cultures.cl1_source:simulated_culture"
 UV_PER_UNIT = 0.195
 BLOCK_FRAMES = 1024
+REAL_TIME_NEURONS = 300
+"""As many kept up with an application that stimulates on every spike, 1,000 ticks a second, on a machine left to it."""
 SAMPLES = 75
 BEFORE = 25
 """Samples of a spike that the SDK shows, and how many of them lie before its time."""
@@ -55,7 +57,8 @@ class SimulatedCL1:
 
     Args:
         seed: which culture.
-        neurons: of the tissue; with fewer than 1,200, each has fewer partners in proportion.
+        neurons: of the tissue; with fewer than 1,200, each has fewer partners in proportion. More than the default may
+            be too many for real time: the application then falls behind the SDK's buffer.
         pitch_um: between electrodes, in the middle of the tissue. Assumed: the SDK does not say.
         reach_um: of an electrode; assumed, and wider than a CMOS array's, as its electrodes are larger.
         charge_nc: that makes a pulse of strength 1; assumed: the SDK's usual 160 us at 2 uA.
@@ -69,7 +72,7 @@ class SimulatedCL1:
         self,
         seed: int = 1,
         *,
-        neurons: int | None = None,
+        neurons: int = REAL_TIME_NEURONS,
         pitch_um: float = 200.0,
         reach_um: float = 100.0,
         charge_nc: float = 0.32,
@@ -79,14 +82,13 @@ class SimulatedCL1:
             if not 0 < value < 1e6:
                 raise InvalidArgument(f"{name}: expected above 0, got {value}")
         parameters = TissueParameters()
-        if neurons is not None:
-            share = min(1.0, neurons / parameters.neurons)
-            parameters = replace(
-                parameters,
-                neurons=neurons,
-                in_degree_e=max(1, round(parameters.in_degree_e * share)),
-                in_degree_i=max(1, round(parameters.in_degree_i * share)),
-            )
+        share = min(1.0, neurons / parameters.neurons)
+        parameters = replace(
+            parameters,
+            neurons=neurons,
+            in_degree_e=max(1, round(parameters.in_degree_e * share)),
+            in_degree_i=max(1, round(parameters.in_degree_i * share)),
+        )
         self._tissue = Tissue(seed, parameters)
         self._seed, self._charge_nc, self._noise_units = seed, charge_nc, noise_uv / UV_PER_UNIT
         self._step_frames = round(parameters.step_ms * 1e-3 * FRAMES_PER_S)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -17,6 +18,7 @@ from jaxtyping import Int64
 from animat.cultures.base import Culture
 from animat.cultures.failing import in_words
 from animat.cultures.history import History
+from animat.cultures.holding import of_the_machine
 from animat.cultures.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
 from animat.cultures.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
 from animat.cultures.maxone_wiring import Wiring, wire
@@ -38,6 +40,7 @@ MAXONE_LIMITS = Limits(
     charge_per_phase=200.0,
     # In what the converter makes of it; what is left is rounding.
     net_charge=1e-6,
+    net_charge_per_session=1e-3,
     electrodes_at_once=32,
     stimuli_per_electrode_s=100,
     stimuli_per_s=200,
@@ -135,6 +138,11 @@ class MaxOneCulture(Culture):
         return self.selection.patterns
 
     @property
+    def device(self) -> Path:
+        """The one that MaxLab Live's server on this machine has."""
+        return of_the_machine("maxone")
+
+    @property
     def device_limits(self) -> Limits:
         """`MAXONE_LIMITS` with the device's own step of voltage, once it is open."""
         reach_mv = DAC_STEPS * self._lsb_mv or MAXONE_LIMITS.amplitude
@@ -179,9 +187,6 @@ class MaxOneCulture(Culture):
             self._switch_power(True)
             self._wait("waitInit")
             self._lsb_mv = _step_mv(mx.query_DAC_lsb_mV())
-            if self._asked_limits is not None:
-                self._asked_limits = replace(self._asked_limits, amplitude_step=self._lsb_mv)
-                self._asked_limits.check_within(self.device_limits)
             self._wiring = wire(mx, self.selection, wait=self._wait)
             self._sequences = Sequences(mx, self._wiring.unit_of, self._lsb_mv)
             self._stream = self._given_stream or ZmqSpikes()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.cultures.safety import steps_of
+from animat.cultures.limits import steps_of
 from animat.recordings.stimulus import Pulse, Stimulus
 
 FRAMES_PER_S = 20_000

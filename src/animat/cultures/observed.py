@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.recordings.protocol import Presentation
 from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
 from animat.recordings.schedule import Schedule
 from animat.recordings.stimulus import Stimulus
@@ -54,6 +55,29 @@ def stimulus_table(stimuli: Sequence[Stimulus], time_s: Float64[np.ndarray, " st
         pattern=np.array([stimulus.pattern for stimulus in stimuli]),
         electrodes=electrodes,
         presentation=np.array([stimulus.presentation for stimulus in stimuli]),
+    )
+
+
+def presented(
+    stimuli: Sequence[Stimulus],
+    observed: Observed,
+    *,
+    channels: Channels,
+    sampling_rate_hz: float,
+    start_min: float,
+    presentation: Presentation | None,
+) -> Recording:
+    """One presentation as a recording; arguments as of `assembled`."""
+    return Recording(
+        spike_times_s=observed.spikes.time_s,
+        spike_channels=observed.spikes.channel,
+        channels=channels,
+        stimuli=stimulus_table(stimuli, observed.stimulus_time_s),
+        sampling_rate_hz=sampling_rate_hz,
+        start_s=0.0,
+        duration_s=observed.duration_s,
+        start_min=start_min,
+        presentation=presentation,
     )
 
 
@@ -106,3 +130,9 @@ def assembled(
         presentation=schedule.protocol.presentation,
         provenance=provenance,
     )
+
+
+def more_left_out(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
+    """What was left out between two times, where it was anything."""
+    more = {what: count - before.get(what, 0) for what, count in after.items()}
+    return {what: count for what, count in more.items() if count}

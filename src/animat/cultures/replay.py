@@ -42,6 +42,8 @@ class ReplayCulture(Culture):
     """
 
     name: ClassVar[str] = "replay"
+    # A delivery is computed, and comes to its end.
+    ends_within_s: ClassVar[float] = -1
 
     def __init__(
         self,

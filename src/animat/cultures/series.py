@@ -12,7 +12,7 @@ import numpy as np
 
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
@@ -22,6 +22,8 @@ from animat.writing import alone_in, clear_away
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
+LONGEST_MIN = 365 * 24 * 60.0
+"""From the first recording to the last: a virtual culture's clock goes no further."""
 
 
 def recording_name(start_min: float) -> str:
@@ -175,6 +177,11 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
     if not 0 < interval_min < float("inf"):
         raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
+    if sessions > 1 and sessions * interval_min > LONGEST_MIN:
+        raise InvalidArgument(
+            f"sessions, interval_min: expected recordings within a year, got {shown(sessions)} every "
+            f"{interval_min:g} min"
+        )
     # How long a schedule takes does not depend on the electrodes: no culture need be opened to refuse.
     patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
     takes_min = make_schedule(protocol, patterns, seed=0).duration_s / 60

@@ -60,6 +60,8 @@ class VirtualCulture(Culture):
     """
 
     name: ClassVar[str] = "virtual"
+    # A delivery is computed, and comes to its end.
+    ends_within_s: ClassVar[float] = -1
 
     def __init__(
         self,
@@ -225,6 +227,11 @@ class VirtualCulture(Culture):
             self._zero_ns = self._now_ns = round(tissue.now_s * NS)
             # Only now: a culture whose opening was broken off before is new, and can be opened again.
             self._have(tissue, visibility)
+        else:
+            # Compiled here, and not while a loop waits: where compiled programs cannot be kept it takes seconds.
+            before = self._tissue.snapshot()
+            self._tissue.advance(self._step_ns / NS)
+            self._tissue.restore(before)
         self._look()
 
     def _grown(self) -> tuple[Tissue, Visibility]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
+from animat.plain_file import expect_plain_file
+from animat.recordings.array import MAXONE
 from animat.recordings.selection import Selection
 from animat.writing import written_whole
 
@@ -18,6 +21,11 @@ if TYPE_CHECKING:
     from animat.cultures.virtual import VirtualCulture
 
 FORMAT = "animat virtual culture state 1"
+_HELD = ("held_ns", "held_neuron")
+_MOST_BYTES, _HEADER_BYTES = 2**24, 2**10
+"""Of an array whose length is not the tissue's; and of what numpy writes before each."""
+_AHEAD_NS = 1_000_000_000
+"""The tissue is ahead of the culture's clock by a step for each pulse that came in the middle of one."""
 
 
 def write_state(culture: VirtualCulture, path: str | os.PathLike[str], remarks: Mapping[str, int]) -> None:
@@ -48,10 +56,21 @@ def write_state(culture: VirtualCulture, path: str | os.PathLike[str], remarks: 
 def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[str, int]:
     """Put a state into a culture; see `VirtualCulture.restore_state`."""
     from animat.cultures.tissue.coupling import Kicks
-    from animat.cultures.tissue.kernel import State
-    from animat.cultures.tissue.tissue import Snapshot
+    from animat.cultures.tissue.snapshot import (
+        LONGEST_NS,
+        Snapshot,
+        expect_array,
+        expect_rising,
+        expect_whole,
+        expect_within,
+    )
 
-    head, arrays = _read(Path(path))
+    path = expect_plain_file(path)
+    tissue, visibility = culture._grown()
+    fresh = tissue.snapshot()
+    lengths = {f"state_{name}": values.nbytes for name, values in fresh.state._asdict().items()}
+    lengths |= dict.fromkeys((*(f"kicks_{name}" for name in Kicks._fields), *_HELD, "head"), _MOST_BYTES)
+    head, arrays = _read(path, lengths)
     for name, value in culture.settings.items():
         if head["culture"].get(name) != value:
             again = "remove it to begin anew, or use the same settings"
@@ -60,52 +79,73 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
             raise Mismatch(
                 f"{path}: expected the state of this culture, got another's, which differs in {name}: {again}"
             )
-    tissue, visibility = culture._grown()
     try:
-        fresh = tissue.snapshot()
         snapshot = Snapshot(
             seed=tissue.seed,
             parameters=tissue.parameters,
             now_ns=head["tissue_now_ns"],
             step=head["tissue_step"],
             kicks=Kicks(*(arrays[f"kicks_{name}"] for name in Kicks._fields)),
-            state=State(*(_like(arrays[f"state_{n}"], getattr(fresh.state, n)) for n in State._fields)),
+            state=fresh.state._replace(**{name: arrays[f"state_{name}"] for name in fresh.state._fields}),
         )
+        # Before the other clocks, which are measured by the tissue's.
+        tissue.restore(snapshot)
+        zero_ns, now_ns, remarks = head["zero_ns"], head["now_ns"], head["remarks"]
+        expect_whole("now_ns", now_ns, max(0, snapshot.now_ns - _AHEAD_NS), snapshot.now_ns)
+        expect_whole("zero_ns", zero_ns, 0, now_ns)
+        if not isinstance(remarks, dict):
+            raise InvalidArgument(f"remarks: expected whole numbers by name, got {shown(remarks)}")
+        for name, remark in remarks.items():
+            expect_whole(f"remarks.{shown(name)}", remark, 0, LONGEST_NS)
+        held_ns, held_neuron = (arrays[name] for name in _HELD)
+        for name in _HELD:
+            expect_array(name, arrays[name], np.int64, (len(held_ns),))
+        expect_within("held_ns", held_ns, now_ns, snapshot.now_ns)
+        expect_rising("held_ns", held_ns)
+        expect_within("held_neuron", held_neuron, 0, len(fresh.state.v_mv) - 1)
         selection = Selection.from_dict(head["selection"])
-        held_ns, held_neuron = arrays["held_ns"].astype(np.int64), arrays["held_neuron"].astype(np.int64)
-        zero_ns, now_ns, remarks = int(head["zero_ns"]), int(head["now_ns"]), dict(head["remarks"])
-    except (KeyError, ValueError, TypeError) as error:
+        if selection.array != MAXONE:
+            raise InvalidArgument(f"selection.array: expected the {MAXONE.name}'s, got {shown(selection.array)}")
+    except (KeyError, TypeError, InvalidArgument) as error:
         raise InvalidFile(
-            f"{path}: expected the state of a virtual culture of this version, got {error!r}: remove it to begin anew"
+            f"{path}: expected the state of a virtual culture of this version, got one that cannot be ({error}): "
+            "remove it to begin anew"
         ) from error
-    tissue.restore(snapshot)
     # Only now: a culture that could not be restored is what it was.
     culture._have(tissue, visibility)
     culture._selection = selection
     culture._zero_ns, culture._now_ns = zero_ns, now_ns
     culture._held_ns, culture._held_neuron = held_ns, held_neuron
-    return remarks
+    return dict(remarks)
 
 
-def _like(values: np.ndarray[Any, Any], example: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    if values.shape != example.shape or values.dtype != example.dtype:
-        raise ValueError(f"an array of shape {values.shape} where one of shape {example.shape} belongs")
-    return values
+def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
+    """The state's description and its arrays; nothing is read of a file with others, or with larger ones.
 
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
+    Args:
+        path: the file.
+        lengths: of each array that belongs into it, the most bytes that it has.
+    """
     try:
         # Opened here, because numpy leaves a damaged file open.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            _expect_members(file.zip, lengths)
             arrays = {name: file[name] for name in file.files}
         head = json.loads(str(arrays.pop("head")))
         if head["format"] != FORMAT or not isinstance(head["culture"], dict):
-            raise ValueError(f"format {head['format']!r}")
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
+            raise ValueError(f"format {shown(head['format'])}")
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
         raise InvalidFile(
             f"{path}: expected the whole state of a virtual culture, but it is damaged or something else; "
             "give another, or move it away to begin anew"
         ) from error
     return head, arrays
+
+
+def _expect_members(archive: zipfile.ZipFile, lengths: Mapping[str, int]) -> None:
+    sizes = [(member.filename, member.file_size) for member in archive.infolist()]
+    if sorted(name for name, _ in sizes) != sorted(f"{name}.npy" for name in lengths):
+        raise ValueError("other arrays than a state's")
+    for name, size in sizes:
+        if size > lengths[name.removesuffix(".npy")] + _HEADER_BYTES:
+            raise ValueError(f"{name} is of {size:,} bytes")

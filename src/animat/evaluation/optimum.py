@@ -18,6 +18,7 @@ from animat.evaluation.commands import CLASSES, class_of, commands_after, layers
 from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
+from animat.evaluation.statistics import Interval
 from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import AT_FIRST, NeuronSimulator
@@ -33,6 +34,7 @@ COARSER = 0.75
 _ALIKE = 0.01
 """Returns nearer than this are alike: without any chance in an environment the standard error is 0."""
 
+_MOST_MIB = 16_384
 _TABLES_AT_ONCE_MIB = 400
 
 
@@ -53,6 +55,9 @@ class Optimum:
         without_clock_standard_error: of `without_clock`.
         episodes: that both were measured in; 0 where the controller was not run.
         nodes: of the grid.
+        interval: of the value, for how few responses the simulator was made of (`animat.evaluation.resampling`); None
+            where that was not asked for.
+        left_out: conditions with too few responses to count, with their number.
     """
 
     value: float
@@ -63,6 +68,8 @@ class Optimum:
     without_clock_standard_error: float
     episodes: int
     nodes: int
+    interval: Interval | None = None
+    left_out: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data; None where the controller was not run."""
@@ -71,12 +78,19 @@ class Optimum:
 
     def to_text(self) -> str:
         """In a line: the value and how well it is known."""
-        text = f"best possible return {self.value:.1f} (grid {self.grid_error:.1f})"
+        text = f"best possible return {self.value:.1f}"
+        if self.interval is not None:
+            text += (
+                f", {100 * self.interval.confidence:g} % interval {self.interval.low:.1f} to {self.interval.high:.1f}"
+            )
+        text += f" (grid {self.grid_error:.1f})"
         if self.episodes:
             text += (
                 f"; its controller, run: {self.monte_carlo:.1f} ± {self.standard_error:.1f}, without knowing the time "
                 f"left {self.without_clock:.1f} ± {self.without_clock_standard_error:.1f}"
             )
+        if self.left_out:
+            text += f"; too few responses to count: {', '.join(self.left_out)}"
         return text
 
     def findings(self) -> tuple[Finding, ...]:
@@ -155,6 +169,11 @@ def best_returns(
     progress = Silent() if progress is None else progress
 
     kept_mib = 2 * fine.size * max(layers_of(*case) for case in cases) * robot.episode_limit / 2**20
+    if episodes and kept_mib > _MOST_MIB:
+        raise InvalidArgument(
+            f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, of which "
+            f"they take {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations an episode): take a smaller one"
+        )
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []
     for start in range(0, len(cases), at_once):
@@ -182,6 +201,18 @@ def best_returns(
             )
             progress.update(len(optima), len(cases), f"limit {values[case]:.1f}")
     return tuple(optima)
+
+
+def rough_values(
+    cases: Sequence[Case], grid: Grid, seed: int
+) -> tuple[Float64[np.ndarray, " cases"], tuple[float, float]]:
+    """The values alone, of many cases on a grid of one's own, and what a return can be at least and at most.
+
+    Args:
+        cases, grid, seed: as in `best_returns`.
+    """
+    programme = _Programme(grid, cases)
+    return programme.run(None, seed), programme.bounds
 
 
 def _mean_with_error(returns: Float64[np.ndarray, " episodes"] | None) -> tuple[float, float]:
@@ -239,6 +270,7 @@ class _Programme:
         self._layers = [slice(end - len(of_case), end) for end, of_case in zip(ends, after, strict=True)]
         self.n_layers = ends[-1]
         self._motion = Motion(robot, grid, nodes, uniforms)
+        self.bounds = -math.inf, math.inf
 
     def run(self, tables: _Tables | None, seed: int) -> Float64[np.ndarray, " cases"]:
         """Step back from the end of an episode to its start; the value there, and all values into the tables."""
@@ -249,6 +281,7 @@ class _Programme:
         values = np.zeros(math.prod(shape), np.float32)
         before = np.empty_like(values)
         for remaining, (lowest, highest) in zip(range(self._robot.episode_limit), landings.bounds(), strict=False):
+            self.bounds = lowest, highest
             if tables is not None:
                 tables.keep(remaining, values.reshape(shape))
             step_back(

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from animat.animat import Animat
 from animat.evaluation.optimum import Optimum, best_returns
+from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.mapping import Mapping, Thresholds
 from animat.neurons.responses import Responses
-from animat.neurons.simulator import fit_histogram
+from animat.neurons.simulator import HistogramSimulator, fit_histogram, pooled_percentiles
 from animat.robots.base import Robot
 
 
@@ -57,27 +58,41 @@ def prospects(
     *,
     resolution: float = 0.75,
     episodes: int = 1000,
+    resamples: int = RESAMPLES,
     seed: int = 1,
 ) -> tuple[Prospect, ...]:
     """What the culture of one recording could do at a robot's task, through some mappings.
 
     Args:
-        responses: of the recording; the simulator is the default one, a histogram of 20 bins.
+        responses: of the recording; the simulator is the default one, a histogram of 20 bins. Conditions with fewer
+            than 30 non-burst responses are left out, also for the random stimuli.
         robot: with its task.
         mappings: from responses to commands.
         resolution: of the limit's grid (`best_returns`); the default moves the cartpole's limits by 0.8 at most.
         episodes: of random stimuli, and of the limit's controller.
+        resamples: of the responses, for the limit's interval (`with_intervals`).
         seed: decides every random draw.
 
     Raises:
-        UnusableData: if a condition has no non-burst response.
+        UnusableData: if no condition has 30 non-burst responses.
     """
-    simulator = fit_histogram(responses)
+    every = responses
+    responses, left_out = with_enough_samples(responses)
+
+    def fit(these: Responses) -> HistogramSimulator:
+        made = fit_histogram(these)
+        # The mapping's thresholds are those of all responses, also where some of them are left out.
+        return replace(made, percentiles=pooled_percentiles(every)) if left_out else made
+
+    simulator = fit(responses)
     cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
     best = best_returns(cases, resolution=resolution, episodes=episodes, seed=seed)
+    environments = [environment for environment, _ in cases]
+    best = with_intervals(best, environments, responses, fit, resolution=resolution, resamples=resamples, seed=seed)
     found = []
     for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
         returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns
         error = float(returns.std(ddof=1) / np.sqrt(returns.size))
-        found.append(Prospect(robot.name, mapping.name, float(returns.mean()), error, of_mapping))
+        told = replace(of_mapping, left_out=left_out)
+        found.append(Prospect(robot.name, mapping.name, float(returns.mean()), error, told))
     return tuple(found)

@@ -14,9 +14,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
 from animat.animat import Environment
+from animat.brief import briefly
 from animat.compilation import FAST_TO_COMPILE
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.neurons.simulator import NeuronSimulator
+from animat.robots.base import MOST_AT_ONCE
 from animat.training.policy import Policy
 from animat.training.sac import Layer, Network, draw_action, forward
 
@@ -108,9 +110,26 @@ class Episodes:
         terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
     """
 
+    __repr__ = briefly
+
     returns: Float64[np.ndarray, "actors episodes"]
     lengths: Int64[np.ndarray, "actors episodes"]
     terminated: Bool[np.ndarray, "actors episodes"]
+
+
+def check_at_once(name: str, episodes: int, n_actors: int) -> None:
+    """Refuse episodes that are none, or more than fit: all of them are run side by side.
+
+    Raises:
+        InvalidArgument: by the name of the argument or option.
+    """
+    if episodes < 1:
+        raise InvalidArgument(f"{name}: expected at least 1, got {episodes}")
+    if episodes * n_actors > MOST_AT_ONCE:
+        raise InvalidArgument(
+            f"{name}: expected at most {MOST_AT_ONCE // n_actors:,} each, as {n_actors} run side by side, got "
+            f"{shown(episodes)}"
+        )
 
 
 def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks:
@@ -154,10 +173,9 @@ def roll_out(
         seed: decides every random draw.
 
     Raises:
-        InvalidArgument: for fewer episodes than one, or a seed of more than 32 bits.
+        InvalidArgument: for fewer episodes than one or more than fit, or a seed of more than 32 bits.
     """
-    if episodes < 1:
-        raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    check_at_once("episodes", episodes, n_actors)
     # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
     if not 0 <= seed < 2**32:
         raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")

@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 
 from animat.errors import InvalidArgument
 
+CONFIDENCE = 0.95
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -63,7 +65,7 @@ class Comparison:
         return asdict(self)
 
 
-def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = 0.95) -> Comparison:
+def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = CONFIDENCE) -> Comparison:
     """The two-sided Mann-Whitney U test of two groups, by the normal approximation and exactly, and its effect size.
 
         U_1 = #(first > second) + #(first = second) / 2,    U = min(U_1, n_1 n_2 - U_1),    effect = 1 - 2 U_1 / n_1 n_2
@@ -135,7 +137,9 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
     return float(min(1.0, 2 * norm.sf(z)))
 
 
-def interquartile_mean(samples: ArrayLike, *, confidence: float = 0.95) -> Interval:
+def interquartile_mean(
+    samples: ArrayLike, *, confidence: float = CONFIDENCE, within: tuple[float, float] = (-math.inf, math.inf)
+) -> Interval:
     """The mean of the middle half of samples, with its interval by Student's t.
 
     A quarter of the samples, rounded down, is left out at each end. With g the samples left out at an end, h = n - 2 g,
@@ -149,6 +153,7 @@ def interquartile_mean(samples: ArrayLike, *, confidence: float = 0.95) -> Inter
     Args:
         samples: numbers, shape (samples,).
         confidence: of the interval.
+        within: what the numbers can be at least and at most; the interval ends there.
 
     Raises:
         InvalidArgument: for no samples, numbers that are not finite, or a confidence outside 0 to 1.
@@ -162,12 +167,12 @@ def interquartile_mean(samples: ArrayLike, *, confidence: float = 0.95) -> Inter
     kept = n - 2 * cut
     mean = float(x[cut : n - cut].mean())
     if kept < 2:
-        return Interval(mean, -math.inf, math.inf, confidence)
+        return Interval(mean, *within, confidence)
     from scipy.stats import t
 
     spread = float(np.clip(x, x[cut], x[n - cut - 1]).std(ddof=1))
     half = float(t.ppf((1 + confidence) / 2, kept - 1)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
-    return Interval(mean, mean - half, mean + half, confidence)
+    return Interval(mean, max(mean - half, within[0]), min(mean + half, within[1]), confidence)
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:

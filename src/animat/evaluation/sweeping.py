@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Int32
+
+from animat.compilation import kept_njit
 
 f4 = np.float32
 ONE, TWO, HALF, SIXTH = f4(1), f4(2), f4(0.5), f4(1 / 6)
 
-compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+compiled = kept_njit(error_model="numpy", fastmath={"contract", "nsz"})
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,15 +10,22 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.animat import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch
+from animat.brief import briefly
+from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of
 from animat.evaluation.optimum import Optimum, best_return
+from animat.evaluation.resampling import with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import normalised_score
+from animat.evaluation.verdict import Verdict
+from animat.neurons.kinds import fit_simulator
+from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
 from animat.robots.base import Robot
 from animat.training.policy import Policy
 
@@ -77,6 +84,8 @@ class Evaluation:
         held_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move along.
     """
 
+    __repr__ = briefly
+
     robot: str
     mapping: str | None
     recorded_at_min: float | None
@@ -87,13 +96,25 @@ class Evaluation:
     no_limit: str | None = None
     held_from_min: float | None = None
 
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the policies outperform the controls; None where none were run."""
+        controls = {row.name: row.episodes.returns for row in self.rows[1:]}
+        return Verdict.of(self.rows[0].episodes.returns, controls) if controls else None
+
+    @property
+    def not_met(self) -> tuple[str, ...]:
+        """Names of the findings that say why a closed loop on the culture would not meet these returns."""
+        return tuple(dict.fromkeys(f.name for f in self.findings if f.name in transfer.NAMES))
+
     def score(self, row: Row) -> float | None:
         """The normalised score of a row's mean return, (mean - random) / (limit - random).
 
-        None where no limit is known or it is not above random actions, and for controls that act in something else than
-        what the limit is of: under shuffled delivery nothing can be chosen, and a silent culture is another one.
+        None where no limit is known or it is not above random actions, where conditions are left out of it, which the
+        rows act on too, and for controls that act in something else than what the limit is of: under shuffled delivery
+        nothing can be chosen, and a silent culture is another one.
         """
-        if self.limit is None or row.changed:
+        if self.limit is None or self.limit.left_out or row.changed:
             return None
         random = next(each for each in self.rows if each.name == "random")
         try:
@@ -112,6 +133,9 @@ class Evaluation:
             "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
             "limit": None if self.limit is None else self.limit.to_dict(),
             "no_limit": self.no_limit,
+            "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
+            "verdict": None if self.verdict is None else str(self.verdict),
+            "not_met_in_a_closed_loop": self.not_met,
             "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
         }
 
@@ -121,9 +145,11 @@ class Evaluation:
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
         if self.held_from_min is not None:
             on += f", percentiles held from {self.held_from_min:g} min"
+        width = max(16, *(len(row.name) for row in self.rows))
+        count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         lines = [
-            f"{self.robot}, {on}: {first.shape[0]} policies, {first.shape[1]} episodes each",
-            f"  {'':16} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}"
+            f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each",
+            f"  {'':{width}} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}"
             + ("" if self.limit is None else f"  {'score':>6}"),
         ]
         for row in self.rows:
@@ -132,18 +158,28 @@ class Evaluation:
             score = self.score(row)
             scored = "" if self.limit is None else f"  {'' if score is None else f'{score:.2f}':>6}"
             lines.append(
-                f"  {row.name:16} {told['mean_return']:11.1f}  {error:>5}  {told['mean_length']:10.1f}"
+                f"  {row.name:{width}} {told['mean_return']:11.1f}  {error:>5}  {told['mean_length']:10.1f}"
                 f"  {100 * told['terminated_share']:9.0f} %{scored}  {row.meaning}"
             )
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
-        return "\n".join([*lines, f"  each policy: {each}", *self._limit_lines()])
+        lines.append(f"  each policy: {each}")
+        if self.verdict is not None:
+            lines.append(f"  {self.verdict}")
+        if self.not_met:
+            known = "whether a closed loop on the culture would meet these returns is not known"
+            if self.not_met != (transfer.UNKNOWN,):
+                known = "a closed loop on the culture would not meet these returns"
+            lines.append(f"  {known}: see the warnings ({', '.join(self.not_met)})")
+        return "\n".join([*lines, *self._limit_lines()])
 
     def _limit_lines(self) -> list[str]:
         if self.no_limit is not None:
             return [f"  no best possible return: {self.no_limit}"]
         if self.limit is None:
             return []
-        if not self.rows[0].changed and self.score(self.rows[0]) is None:
+        if self.limit.left_out:
+            meaning = "no score, as the best possible return is without conditions that the rows act on too"
+        elif not self.rows[0].changed and self.score(self.rows[0]) is None:
             meaning = "no score, as the best possible return is not above that of random actions"
         else:
             meaning = "score: (mean return - random) / (best possible return - random)"
@@ -162,6 +198,7 @@ def evaluate(
     seed: int = 1,
     greedy: bool = True,
     robot: Robot[Any] | None = None,
+    controls: Collection[str] | None = None,
     limit_resolution: float | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -177,6 +214,7 @@ def evaluate(
         seed: decides every random draw.
         greedy: whether the most probable action is taken, or one drawn from the policy as in training.
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
+        controls: names of those that are run beside the policies (`animat.evaluation.controls`); None: all.
         limit_resolution: of the grid for the best possible return in the same environment (`best_returns`; a study's is
             1), which takes seconds; None: it is not computed.
         progress: told after the policies and each control, and before the limit.
@@ -205,9 +243,9 @@ def evaluate(
     else:
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
-        findings = _check(first, timeline)
         row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
+        findings = (*_check(first, timeline), *_not_of_a_loop(first, timeline, minute))
         held_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = (timeline if held_from_min is None else timeline.with_first_percentiles()).at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))
@@ -218,10 +256,9 @@ def evaluate(
     trained_in, meaning = environment, "as trained"
     if isinstance(environment, Animat) and first.delivery == "shuffled":
         trained_in, meaning = replace(environment, delivery="shuffled"), "as trained: what is delivered is drawn anew"
-    acting = [
-        Control("policies", meaning, trained_in, simulator, networks, n),
-        *controls_of(environment, simulator, _action_labels(first), networks, n),
-    ]
+    acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
+    every = controls_of(environment, simulator, _action_labels(first), networks, n)
+    acting += [control for control in every if controls is None or control.name in controls]
     if limit_resolution is not None and not 0 < limit_resolution < float("inf"):
         raise InvalidArgument(f"limit_resolution: expected a positive number, got {limit_resolution!r}")
     rows = []
@@ -237,8 +274,8 @@ def evaluate(
         if progress is not None:
             progress.update(len(rows), steps, "best possible return")
         try:
-            limit = best_return(environment, simulator, resolution=limit_resolution, seed=seed)
-        except InvalidArgument as error:
+            limit = _limit(environment, simulator, timeline, minute, held_from_min is not None, limit_resolution, seed)
+        except (InvalidArgument, UnusableData) as error:
             no_limit = str(error)
     return Evaluation(
         body.name,
@@ -251,6 +288,42 @@ def evaluate(
         no_limit,
         held_from_min,
     )
+
+
+def _limit(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    timeline: SimulatorTimeline | None,
+    minute: float | None,
+    are_held: bool,
+    resolution: float,
+    seed: int,
+) -> Optimum:
+    """The best possible return; with its interval, without conditions of few responses, where responses are known."""
+    if not (isinstance(environment, Animat) and simulator is not None and timeline and minute is not None):
+        return best_return(environment, simulator, resolution=resolution, seed=seed)
+    if not timeline.responses:
+        return best_return(environment, simulator, resolution=resolution, seed=seed)
+    responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
+    # The mapping's thresholds are those of all responses, also where some of them are left out.
+    percentiles = simulator.percentiles
+    fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
+
+    def fit(responses: Responses, kind: str) -> NeuronSimulator:
+        made = fit_simulator(responses, kind=kind, **(fitted if kind == "histogram" else {}))
+        return replace(made, percentiles=percentiles) if are_held or left_out else made  # type: ignore[type-var]
+
+    kind = timeline.fitted["kind"]
+    if left_out:
+        environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)
+    best = best_return(environment, simulator, resolution=resolution, seed=seed)
+    # What is remembered changes the optimum, and little how well it is known: that is found without, in a sixth of the
+    # time.
+    spread = "histogram" if simulator.has_memory else kind
+    redrawn = with_intervals(
+        [best], [environment], responses, lambda these: fit(these, spread), resolution=resolution, seed=seed
+    )
+    return replace(redrawn[0], left_out=left_out)
 
 
 def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
@@ -268,17 +341,8 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
                 f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}",
             )
         )
-    given, trained = timeline.fitted, policy.provenance.get("simulators") or {}
-    differing = [name for name in ("kind", "bins", "range_hz") if name in trained and trained[name] != given.get(name)]
-    if differing:
-        found.append(
-            Finding(
-                "other-simulator",
-                "warning",
-                "the policies were trained on simulators made otherwise: "
-                + ", ".join(f"{name} {trained[name]}, here {given.get(name)}" for name in differing),
-            )
-        )
+    found += transfer.other_simulator(policy.fitted, timeline.fitted)
+    trained = policy.provenance.get("simulators") or {}
     first_min = next(iter(trained.get("recorded_at_min", ())), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         found.append(
@@ -289,16 +353,20 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
                 f"of these: here they are held from {timeline.start_min[0]:g} min",
             )
         )
-    if policy.presentation != timeline.presentation:
-        found.append(
-            Finding(
-                "other-presentation",
-                "warning",
-                f"the policies were trained on stimuli presented as {policy.presentation or 'unknown'}, in these "
-                f"recordings they are {timeline.presentation or 'unknown'}, and a culture answers otherwise",
-            )
-        )
     return tuple(found)
+
+
+def _not_of_a_loop(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:
+    """Why returns on the simulator of a minute are not those of a closed loop on the culture."""
+    recorded = policy.presentation
+    yield from transfer.other_presentation(recorded, Presentation("mixed", 1 if recorded is None else recorded.pulses))
+    yield from transfer.other_calibration(recorded, timeline.presentation)
+    yield from transfer.old_calibration(minute, float(timeline.start_min[-1]))
+    has_memory = timeline.simulators.has_memory
+    yield from transfer.no_memory(timeline.findings_at(minute), timeline.presentation, has_memory=has_memory)
+    trained_until = policy.trained_until_min(float(timeline.start_min[0]))
+    if trained_until is not None:
+        yield from transfer.other_recording(float(timeline.start_min[timeline.row_at(trained_until)]), minute)
 
 
 def _action_labels(policy: Policy) -> list[str]:

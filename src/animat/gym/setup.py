@@ -21,7 +21,8 @@ from animat.neurons.series import extract_series
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.neurons.windows import DEFAULT_WINDOW_MS
-from animat.recordings.reading import read_recordings
+from animat.recordings.findings import warnings_once
+from animat.recordings.reading import read_sources
 from animat.robots.registry import robot_named
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -63,7 +64,7 @@ def set_up(
     at_min: float | None = None,
     conditions: str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
-    kind: Kind = "histogram",
+    kind: Kind | None = None,
     delivery: Delivery = "chosen",
     **parameters: float,
 ) -> Setup:
@@ -79,7 +80,7 @@ def set_up(
             first.
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
         window_ms: when a response is read after its stimulus.
-        kind: `histogram` (the paper), `empirical` or `memory`.
+        kind: `histogram` (the paper), `empirical` or `memory`; None: what suits the recordings (`fit_timeline`).
         delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
         parameters: of the robot, `pole_mass_kg=0.55`.
 
@@ -94,7 +95,7 @@ def set_up(
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     if recordings is None:
-        reading = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, "histogram")}
+        reading = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
         for name, (got, usual) in (reading | {"window_ms": (tuple(window_ms), DEFAULT_WINDOW_MS)}).items():
             if got != usual:
                 raise InvalidArgument(f"{name}: expected only with recordings, of which it says how they are read")
@@ -111,12 +112,11 @@ def set_up(
 
 
 def _simulator_of(
-    recordings: Paths, at_min: float | None, conditions: str | None, window_ms: tuple[float, float], kind: Kind
+    recordings: Paths, at_min: float | None, conditions: str | None, window_ms: tuple[float, float], kind: Kind | None
 ) -> tuple[NeuronSimulator, tuple[str, ...]]:
     by = None if conditions is None else conditions_named(conditions)
-    timeline = fit_timeline(extract_series(read_recordings(recordings), by, window_ms), kind=kind)
-    for finding in timeline.findings:
-        if finding.severity == "warning":
-            warnings.warn(finding.sentence, stacklevel=3)
+    timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms), kind=kind)
+    for sentence in warnings_once(timeline.findings):
+        warnings.warn(sentence, stacklevel=3)
     row = 0 if at_min is None else timeline.row_asked_for(at_min)
     return timeline.at(timeline.start_min[row]), tuple(condition.label for condition in timeline.conditions)

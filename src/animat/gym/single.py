@@ -102,4 +102,5 @@ def check_render_mode(render_mode: str | None) -> None:
         InvalidArgument: naming the mode.
     """
     if render_mode not in (None, "rgb_array"):
-        raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")
+        show = "; gymnasium.make shows these pictures in a window, with pygame" if render_mode == "human" else ""
+        raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}{show}")

@@ -11,15 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from animat.closed_loop.gathering import LOG_FILE as SESSION_LOG
+from animat.closed_loop.gathering import RECORDING_FILE
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import LOG_FILE as SESSION_LOG
-from animat.closed_loop.session import RECORDING_FILE, expect_no_file
+from animat.closed_loop.running import check_episodes
+from animat.closed_loop.session import expect_no_file
 from animat.errors import InvalidArgument, Mismatch
 from animat.mapping import N_PERCENTILES
 from animat.neurons.conditions import Condition
 from animat.recordings.protocol import Protocol
 from animat.recordings.schedule import make_schedule
 from animat.training.specification import Training
+from animat.training.trainer import expect_trainable
 from animat.writing import LOCK
 
 LOG_FILE = "live.log"
@@ -80,6 +83,7 @@ def check_plan(
     """
     if training.mapping is None:
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
+    expect_trainable(training, is_saved=True)
     # How long it takes does not depend on which electrodes are pulsed.
     takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), 0).duration_s / 60
     if takes_min > timetable.interval_min:
@@ -87,8 +91,7 @@ def check_plan(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, "
             f"got {timetable.interval_min:g}"
         )
-    if episodes < 1:
-        raise InvalidArgument(f"episodes: expected at least 1, got {episodes}")
+    check_episodes("episodes", episodes)
     of_the_loop = {name: value for name, value in settings.items() if name not in _NOT_OF_THE_LOOP}
     conditions = tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in protocol.frequencies_hz)
     given: dict[str, Any] = {

@@ -85,7 +85,7 @@ def live(
     timetable: Timetable | None = None,
     episodes: int = 5,
     with_controls: bool = False,
-    kind: Kind = "histogram",
+    kind: Kind | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
     **settings: Any,
@@ -109,7 +109,7 @@ def live(
         timetable: when to record.
         episodes: of each policy in closed loop.
         with_controls: all of them between the policies' episodes; if not, only the random one.
-        kind: of simulator.
+        kind: of simulator; None: what suits the protocol (`fit_timeline`).
         account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
         progress: told as the culture's time goes by, and in the closed loop.
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
@@ -165,7 +165,7 @@ class _Run:
         protocol: Protocol,
         folder: Path,
         timetable: Timetable,
-        kind: Kind,
+        kind: Kind | None,
         account: Account,
         progress: Progress | None,
     ) -> None:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import abc
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.recordings.recording import UNKNOWN, Stimuli
 
 NO_CONDITION = -1
 """The index of a stimulus that belongs to no condition."""
+_LONGEST_LABEL = 10_000
+"""A condition may be a set of very many electrodes, and its label names all of them."""
+_LARGEST_VALUE = 2.0**63
 
 
 @dataclass(frozen=True)
@@ -24,11 +28,25 @@ class Condition:
         label: what figures and tables call it, with its unit: `"5 Hz"`, `"electrodes 909+23923"`.
         value: the frequency in Hz; the number of the pattern; the position in the list for electrodes; 0 for "all".
         unit: of `value`: `"Hz"`, or empty for a number that only counts.
+
+    Raises:
+        InvalidArgument: for a label that is no line of text, or a value that is no finite number.
     """
 
     label: str
     value: float
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        told: Any
+        for name, told in (("label", self.label), ("unit", self.unit)):
+            if not isinstance(told, str) or not told.isprintable() or len(told) > _LONGEST_LABEL:
+                raise InvalidArgument(f"condition.{name}: expected a line of text, got {shown(told)}")
+        if not self.label:
+            raise InvalidArgument("condition.label: expected some text, got none")
+        value: Any = self.value
+        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= _LARGEST_VALUE:
+            raise InvalidArgument(f"condition.value: expected a finite number, got {shown(value)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +153,8 @@ class ByInterval(Conditions):
             with np.errstate(divide="ignore"):
                 distance = np.abs(np.log(interval_s[:, None] * np.array(self.values_hz)))
             nearest = np.argmin(distance, axis=1)
-            within = distance.min(axis=1) <= math.log1p(self.tolerance)
+            # 1e-9: times are rounded, so an interval on the edge would be in or out by chance.
+            within = distance.min(axis=1) <= math.log1p(self.tolerance) + 1e-9
             index[1:][within] = nearest[within]
         return Assignment(index, tuple(_frequency(value_hz) for value_hz in self.values_hz))
 

@@ -29,12 +29,13 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     the relative change from a condition's first stimuli to its last; its standard error comes from the residuals.
 
     Args:
-        responses: with their times.
+        responses: with their times; those of a table without any are taken in the order of its rows.
     """
-    if responses.time_s is None or len(responses) < FEWEST:
+    if len(responses) < FEWEST:
         return
+    time_s = np.arange(float(len(responses))) if responses.time_s is None else responses.time_s
     times, relative = [], []
-    span_s = float(responses.time_s[-1] - responses.time_s[0])
+    span_s = float(time_s[-1] - time_s[0])
     if span_s <= 0:
         return
     for i in range(len(responses.conditions)):
@@ -42,11 +43,11 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         mean_hz = float(responses.rate_hz[chosen].mean()) if chosen.any() else 0.0
         if np.count_nonzero(chosen) < 3 or mean_hz <= 0:
             continue
-        presented_s = responses.time_s[responses.condition == i]
+        presented_s = time_s[responses.condition == i]
         of_condition_s = float(presented_s[-1] - presented_s[0])
         if of_condition_s <= 0:
             continue
-        time = responses.time_s[chosen] / of_condition_s
+        time = time_s[chosen] / of_condition_s
         times.append(time - time.mean())
         relative.append(responses.rate_hz[chosen] / mean_hz - 1)
     if not times:
@@ -64,7 +65,8 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         "drift",
         "warning" if large else "note",
         f"responses {'rise' if slope > 0 else 'fall'} by {100 * abs(slope):.0f} % of their mean "
-        f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last (recording: {span_s / 60:.1f} min)"
+        f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last "
+        + ("(in the order of the rows)" if responses.time_s is None else f"(recording: {span_s / 60:.1f} min)")
         + (
             ": one simulator stands for a culture that changes; record for a shorter time, wait until it has settled, "
             "or present conditions mixed, so that drift is not taken for a difference"

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
+from animat.brief import briefly
 from animat.neurons.conditions import NO_CONDITION
 from animat.neurons.responses import Presented, Responses
 from animat.neurons.simulator import AT_FIRST, Answer, EmpiricalSimulator, Stored, fit_empirical
@@ -67,6 +68,8 @@ class MemorySimulator(EmpiricalSimulator):
     Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with one number as its
     memory and without its weights.
     """
+
+    __repr__ = briefly
 
     before: Float[Stored, "*recordings conditions values"]
     after_hz: Float[Stored, "*recordings conditions values"]

@@ -120,17 +120,24 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
     return (float(spikes.sum()) / quiet_s if quiet_s > 0 else float("nan")), quiet_s
 
 
-def find_response(recording: Recording, up_to_ms: float = 500.0) -> ResponseTime | None:
+def find_response(
+    recording: Recording, up_to_ms: float = 500.0, stimuli: Bool[np.ndarray, " stimuli"] | None = None
+) -> ResponseTime | None:
     """When the culture first fires above its spontaneous rate after a stimulus; None where it does not, or is unknown.
 
     The first stretch, from 2 ms on, that begins with three successive bins above b + 3 sqrt(b), b the spikes expected
     spontaneously in a bin, and ends before three successive bins that are not. Bins are 1 ms wide, or up to 10 ms where
     spikes are few. Only stimuli are used that no other pulse follows within the search; where there are few such, the
     search is shortened to the upper quarter of the intervals.
+
+    Args:
+        recording: the spikes and stimuli.
+        up_to_ms: how far after the stimulus is searched.
+        stimuli: which pulses to take, shape (stimuli,); None for those that end a presentation.
     """
     table = recording.stimuli
     rate_hz, _ = spontaneous_rate(recording)
-    read = table.is_last_of_presentation
+    read = table.is_last_of_presentation if stimuli is None else stimuli
     if not read.any() or math.isnan(rate_hz):
         return None
     gap_ms = 1e3 * np.append(np.diff(table.time_s), np.inf)

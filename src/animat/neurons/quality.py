@@ -13,18 +13,16 @@ from animat.neurons.bursts import BurstSeparation
 from animat.neurons.conditions import NO_CONDITION, Assignment
 from animat.neurons.drift_quality import drift_findings
 from animat.neurons.memory_quality import memory_findings
-from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
+from animat.neurons.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.neurons.timing_quality import artefact_findings
 from animat.recordings.findings import Finding
-from animat.recordings.recording import Recording
+from animat.recordings.recording import Recording, Stimuli
 
 if TYPE_CHECKING:
     from animat.neurons.responses import Responses
 
 FEW_SAMPLES = 30
 """Below this many non-burst responses of a condition, its distribution is little more than a guess."""
-LOW_SEPARABILITY = 0.6
-LOW_VALLEY = 0.5
 MANY_BURSTS = 0.25
 SMALL_DIFFERENCE = 0.1
 """Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
@@ -60,18 +58,60 @@ def findings_on(
         )
     return (
         *_left_out(recording, assignment, inside),
-        *_timing(responses, recording),
+        *_timing(responses, recording, assignment),
         *artefact_findings(recording, responses.window_ms),
-        *_conditions(responses),
-        *_bursts(responses, bursts),
-        *_difference(responses),
-        *drift_findings(responses),
-        *memory_findings(responses),
+        *_without_times(responses, bursts),
     )
 
 
+def findings_without_times(
+    responses: Responses, stimuli: Stimuli, assignment: Assignment, bursts: BurstSeparation
+) -> tuple[Finding, ...]:
+    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told.
+
+    Args:
+        responses: the responses.
+        stimuli: what they are responses to.
+        assignment: the condition of every stimulus.
+        bursts: the burst separation.
+    """
+    return (
+        *_without_condition(stimuli, assignment),
+        Finding(
+            "spike-times-unknown",
+            "warning",
+            "the table has no times of spikes, so it cannot be told whether its window holds the response, an artefact "
+            "or a blank, nor how the culture fires without stimuli",
+        ),
+        *_without_times(responses, bursts),
+    )
+
+
+def _without_times(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
+    """What is told by the responses alone."""
+    yield from _conditions(responses)
+    yield from _bursts(responses, bursts)
+    yield from _difference(responses)
+    yield from drift_findings(responses)
+    yield from memory_findings(responses)
+
+
 def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndarray, " stimuli"]) -> Iterator[Finding]:
+    yield from _without_condition(recording.stimuli, assignment)
     read = recording.stimuli.is_last_of_presentation
+    n_read = int(np.count_nonzero(read))
+    late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
+    if late:
+        yield Finding(
+            "window-past-end",
+            "note" if late < 0.05 * n_read else "warning",
+            f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out",
+            float(late),
+        )
+
+
+def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Finding]:
+    read = stimuli.is_last_of_presentation
     n_read = int(np.count_nonzero(read))
     without = int(np.count_nonzero(read & (assignment.condition == NO_CONDITION)))
     if without == n_read:
@@ -89,17 +129,9 @@ def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndar
             f"{without} of {n_read} stimuli belong to no condition and are left out",
             float(without),
         )
-    late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
-    if late:
-        yield Finding(
-            "window-past-end",
-            "note" if late < 0.05 * n_read else "warning",
-            f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out",
-            float(late),
-        )
 
 
-def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
+def _timing(responses: Responses, recording: Recording, assignment: Assignment) -> Iterator[Finding]:
     start_ms, end_ms = responses.window_ms
     stimuli = recording.stimuli
     read = stimuli.is_last_of_presentation
@@ -125,12 +157,9 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
             "stimulus), so it is not known whether the window holds a response",
         )
         return
-    # An artefact that reaches into the window is no response: the busier of the window's first two parts is left out.
-    spikes = int(parts.count.sum() - parts.count[:2].max())
-    expected = (
-        0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * parts.n_stimuli * (1 - 1 / _WINDOW_PARTS)
-    )
-    per_stimulus = expected / max(parts.n_stimuli, 1)
+    spikes = _without_artefact(parts)
+    per_stimulus = 0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * (1 - 1 / _WINDOW_PARTS)
+    expected = per_stimulus * parts.n_stimuli
     elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
     if spikes <= expected:
         yield Finding(
@@ -147,7 +176,9 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
             ),
             spikes / expected if expected else 0.0,
         )
-    elif response and elsewhere:
+        return
+    yield from _dead_conditions(responses, recording, assignment, per_stimulus)
+    if response and elsewhere:
         yield Finding(
             "response-elsewhere",
             "warning",
@@ -165,12 +196,46 @@ def _timing(responses: Responses, recording: Recording) -> Iterator[Finding]:
         )
 
 
+def _without_artefact(parts: PostStimulusHistogram) -> int:
+    """Spikes in the window; an artefact that reaches into it, in the busier of its first two parts, is no response."""
+    return int(parts.count.sum() - parts.count[:2].max())
+
+
+def _dead_conditions(
+    responses: Responses, recording: Recording, assignment: Assignment, per_stimulus: float
+) -> Iterator[Finding]:
+    """Conditions whose window is dead though that of all together is not."""
+    start_ms, end_ms = responses.window_ms
+    dead, worst = [], math.inf
+    for i, condition in enumerate(assignment.conditions if len(assignment.conditions) > 1 else ()):
+        of = recording.stimuli.is_last_of_presentation & (assignment.condition == i)
+        parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS, of)
+        if parts.n_stimuli and _without_artefact(parts) <= per_stimulus * parts.n_stimuli:
+            spikes = _without_artefact(parts) / parts.n_stimuli
+            later = find_response(recording, stimuli=of)
+            at = f"; its response is at {later.start_ms:g} to {later.end_ms:g} ms" if later else ""
+            dead.append(f"{condition.label} ({spikes:.2f}{at})")
+            worst = min(worst, spikes)
+    if dead:
+        listed = ", ".join(dead[:8]) + (f" and {len(dead) - 8} more" if len(dead) > 8 else "")
+        yield Finding(
+            "dead-condition",
+            "warning",
+            f"after stimuli of some conditions the window from {start_ms:g} to {end_ms:g} ms holds no more spikes than "
+            f"as much time before a stimulus, {per_stimulus:.2f} (without an eighth at its start): {listed}; what is "
+            "in it is no response: leave them out, or use a window that suits all",
+            worst,
+        )
+
+
 def _conditions(responses: Responses) -> Iterator[Finding]:
     for i, condition in enumerate(responses.conditions):
         n_all = int(np.count_nonzero(responses.condition == i))
         n = len(responses.rates_of(i))
         if not n:
-            what = "no stimulus" if not n_all else f"{n_all} stimuli, all of them bursts"
+            what = (
+                "no stimulus" if not n_all else f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
+            )
             yield Finding(
                 "empty-condition",
                 "refuse",
@@ -188,20 +253,22 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
 
 def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
     n_bursts = int(np.count_nonzero(responses.is_burst))
+    values = f"separability {bursts.separability:.2f}, valley {bursts.valley:.2f}"
     if not n_bursts:
+        if not math.isnan(bursts.rejected):
+            above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
+            yield Finding(
+                "bursts-not-separable",
+                "note",
+                f"no response is set apart as a burst, as the ratios of active channels do not form two groups: Otsu's "
+                f"threshold, {bursts.rejected:.3f}, would part {above} of {len(responses)} responses from the others "
+                f"({values})",
+                bursts.separability,
+            )
         return
     share = n_bursts / len(responses)
     dropped = f"{n_bursts} of {len(responses)} responses ({100 * share:.1f} %) are set apart as bursts"
-    if bursts.separability < LOW_SEPARABILITY or bursts.valley < LOW_VALLEY:
-        yield Finding(
-            "bursts-not-separable",
-            "warning",
-            f"the burst separation separates nothing: the ratios of active channels form no two groups (separability "
-            f"{bursts.separability:.2f}, where one bell-shaped group gives 0.64; valley between the groups "
-            f"{bursts.valley:.2f} of 1), yet {dropped}: use --burst-threshold 1 to keep them",
-            bursts.separability,
-        )
-    elif share > MANY_BURSTS:
+    if share > MANY_BURSTS:
         yield Finding(
             "many-bursts",
             "warning",
@@ -213,8 +280,7 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
         yield Finding(
             "bursts",
             "note",
-            f"{dropped} (above {responses.threshold:.3f} of the channels active; separability "
-            f"{bursts.separability:.2f}, valley {bursts.valley:.2f})",
+            f"{dropped} (above {responses.threshold:.3f} of the channels active; {values})",
             share,
         )
 

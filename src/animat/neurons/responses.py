@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from animat.brief import briefly
 from animat.errors import Mismatch, UnusableData
 from animat.neurons.bursts import separate_bursts
 from animat.neurons.conditions import NO_CONDITION, Condition, Conditions, default_conditions
@@ -31,6 +33,8 @@ class Presented:
         is_burst: whether the response was one, shape (presentations,).
         is_rested: whether there was no pulse in the `SILENCE_S` before it, shape (presentations,).
     """
+
+    __repr__ = briefly
 
     condition: Int64[np.ndarray, " presentations"]
     rate_hz: Float64[np.ndarray, " presentations"]
@@ -58,8 +62,10 @@ class Responses:
         conditions: what the agent can choose from, in the order of their index.
         window_ms: start and end of the window, after the last pulse of each presentation.
         n_channels: channels that x is a mean over.
-        threshold: of the active ratio, by Otsu's method unless it was given; NaN without responses.
-        separability: between-class over total variance of the active ratio (see `animat.neurons.bursts`).
+        threshold: of the active ratio, by Otsu's method unless it was given; 1 where that separates nothing, NaN
+            without responses.
+        separability: between-class over total variance of the active ratio, of Otsu's classes or of those that a given
+            threshold makes; NaN where that leaves one (see `animat.neurons.bursts`).
         presentation: how stimuli were presented, None where it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         findings: what was noticed about them.
@@ -68,10 +74,14 @@ class Responses:
         presented: all presentations of the recording, also those without a condition; None: these responses are all,
             one soon after the other (see `presentations`).
         place: where among them each response is, shape (responses,).
+        by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None where it is not known.
+        burst_threshold: the threshold that was given in place of Otsu's; None: none was.
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
     """
+
+    __repr__ = briefly
 
     condition: Int64[np.ndarray, " responses"]
     rate_hz: Float64[np.ndarray, " responses"]
@@ -88,6 +98,8 @@ class Responses:
     time_s: Float64[np.ndarray, " responses"] | None = None
     presented: Presented | None = None
     place: Int64[np.ndarray, " responses"] | None = None
+    by: str | None = None
+    burst_threshold: float | None = None
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {
@@ -176,6 +188,25 @@ class Responses:
             place=place[drawn],
         )
 
+    def only(self, conditions: Sequence[int]) -> Responses:
+        """The responses to some conditions, by index; what was presented before them is kept."""
+        index = np.full(len(self.conditions) + 1, NO_CONDITION)
+        index[list(conditions)] = np.arange(len(conditions))
+        presented, place = self.presentations
+        kept = index[self.condition] != NO_CONDITION
+        return replace(
+            self,
+            condition=index[self.condition[kept]],
+            rate_hz=self.rate_hz[kept],
+            active_ratio=self.active_ratio[kept],
+            is_burst=self.is_burst[kept],
+            conditions=tuple(self.conditions[i] for i in conditions),
+            time_s=None if self.time_s is None else self.time_s[kept],
+            # No condition is the last index, -1, and stays none.
+            presented=replace(presented, condition=index[presented.condition]),
+            place=place[kept],
+        )
+
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
         """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""
         median_hz = self.median_rate_hz
@@ -209,14 +240,16 @@ def extract_responses(
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
         UnusableData: for a recording without channels.
 
-    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels).
+    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
+        only where it finds two groups).
     """
     check_window(window_ms)
     n_channels = len(recording.channels)
     if not n_channels:
         raise UnusableData("channels: expected at least one, got a recording without any; x is a mean over channels")
     stimuli = recording.stimuli
-    assignment = (by or default_conditions(stimuli)).assign(stimuli)
+    by = by or default_conditions(stimuli)
+    assignment = by.assign(stimuli)
     # An end that is the last stimulus' or spike's own time is rounded like them.
     inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
     presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
@@ -224,7 +257,7 @@ def extract_responses(
     rate_hz, active_ratio = read_windows(recording, stimuli.time_s[presented], window_ms)
     chosen = assignment.condition[presented] != NO_CONDITION
     used = presented[chosen]
-    bursts = separate_bursts(active_ratio[chosen], burst_threshold)
+    bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
     # Between the pulses of a presentation there is no silence, however long it lasts.
     silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
     is_rested = np.diff(silences[presented], prepend=0) > 0
@@ -243,5 +276,7 @@ def extract_responses(
         time_s=stimuli.time_s[used],
         presented=Presented(assignment.condition[presented], rate_hz, active_ratio > bursts.threshold, is_rested),
         place=np.flatnonzero(chosen),
+        by=str(by),
+        burst_threshold=burst_threshold,
     )
     return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
+from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.responses import Responses
 
@@ -88,6 +89,8 @@ class HistogramSimulator(NeuronSimulator):
         percentiles: as in `NeuronSimulator`.
     """
 
+    __repr__ = briefly
+
     cumulative: Float[Stored, "*recordings conditions edges"]
     edges_hz: Float[Stored, "*recordings edges"]
     percentiles: Float[Stored, "*recordings percentiles"]
@@ -117,6 +120,8 @@ class EmpiricalSimulator(NeuronSimulator):
         counts: how many of them there are, shape (conditions,).
         percentiles: as in `NeuronSimulator`.
     """
+
+    __repr__ = briefly
 
     values_hz: Float[Stored, "*recordings conditions values"]
     counts: Int[Stored, "*recordings conditions"]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
+from animat.brief import briefly
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import Fidelity, fidelity
@@ -28,6 +29,10 @@ _MEMORY_OF_BLOCKS = Finding(
 )
 
 
+ALONE_MIN = 10.0
+"""For which the simulator of a single recording holds: the paper's interval."""
+
+
 @dataclass(frozen=True, eq=False)
 class SimulatorTimeline:
     """Simulators of one culture, one a recording, stacked, with the minutes they were recorded at.
@@ -39,10 +44,14 @@ class SimulatorTimeline:
         window_ms: the response window.
         presentation: how stimuli were presented, None where it is not known.
         fidelities: what each simulator keeps of its responses.
-        fitted: how the simulators were made of responses, for whoever comes later: `kind`, `bins`, `range_hz`, and
-            `burst_thresholds`, the share of active channels above which a response was left out of each.
+        fitted: how the simulators were made of responses, for whoever comes later: `kind`, `bins`, `range_hz`; `by`,
+            the rule of the conditions; `burst_threshold`, where one was given; and `burst_thresholds`, the share of
+            active channels above which a response was left out of each.
         findings: what was noticed in the recordings and in the fits, with the minute in front.
+        responses: that the simulators were made of; none where they come from elsewhere.
     """
+
+    __repr__ = briefly
 
     simulators: NeuronSimulator
     start_min: Float64[np.ndarray, " recordings"]
@@ -52,9 +61,20 @@ class SimulatorTimeline:
     fidelities: tuple[Fidelity, ...]
     findings: tuple[Finding, ...]
     fitted: dict[str, Any] = field(default_factory=dict)
+    responses: tuple[Responses, ...] = ()
 
     def __len__(self) -> int:
         return len(self.start_min)
+
+    @property
+    def span_min(self) -> float:
+        """Minutes from the first recording to one usual interval after the last, for which its simulator holds."""
+        gaps_min = np.diff(self.start_min)
+        return float(self.start_min[-1] - self.start_min[0] + (np.median(gaps_min) if len(gaps_min) else ALONE_MIN))
+
+    def findings_at(self, start_min: float) -> tuple[Finding, ...]:
+        """What was noticed in the recording that started at a minute, and in its simulator."""
+        return tuple(finding for finding in self.findings if finding.at_min == start_min)
 
     def row_at(self, minute: float) -> int:
         """The newest recording at a minute: the last one that started at or before it (before all: the first)."""
@@ -86,14 +106,15 @@ class SimulatorTimeline:
 
 
 def fit_timeline(
-    series: Sequence[Responses], *, kind: Kind = "histogram", bins: int = 20, range_hz: float | None = None
+    series: Sequence[Responses], *, kind: Kind | None = None, bins: int = 20, range_hz: float | None = None
 ) -> SimulatorTimeline:
     """Fit a simulator to each recording's responses and stack them in the order of time.
 
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
         kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one that was measured
-            after a past like the present one).
+            after a past like the present one); None: `"memory"`, but `"histogram"` where stimuli were presented in
+            blocks, which hold nothing of what a culture answers after another condition.
         bins: of a histogram.
         range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
             percentiles are the edges (`fit_histogram`).
@@ -107,6 +128,9 @@ def fit_timeline(
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
+    blocked = first.presentation is not None and first.presentation.order == "blocked"
+    if kind is None:
+        kind = "histogram" if blocked else "memory"
     for other in ordered[1:]:
         for name in ("conditions", "window_ms", "presentation"):
             if getattr(other, name) != getattr(first, name):
@@ -123,11 +147,11 @@ def fit_timeline(
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(
-        replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}")
+        replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}", at_min=responses.start_min)
         for responses, kept in zip(ordered, fidelities, strict=True)
         for finding in (*responses.findings, *kept.findings(of_memory=kind == "memory"))
     )
-    if kind == "memory" and first.presentation is not None and first.presentation.order == "blocked":
+    if kind == "memory" and blocked:
         findings += (_MEMORY_OF_BLOCKS,)
     return SimulatorTimeline(
         simulators=jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted),
@@ -141,8 +165,11 @@ def fit_timeline(
             "kind": kind,
             "bins": bins if kind == "histogram" else None,
             "range_hz": range_hz if kind == "histogram" else None,
+            "by": first.by,
+            "burst_threshold": first.burst_threshold,
             "burst_thresholds": [float(responses.threshold) for responses in ordered],
         },
+        responses=tuple(ordered),
     )
 
 

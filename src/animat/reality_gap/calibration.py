@@ -17,7 +17,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
-from animat.training.policy import Policy
+from animat.training.policy import FITTED, Policy
 
 REDRAWN = 100
 """Bootstrap samples of the recording's responses."""
@@ -35,7 +35,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         conditions, window_ms, presentation: of the recording.
         findings: what was noticed.
-        fitted: how the simulators were made: `kind`, `bins`, `range_hz`.
+        fitted: how the simulators were made, as `Policy.fitted`.
     """
 
     simulator: NeuronSimulator
@@ -61,7 +61,7 @@ class Calibration:
         policy: Policy | None = None,
         *,
         at_min: float | None = None,
-        kind: Kind = "histogram",
+        kind: Kind | None = None,
         bins: int = 20,
         range_hz: float | None = None,
     ) -> Self:
@@ -76,13 +76,12 @@ class Calibration:
         Raises:
             InvalidArgument, Mismatch, UnusableData: as `fit_timeline` does.
         """
-        fit: dict[str, Any] = {"kind": kind, "bins": bins, "range_hz": range_hz}
-        timeline = fit_timeline(series, **fit)
-        trained = {} if policy is None else policy.provenance.get("training", {})
+        timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
+        fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}
         if at_min is None:
-            at_min = float(timeline.start_min[-1] if policy is None else timeline.start_min[0])
-            if trained.get("shadowing"):
-                at_min += trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"]
+            first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
+            trained_until = None if policy is None else policy.trained_until_min(first_min)
+            at_min = last_min if policy is None else first_min if trained_until is None else trained_until
         row = timeline.row_asked_for(at_min)
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)
@@ -99,10 +98,10 @@ class Calibration:
             conditions=timeline.conditions,
             window_ms=timeline.window_ms,
             presentation=timeline.presentation,
-            findings=tuple(f for f in timeline.findings if f.sentence.startswith(f"at {start_min:g} min: ")),
-            fitted={name: timeline.fitted[name] for name in fit},
+            findings=timeline.findings_at(start_min),
+            fitted={name: timeline.fitted[name] for name in FITTED},
         )
-        held = trained.get("percentiles") == "first"
+        held = policy is not None and policy.percentiles == "first"
         return calibration.holding(timeline.with_first_percentiles().at(start_min).percentiles) if held else calibration
 
     def holding(self, percentiles: Any) -> Self:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +21,9 @@ from animat.cultures.budget import Account
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
-from animat.evaluation.statistics import compare
+from animat.evaluation.resampling import too_few
+from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
+from animat.evaluation.verdict import beside
 from animat.progress import Progress
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Predicted, predict
@@ -28,8 +32,6 @@ from animat.recordings.findings import Finding
 from animat.robots.steering import STEERED
 from animat.training.policy import Policy
 
-OLD_MIN = 30.0
-"""Age of a recording from which on a warning says that the culture may be another by now."""
 LIMIT_RESOLUTION = 0.6
 """Of the grid of the best possible return: fast and rough, 0.5 of the cartpole's 200."""
 
@@ -84,12 +86,7 @@ def run_policies(
     if follow:
         settings["following"] = calibration.responses_hz
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
-    if calibration.presentation is not None and calibration.presentation != first.presentation:
-        sentence = (
-            f"the prediction is from a recording presented {calibration.presentation}, the policies' recordings were "
-            f"{first.presentation or 'unknown'}"
-        )
-        findings += (Finding("other-calibration", "warning", sentence),)
+    findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":
         sentence = (
             "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
@@ -108,22 +105,11 @@ def run_policies(
             "--thresholds held they are as in training"
         )
         findings += (Finding("moving-percentiles", "warning", sentence),)
-    age_min = culture.now_s / 60 - calibration.start_min
-    if age_min > OLD_MIN:
-        sentence = (
-            f"percentiles and prediction are of {calibration.start_min:.0f} min, and the culture is at "
-            f"{culture.now_s / 60:.0f} min: cultures drift; take a later recording (--at-min), or train on later ones"
-        )
-        findings += (Finding("old-calibration", "warning", sentence, age_min),)
-    remembers = next((finding for finding in calibration.findings if finding.name == "memory"), None)
-    if remembers is not None and not calibration.simulator.has_memory:
-        blocked = calibration.presentation is not None and calibration.presentation.order == "blocked"
-        remedy = "record with --order mixed" if blocked else "--simulator memory"
-        sentence = f"{remembers.sentence}: what is lived will be something else than predicted ({remedy})"
-        findings += (Finding("no-memory", "warning", sentence, remembers.value),)
-    if first.fitted and first.fitted != calibration.fitted:
-        sentence = f"the policies were trained on simulators made otherwise ({first.fitted}) than the one that predicts"
-        findings += (Finding("other-simulator", "warning", f"{sentence} ({calibration.fitted})"),)
+    findings += (
+        *other_simulator(first.fitted, calibration.fitted),
+        *old_calibration(calibration.start_min, culture.now_s / 60),
+        *no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory),
+    )
     account = account or Account()
 
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
@@ -143,6 +129,13 @@ def run_policies(
     else:
         contenders.append(random_control(len(loop.conditions)))
 
+    # Beside the prediction, on another core: it takes as long. Nothing else runs any more when the loop does.
+    limit = None
+    if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
+        sentence = f"no best possible return, as these conditions have too few responses: {', '.join(few)}"
+        findings += (Finding("no-limit", "note", sentence),)
+    else:
+        limit = _meanwhile(lambda: best_return(environment, simulator, resolution=LIMIT_RESOLUTION, episodes=0).value)
     predicted = predict(
         [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
         environment,
@@ -153,7 +146,9 @@ def run_policies(
         seed=seed,
         progress=progress,
     )
-    limit = best_return(environment, simulator, resolution=LIMIT_RESOLUTION, episodes=0).value
+    if limit is not None and progress is not None:
+        progress.update(0, 1, "best possible return")
+    best = None if limit is None else limit()
     session = run_session(
         culture, loop, contenders, folder, episodes=episodes, seed=seed, account=account, progress=progress
     )
@@ -163,13 +158,28 @@ def run_policies(
         loop.mapping.name,
         loop,
         calibration.start_min,
-        limit,
+        best,
         rows,
         session,
         account,
         (*noticed, *findings, *calibration.findings),
         calibration.simulator.has_memory,
     )
+
+
+def _meanwhile(compute: Callable[[], float]) -> Callable[[], float]:
+    """Begin to compute in a thread of its own; what is returned waits for the result, or raises what was raised."""
+    found: Future[float] = Future()
+
+    def work() -> None:
+        try:
+            found.set_result(compute())
+        except BaseException as error:
+            found.set_exception(error)
+
+    # A daemon: whoever stops while it computes need not wait for it.
+    threading.Thread(target=work, name="best possible return", daemon=True).start()
+    return found.result
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
@@ -207,20 +217,20 @@ def _rows(
     contenders: Sequence[Contender], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
 ) -> tuple[Row, ...]:
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
-        whole = [episode for episode in session.episodes if episode.contender in of and episode.is_whole]
-        ticks = [tick for tick in session.ticks if tick.contender in of and tick.handled != "lead-in"]
-        actions = max(1, sum(tick.command is not None for tick in ticks))
+        episodes = [episode for episode in session.episodes if episode.contender in of]
+        acted = [episode.acted for episode in episodes]
+        actions = max(1, sum(each.actions for each in acted))
+        presentations = max(1, sum(each.presentations for each in acted))
         return Row(
             name=name,
             meaning=meaning,
             predicted=np.concatenate([predicted[each].returns for each in of]),
             predicted_anew=np.mean([predicted[each].anew for each in of], axis=0),
-            lived=np.array([episode.total for episode in whole], np.float64),
-            pulses_per_action=sum(len(tick.pulse_time_s) for tick in ticks) / actions,
-            seconds_per_action=sum(session.log.header["loop"]["pulses"] / tick.frequency_hz for tick in ticks)
-            / actions,
-            bursts=sum(tick.is_burst for tick in ticks) / max(1, len(ticks)),
-            late=sum(tick.late_s > 0 for tick in ticks) / max(1, len(ticks)),
+            lived=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
+            pulses_per_action=sum(each.pulses for each in acted) / actions,
+            seconds_per_action=sum(each.pulses_s for each in acted) / actions,
+            bursts=sum(each.bursts for each in acted) / presentations,
+            late=sum(each.late for each in acted) / presentations,
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
@@ -232,7 +242,6 @@ def _rows(
             continue
         control = row(contender.name, contender.meaning, [contender.name])
         if len(control.lived) and len(policies.lived):
-            comparison = compare(control.lived, policies.lived)
-            control = replace(control, p=comparison.p_normal, wins=(comparison.effect.value + 1) / 2)
+            control = replace(control, beside=beside(policies.lived, control.lived))
         rows.append(control)
     return tuple(rows)

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.closed_loop.gathering import in_words
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import Session, told_left_out, told_unanswered
+from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
-from animat.evaluation.statistics import Interval, compare
+from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.evaluation.verdict import Beside, Verdict
 from animat.recordings.findings import Finding
 
-CONFIDENCE = 0.95
-BEATEN_P = 0.01
 _RESAMPLES = 10_000
 
 
@@ -32,8 +32,7 @@ class Row:
         seconds_per_action: of the culture's time.
         bursts: share of responses that were.
         late: share of presentations that came late.
-        p: that the policies' lived returns are no other than these (two-sided, by rank); None for the policies.
-        wins: share of pairs in which the policies' lived return is larger, ties half; None for the policies.
+        beside: the policies' lived returns beside these; None for the policies, and where either has none.
     """
 
     name: str
@@ -45,8 +44,7 @@ class Row:
     seconds_per_action: float
     bursts: float
     late: float
-    p: float | None = None
-    wins: float | None = None
+    beside: Beside | None = None
 
     @property
     def prediction(self) -> Interval:
@@ -83,8 +81,8 @@ class Row:
             "seconds_per_action": self.seconds_per_action,
             "bursts": self.bursts,
             "late": self.late,
-            "p": self.p,
-            "wins": self.wins,
+            "p": None if self.beside is None else self.beside.p,
+            "wins": None if self.beside is None else self.beside.wins,
         }
 
 
@@ -96,7 +94,8 @@ class RealityGap:
         robot, mapping: names.
         loop: the settings of the closed loop.
         calibrated_at_min: of the recording that predicted.
-        limit: the best possible return on that recording's simulator, of any controller (`animat.evaluation.optimum`).
+        limit: the best possible return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
+            None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
         session: as it was lived.
         account: of the stimulation.
@@ -108,7 +107,7 @@ class RealityGap:
     mapping: str
     loop: Loop
     calibrated_at_min: float
-    limit: float
+    limit: float | None
     rows: tuple[Row, ...]
     session: Session
     account: Account
@@ -116,39 +115,26 @@ class RealityGap:
     has_memory: bool = False
 
     @property
-    def not_beaten(self) -> tuple[str, ...] | None:
-        """Controls that the policies do not live larger returns than (p < 0.01, by rank); None if none was lived."""
-        controls = [row for row in self.rows if row.p is not None]
-        beaten = [row for row in controls if row.p is not None and row.p < BEATEN_P and (row.wins or 0) > 0.5]
-        return tuple(row.name for row in controls if row not in beaten) if controls else None
+    def beside_controls(self) -> Verdict | None:
+        """Whether the policies outperform each control that was run to the end of an episode; None if none was."""
+        controls = {row.name: row.beside for row in self.rows if row.beside is not None}
+        return Verdict(controls) if controls else None
 
     @property
     def gap_share(self) -> float | None:
         """The policies' gap as a share of what there is to win: of the range from predicted random to the limit."""
+        if self.limit is None:
+            return None
         range_ = self.limit - next(row for row in self.rows if row.name == "random").predicted.mean()
         return float(self.rows[0].gap.value / range_) if len(self.rows[0].lived) and range_ > 0 else None
 
     def verdict(self) -> str:
-        """Whether the policies beat the controls, by how much they do not, and what the gap may come from."""
-        names, policies = self.not_beaten, self.rows[0]
-        if names is None:
+        """Whether the policies outperform the controls, and what the gap may come from."""
+        beside, policies = self.beside_controls, self.rows[0]
+        if beside is None:
             who = "no control" if len(policies.lived) else "no episode of a policy"
             return f"{who} was lived to its end: nothing can be said of the policies beside the controls"
-        fewest = min(len(row.lived) for row in self.rows if row.p is not None)
-        if not _can_tell(len(policies.lived), fewest):
-            said = (
-                f"{len(policies.lived)} episodes of the policies beside {fewest} of a control are too few to tell (p < "
-                f"{BEATEN_P:g}) whether they live larger returns"
-            )
-        elif not names:
-            said = f"the policies live larger returns than each control (p < {BEATEN_P:g})"
-        else:
-            rows = {row.name: row for row in self.rows}
-            told = ", ".join(f"{name} ({100 * (rows[name].wins or 0):.0f} %)" for name in names)
-            said = (
-                f"the policies do not live larger returns (p < {BEATEN_P:g}) than: {told}; in brackets, the pairs of "
-                "episodes in which theirs is larger"
-            )
+        said = str(beside)
         if policies.gap.high < 0:
             said += "; they live less than predicted: a culture tires, which no simulator does"
             said += "" if self.has_memory else ", and remembers, which only one with memory does"
@@ -164,7 +150,7 @@ class RealityGap:
             "limit": self.limit,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
-            "not_beaten": self.not_beaten,
+            "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
             "verdict": self.verdict(),
             "session": self.session.to_dict(),
             "folder": str(self.session.folder),
@@ -188,7 +174,7 @@ class RealityGap:
                 gap = told["gap"]
                 between = "unknown" if gap["low"] is None else f"{gap['low']:+.1f} to {gap['high']:+.1f}"
                 lived = f"{told['lived']:8.1f} {gap['value']:+7.1f}  {between:>16}"
-            p = "" if row.p is None else f"{row.p:.2g}"
+            p = "" if row.beside is None else f"{row.beside.p:.2g}"
             lines.append(
                 f"  {row.name:16} {told['predicted']:9.1f}  {anew:>16} {lived} {len(row.lived):8} "
                 f"{row.pulses_per_action:13.1f} {p:>8}  {row.meaning}"
@@ -198,7 +184,8 @@ class RealityGap:
             if self.gap_share is None
             else (f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it")
         )
-        lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
+        if self.limit is not None:
+            lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies live no other returns than this control; stimulation: {self.account}")
@@ -209,7 +196,7 @@ class RealityGap:
         if outline["unanswered_pulses"]:
             lines.append(f"  {told_unanswered(self.session)}")
         if self.session.left_out:
-            lines.append(f"  left out: {told_left_out(self.session)}")
+            lines.append(f"  left out: {in_words(self.session.left_out)}")
         return "\n".join(lines)
 
 
@@ -223,11 +210,6 @@ def _between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
 def _finite(interval: Interval) -> dict[str, float | None]:
     """As plain data; JSON knows no infinity."""
     return {name: value if np.isfinite(value) else None for name, value in interval.to_dict().items()}
-
-
-def _can_tell(policies: int, control: int) -> bool:
-    """Whether that many episodes could come to a small p at all: if every return of the one is above the other's."""
-    return compare(np.arange(control), control + np.arange(policies)).p_normal < BEATEN_P
 
 
 def _resampled_means(

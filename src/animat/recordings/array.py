@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
+
+_MOST = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,9 @@ class ElectrodeArray:
         pitch_um: distance between neighbours, in both directions.
         channels: electrodes that can be recorded at once.
         stimulation_units: electrodes that can be stimulated at once.
+
+    Raises:
+        InvalidArgument: for counts that are no whole numbers above 0, or a distance that is none.
     """
 
     name: str
@@ -28,6 +34,17 @@ class ElectrodeArray:
     pitch_um: float
     channels: int
     stimulation_units: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise InvalidArgument(f"array.name: expected text, got {shown(self.name)}")
+        for name in ("columns", "rows", "channels", "stimulation_units"):
+            count: Any = getattr(self, name)
+            if not isinstance(count, int | np.integer) or isinstance(count, bool) or not 1 <= count <= _MOST:
+                raise InvalidArgument(f"array.{name}: expected a whole number from 1 to {_MOST:,}, got {shown(count)}")
+        pitch_um: Any = self.pitch_um
+        if not isinstance(pitch_um, int | float) or not 0 < pitch_um <= _MOST:
+            raise InvalidArgument(f"array.pitch_um: expected a distance above 0 um, got {shown(pitch_um)}")
 
     def __len__(self) -> int:
         return self.columns * self.rows

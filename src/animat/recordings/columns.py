@@ -13,9 +13,12 @@ from animat.errors import UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.noticed import as_provenance
 from animat.recordings.protocol import Order, Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli, expect_times
 
 Column = np.ndarray[Any, Any]
+
+LONGEST_TEXT = 1_000
+"""Characters of a name: an array has room in each row for the longest of all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +74,16 @@ class PlainColumns:
         Raises:
             UnusableData: naming the column, what was expected and what came.
         """
+        for name in ("spike_channel", "channel_label", "stimulus_pattern"):
+            column = getattr(self, name)
+            if column is not None and (width := _width(column)) > LONGEST_TEXT:
+                raise UnusableData(f"{name}: expected names of at most {LONGEST_TEXT:,} characters, got {width:,}")
         noted = [*findings]
         spike_time_s, spikes_in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
         stimulus_time_s, stimuli_in_time = _in_time("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
         channels, rows = self._channels(len(spike_time_s), noted)
         patterns, names = self._patterns(len(stimulus_time_s))
         start_s, duration_s = self._span(spike_time_s, stimulus_time_s)
-        if self.sampling_rate_hz <= 0:
-            raise UnusableData(f"sampling_rate_hz: expected a positive rate in Hz, got {self.sampling_rate_hz:g}")
-        if not np.isfinite(self.start_min):
-            raise UnusableData(f"start_min: expected finite minutes, got {self.start_min:g}")
         stimuli = Stimuli(
             time_s=stimulus_time_s,
             frequency_hz=self._frequencies(len(stimulus_time_s))[stimuli_in_time],
@@ -214,17 +217,16 @@ def _in_time(
     times_s = _numbers(name, np.asarray(column))
     if times_s.ndim != 1:
         raise UnusableData(f"{name}: expected one column of times in seconds, got shape {times_s.shape}")
-    wrong = np.count_nonzero(~np.isfinite(times_s))
-    if wrong:
-        raise UnusableData(f"{name}: expected finite times in seconds, got {wrong} of {len(times_s)} NaN or infinite")
+    expect_times(name, times_s)
     order = np.argsort(times_s, kind="stable")
-    early = np.count_nonzero(np.diff(times_s) < 0)
+    # Later than one that stands anywhere before it, not only just before it.
+    early = np.count_nonzero(times_s < np.maximum.accumulate(times_s)) if len(times_s) else 0
     if early:
         noted.append(
             Finding(
                 f"unsorted-{events}",
                 "note",
-                f"{early:,} of {len(times_s):,} {events} came after a later one in the file: sorted by time",
+                f"{early:,} of {len(times_s):,} {events} stand behind a later one in the file: sorted by time",
                 float(early),
             )
         )
@@ -266,6 +268,12 @@ def _column(name: str, column: Column, n: int, expected: str = "one value a stim
     if column.shape != (n,):
         raise UnusableData(f"{name}: expected {expected}, shape ({n},), got {column.shape}")
     return column
+
+
+def _width(column: Column) -> int:
+    """Characters that every row of a column of text has room for; 0 for numbers."""
+    dtype = np.asarray(column).dtype
+    return {"U": dtype.itemsize // 4, "S": dtype.itemsize}.get(dtype.kind, 0)
 
 
 def _is_text(column: Column) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,9 +19,28 @@ class Finding:
             unless the user says otherwise.
         sentence: what was found, what it means and what to do, for people.
         value: the number behind it, if there is one.
+        at_min: start of the recording that it is of, among those of several; None elsewhere.
     """
 
     name: str
     severity: Severity
     sentence: str
     value: float | None = None
+    at_min: float | None = None
+
+
+def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
+    """What all but notes say; what is found in several recordings once, where it is worst, with how many others."""
+    warnings: dict[str, list[Finding]] = {}
+    for finding in findings:
+        if finding.severity != "note":
+            warnings.setdefault(finding.name, []).append(finding)
+    for alike in warnings.values():
+        worst = max(alike, key=_gravity)
+        yield worst.sentence + (f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else "")
+
+
+def _gravity(finding: Finding) -> float:
+    """What makes one of several findings of a name the worst: a number far from 0, or close to it where few is bad."""
+    value = abs(finding.value or 0.0)
+    return -value if finding.name in ("few-samples", "no-difference") else value

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, Mismatch, shown
 from animat.progress import Progress, Silent
 from animat.recordings.array import MAXONE
 from animat.recordings.protocol import Presentation
@@ -257,6 +257,7 @@ def write_made_up_series(
     """
     _expect(sessions >= 1, "sessions", "at least 1 recording", sessions)
     _expect(interval_min > 0, "interval_min", "more than 0 minutes", interval_min)
+    _expect(sessions * interval_min <= 366 * 24 * 60, "sessions, interval_min", "recordings within a year", sessions)
     culture = MadeUpCulture(seed, **settings)
     progress = progress or Silent()
     files = []
@@ -284,4 +285,4 @@ def _shuffles(rng: np.random.Generator, n: int, channels: int) -> Int64[np.ndarr
 
 def _expect(is_right: bool, name: str, expected: str, got: object) -> None:
     if not is_right:
-        raise InvalidArgument(f"{name}: expected {expected}, got {got}")
+        raise InvalidArgument(f"{name}: expected {expected}, got {shown(got)}")

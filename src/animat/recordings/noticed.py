@@ -10,6 +10,12 @@ import numpy as np
 from animat.recordings.channel_quality import channel_findings
 from animat.recordings.findings import Finding, Severity
 from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.response_table import ResponseTable
+from animat.recordings.time_quality import time_findings
+
+MANY_STIMULI = 100
+STIMULI_A_SPIKE = 10.0
+"""From here on, spikes and stimuli must be swapped: a culture that answers so seldom teaches nothing."""
 
 
 def as_provenance(findings: Iterable[Finding]) -> dict[str, str]:
@@ -25,19 +31,25 @@ def as_provenance(findings: Iterable[Finding]) -> dict[str, str]:
     return entries
 
 
-def noticed(recording: Recording) -> tuple[Finding, ...]:
+def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     """All findings about a recording: those noted when its file was read, then those seen in its data.
 
+    Of a table of responses, which has no spikes to look at, only the former.
+
     Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
-    (`animat.recordings.channel_quality`), stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown
-    presentation (`presentation-unknown`).
+    (`animat.recordings.channel_quality`), times that cannot be in seconds (`animat.recordings.time_quality`), more
+    stimuli than spikes (`more-stimuli-than-spikes`), stimuli of one time (`simultaneous-stimuli`), stimuli without
+    electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
     """
     from_file = []
     for key, sentence in recording.provenance.items():
         severity, colon, name = key.partition(": ")
         if colon and severity in get_args(Severity):
             from_file.append(Finding(name, severity, sentence))  # type: ignore[arg-type]
-    return (*from_file, *_in_data(recording))
+    if isinstance(recording, ResponseTable):
+        return tuple(from_file)
+    known = {finding.name for finding in from_file}
+    return (*from_file, *(finding for finding in _in_data(recording) if finding.name not in known))
 
 
 def _in_data(recording: Recording) -> Iterable[Finding]:
@@ -53,6 +65,8 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield Finding("no-spikes", "refuse", f"no spike on any of {len(channels):,} channels: nothing can be learned")
     else:
         yield from channel_findings(recording)
+    yield from time_findings(recording)
+    yield from _stimulus_rows(recording)
     unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1)))
     if unknown:
         sentence = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
@@ -63,4 +77,27 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
             "note",
             "how the stimuli were presented (blocked or mixed, pulses a presentation) is not known; a closed loop "
             "cannot check that it presents them in the same way",
+        )
+
+
+def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
+    """Rows of the stimulus table that are no single stimuli."""
+    n_spikes, times_s = len(recording.spike_times_s), recording.stimuli.time_s
+    if len(times_s) >= MANY_STIMULI and 0 < n_spikes < len(times_s):
+        ratio = len(times_s) / n_spikes
+        yield Finding(
+            "more-stimuli-than-spikes",
+            "refuse" if ratio >= STIMULI_A_SPIKE else "note",
+            f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?",
+            ratio,
+        )
+    last = recording.stimuli.is_last_of_presentation
+    same = int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1]))
+    if same:
+        yield Finding(
+            "simultaneous-stimuli",
+            "refuse",
+            f"{same:,} of {len(times_s):,} stimuli come at the very time of the one before, and the response is "
+            "counted for each: where they are the electrodes of one stimulus, put these into one row",
+            float(same),
         )

@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any, Literal, get_args
 
-from animat.errors import InvalidArgument, InvalidFile
+import numpy as np
+
+from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.plain_file import read_plain_text
 from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
 
 Order = Literal["blocked", "mixed"]
 
 _MOST_PULSES = 10_000_000
 _LONGEST_S = 86_400
+_LONGEST_RECORDING_S = 7 * 86_400
+_MOST_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -38,9 +42,14 @@ class Presentation:
 
     def __post_init__(self) -> None:
         if self.order not in get_args(Order):
-            raise InvalidArgument(f"order: expected 'blocked' or 'mixed', got {self.order!r}")
-        if self.pulses < 1:
-            raise InvalidArgument(f"pulses: expected at least 1 pulse a presentation, got {self.pulses}")
+            raise InvalidArgument(f"order: expected 'blocked' or 'mixed', got {shown(self.order)}")
+        pulses: Any = self.pulses
+        if not isinstance(pulses, int | np.integer) or isinstance(pulses, bool):
+            raise InvalidArgument(f"pulses: expected a whole number, got {shown(pulses)}")
+        if pulses < 1:
+            raise InvalidArgument(f"pulses: expected at least 1 pulse a presentation, got {shown(pulses)}")
+        if pulses > _MOST_PULSES:
+            raise InvalidArgument(f"pulses: expected at most {_MOST_PULSES:,} in a recording, got {shown(pulses)}")
 
     def __str__(self) -> str:
         return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} a presentation"
@@ -90,7 +99,7 @@ class Protocol:
             raise InvalidArgument(f"frequencies_hz: expected each once, got {self.frequencies_hz}")
         for name in ("patterns", "presentations"):
             if not 1 <= getattr(self, name) <= 1_000_000:
-                raise InvalidArgument(f"{name}: expected 1 to 1,000,000, got {getattr(self, name)}")
+                raise InvalidArgument(f"{name}: expected 1 to 1,000,000, got {shown(getattr(self, name))}")
         for name in ("setup_s", "pause_s", "tail_s"):
             if not 0 <= getattr(self, name) <= _LONGEST_S:
                 raise InvalidArgument(
@@ -105,6 +114,13 @@ class Protocol:
             raise InvalidArgument(
                 f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x presentations x pulses), got "
                 f"{pulses:,}"
+            )
+
+        stimulated_s = sum(self.presentations * self.pulses / f for f in self.frequencies_hz)
+        if stimulated_s > _LONGEST_RECORDING_S:
+            raise InvalidArgument(
+                f"frequencies_hz: expected stimuli of at most a week ({_LONGEST_RECORDING_S:,} s) in a recording, got "
+                f"{stimulated_s:.3g} s"
             )
 
     @property
@@ -159,15 +175,10 @@ def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
     """
-    path = Path(path)
     try:
-        return Protocol.from_json(path.read_text(encoding="utf-8"), defaults or PAPER)
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
+        return Protocol.from_json(read_plain_text(path, _MOST_BYTES), defaults or PAPER)
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidFile(f"{path}: cannot be read: {error}") from error
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -210,5 +221,6 @@ def _number(name: str, value: Any) -> float:
 PAPER = Protocol()
 """The paper's recording."""
 
-CLOSED_LOOP = Protocol(order="mixed", pulses=5)
-"""Recorded as a closed loop presents: frequencies mixed at random, five pulses a presentation, the last one read."""
+CLOSED_LOOP = Protocol(order="mixed", presentations=500)
+"""What a closed loop needs: frequencies mixed at random, one pulse a presentation, and so many of each that a simulator
+with memory finds responses with a like past."""

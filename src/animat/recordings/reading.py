@@ -4,25 +4,46 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.plain_file import expect_plain_file, is_folder
 from animat.recordings.apart import read_hdf5_apart
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
 from animat.recordings.formats.npz import read_npz
+from animat.recordings.formats.responses_plain import (
+    is_response_csv,
+    is_response_npz,
+    read_response_csv,
+    read_response_npz,
+)
 from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
+
+S = TypeVar("S", Recording, Recording | ResponseTable)
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 ZIP = b"PK"
 NPY = b"\x93NUMPY"
+OTHERS = {
+    **{
+        bytes([0x80, protocol]): "a Python pickle, which is never read; save plain arrays with numpy.savez"
+        for protocol in range(2, 6)
+    },
+    b"\xff\xfe": "text in UTF-16; save it as CSV in UTF-8",
+    b"\xfe\xff": "text in UTF-16; save it as CSV in UTF-8",
+    b"MATLAB": "a MATLAB file; save its columns as CSV or NPZ",
+}
+"""How files begin that are often given for recordings and are none, and what to do with them."""
 HDF5_NAMES = (".nwb", ".h5", ".hdf5")
 TEXT_NAMES = (".csv", ".csv.gz", ".tsv", ".txt")
-IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz")
+IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz", "*_responses.csv", "*_responses.csv.gz")
 """Names that are taken from a folder for recordings."""
 
 
@@ -67,10 +88,17 @@ def read_recording(
     try:
         if magic.startswith(HDF5):
             recording = read_hdf5_apart(path, part=part, stimuli=stimuli)
+        elif _response_reader(path, magic) is not None:
+            raise InvalidFile(
+                f"{path}: expected spikes, got a table of responses, which animat inspect, train and evaluate read; "
+                "this needs the times of spikes"
+            )
         elif magic.startswith(ZIP):
             recording = read_npz(path)
         elif magic.startswith(NPY):
             raise InvalidFile(f"{path}: expected NPZ (several arrays by name), got NPY (one array)")
+        elif kind := _other_kind(path, magic):
+            raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
         else:
             recording = _read_text(path, stimuli_path)
     except (UnusableData, InvalidArgument) as error:
@@ -80,6 +108,42 @@ def read_recording(
         # What no reader foresaw: still a file that cannot be read, and one line.
         raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
     return recording if start_min is None else dataclasses.replace(recording, start_min=float(start_min))
+
+
+def read_source(
+    path: str | os.PathLike[str], *, stimuli: str | None = None, part: str | None = None
+) -> Recording | ResponseTable:
+    """Read what responses can be had from: a recording, or a table of responses without spikes.
+
+    Args:
+        path: the file.
+        stimuli, part: as in `read_recording`.
+
+    Raises:
+        InvalidFile, InvalidArgument: as in `read_recording`.
+    """
+    path = Path(path)
+    read = _response_reader(path, _first_bytes(path))
+    if read is None or stimuli is not None or part is not None:
+        return read_recording(path, stimuli=stimuli, part=part)
+    try:
+        return read(path)
+    except (UnusableData, InvalidArgument) as error:
+        raise InvalidFile(f"{path}: {error}") from error
+
+
+def _response_reader(path: Path, magic: bytes) -> Callable[[Path], ResponseTable] | None:
+    """What reads a table of responses; None for any other file."""
+    if magic.startswith(ZIP):
+        return read_response_npz if is_response_npz(path) else None
+    is_text = not magic.startswith((HDF5, NPY)) and not _other_kind(path, magic)
+    if not is_text or path.suffix.lower() in HDF5_NAMES:
+        return None
+    try:
+        return read_response_csv if is_response_csv(path) else None
+    except InvalidFile:
+        # Whoever reads it in full says better what is wrong with it.
+        return None
 
 
 def expect_traces(path: Path) -> None:
@@ -125,8 +189,20 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
         InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings of one time.
         InvalidArgument: if no path is given.
     """
-    files = list_recordings(paths)
-    read = sorted(((read_recording(file), file) for file in files), key=lambda pair: pair[0].start_min)
+    return _in_order(list_recordings(paths), read_recording)
+
+
+def read_sources(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording | ResponseTable]:
+    """Read recordings, and tables of responses without spikes, in the order of the culture's clock.
+
+    Args and errors are those of `read_recordings`; tables in folders are `*.npz`, `*_responses.csv` and
+    `*_responses.csv.gz`.
+    """
+    return _in_order(list_recordings(paths), read_source)
+
+
+def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
+    read = sorted(((read_one(file), file) for file in files), key=lambda pair: pair[0].start_min)
     for (earlier, file), (later, other) in pairwise(read):
         if earlier.start_min == later.start_min:
             raise InvalidFile(
@@ -154,8 +230,8 @@ def _listed(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) ->
 
 
 def _files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
+    if not is_folder(path):
+        return [expect_plain_file(path)]
     try:
         # A folder that cannot be read looks empty to glob.
         next(path.iterdir(), None)
@@ -168,16 +244,23 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
+def _other_kind(path: Path, magic: bytes) -> str | None:
+    """What a file is that is no text, neither gzipped nor under a name of HDF5, which has an error of its own."""
+    if path.suffix.lower() in HDF5_NAMES or magic.startswith(b"\x1f\x8b"):
+        return None
+    with path.open("rb") as file:
+        is_binary = b"\0" in file.read(4096)
+    # Text in UTF-16 is full of zeros, and a pickle need not have any.
+    known = next((kind for begin, kind in OTHERS.items() if magic.startswith(begin)), None)
+    return known or ("a file of another kind" if is_binary else None)
+
+
 def _first_bytes(path: Path) -> bytes:
+    if is_folder(path):
+        raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders")
     try:
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise InvalidFile(f"{path}: expected a file, got a device or a pipe")
-        with path.open("rb") as file:
+        with expect_plain_file(path).open("rb") as file:
             magic = file.read(len(HDF5))
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
-    except IsADirectoryError as error:
-        raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders") from error
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
     if not magic:

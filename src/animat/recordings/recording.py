@@ -11,11 +11,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.brief import briefly
 from animat.errors import UnusableData
 from animat.recordings.protocol import Presentation
 
 UNKNOWN = -1
 """Stands for an unknown electrode or pattern, and pads `Stimuli.electrodes`."""
+
+CENTURY_S = 100 * 365.25 * 24 * 3600
+FASTEST_HZ = 1e9
+"""No time of a recording is farther from 0 than the one, and no rate or frequency above the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +35,8 @@ class Channels:
         electrode: the electrode each channel reads, `UNKNOWN` where it is not known, shape (channels,).
         x_um, y_um: the electrode's position in micrometres, NaN where it is not known, shape (channels,).
     """
+
+    __repr__ = briefly
 
     label: np.ndarray[Any, np.dtype[np.str_]]
     electrode: Int64[np.ndarray, " channels"]
@@ -64,6 +71,8 @@ class Stimuli:
             presentation, shape (stimuli,).
     """
 
+    __repr__ = briefly
+
     time_s: Float64[np.ndarray, " stimuli"]
     frequency_hz: Float64[np.ndarray, " stimuli"]
     pattern: Int64[np.ndarray, " stimuli"]
@@ -79,9 +88,12 @@ class Stimuli:
             )
         _check_times("stimuli.time_s", self.time_s)
         known = self.frequency_hz[~np.isnan(self.frequency_hz)]
-        if np.any((known <= 0) | np.isinf(known)):
-            bad = known[(known <= 0) | np.isinf(known)][0]
-            raise UnusableData(f"stimuli.frequency_hz: expected positive frequencies in Hz, or NaN, got {bad:g}")
+        wrong = (known <= 0) | (known > FASTEST_HZ)
+        if np.any(wrong):
+            raise UnusableData(
+                f"stimuli.frequency_hz: expected positive frequencies up to {FASTEST_HZ:g} Hz, or NaN, got "
+                f"{known[wrong][0]:g}"
+            )
         if np.any(np.diff(self.presentation) < 0):
             raise UnusableData("stimuli.presentation: expected numbers that do not fall as time goes on")
 
@@ -120,6 +132,8 @@ class Recording:
         UnusableData: for times that are not finite or do not rise, or rows that no table names.
     """
 
+    __repr__ = briefly
+
     spike_times_s: Float64[np.ndarray, " spikes"]
     spike_channels: Int64[np.ndarray, " spikes"]
     channels: Channels
@@ -142,16 +156,18 @@ class Recording:
                 f"got {self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
             )
         self._order_simultaneous_spikes()
-        if not (np.isfinite(self.start_s) and np.isfinite(self.duration_s) and self.duration_s >= 0):
+        # Spikes and stimuli up to a century before and after 0 are two apart.
+        if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
             raise UnusableData(
-                f"start_s, duration_s: expected finite seconds, got {self.start_s:g} and {self.duration_s:g}"
+                f"start_s, duration_s: expected finite seconds, within a century, got {self.start_s:g} and "
+                f"{self.duration_s:g}"
             )
-        if not np.isfinite(self.start_min):
-            raise UnusableData(f"start_min: expected finite minutes, got {self.start_min:g}")
-        if self.sampling_rate_hz <= 0 or np.isinf(self.sampling_rate_hz):
+        if not abs(self.start_min) <= CENTURY_S / 60:
+            raise UnusableData(f"start_min: expected finite minutes, within a century, got {self.start_min:g}")
+        if self.sampling_rate_hz <= 0 or self.sampling_rate_hz > FASTEST_HZ:
             raise UnusableData(
-                f"sampling_rate_hz: expected a positive rate in Hz, or NaN where it is not known, got "
-                f"{self.sampling_rate_hz:g}"
+                f"sampling_rate_hz: expected a positive rate up to {FASTEST_HZ:g} Hz, or NaN where it is not known, "
+                f"got {self.sampling_rate_hz:g}"
             )
         for name, times in (("spike_times_s", self.spike_times_s), ("stimuli.time_s", self.stimuli.time_s)):
             if len(times) and (times[0] < self.start_s or times[-1] > self.stop_s):
@@ -206,10 +222,24 @@ def _freeze(table: object, name: str, **dtypes: Any) -> None:
         object.__setattr__(table, attribute, array)
 
 
-def _check_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    if not np.all(np.isfinite(times_s)):
-        bad = np.count_nonzero(~np.isfinite(times_s))
+def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
+    """Refuse times that are not finite, or not within a century.
+
+    Raises:
+        UnusableData: by the name of the column.
+    """
+    bad = np.count_nonzero(~np.isfinite(times_s))
+    if bad:
         raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
+    far = np.abs(times_s) > CENTURY_S
+    if np.any(far):
+        raise UnusableData(
+            f"{name}: expected times in seconds, within a century, got {times_s[far][0]:g}; are they in seconds?"
+        )
+
+
+def _check_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
+    expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.brief import briefly
+from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.plain_file import read_plain_text
 from animat.recordings.array import ElectrodeArray
 from animat.recordings.patterns import draw_patterns
 from animat.recordings.recording import Channels
@@ -19,6 +21,7 @@ from animat.recordings.scan import ScannedActivity
 from animat.writing import written_whole
 
 FORMAT = "animat electrode selection 1"
+_MOST_BYTES = 2**24
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,12 @@ class SelectionRule:
     pattern_size: int = 5
     pattern_spacing_um: float = 100.0
 
+    def __post_init__(self) -> None:
+        value: Any
+        for name, value in vars(self).items():
+            if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not math.isfinite(value):
+                raise InvalidArgument(f"rule.{name}: expected a finite number, got {shown(value)}")
+
 
 @dataclass(frozen=True, eq=False)
 class Selection:
@@ -57,6 +66,8 @@ class Selection:
         scanned: electrodes that were scanned.
         passed: electrodes that passed the threshold and the spacing.
     """
+
+    __repr__ = briefly
 
     array: ElectrodeArray
     recording: Int64[np.ndarray, " channels"]
@@ -125,16 +136,20 @@ class Selection:
         try:
             return Selection(
                 array=ElectrodeArray(**data["array"]),
-                recording=np.array(data["recording"], dtype=np.int64),
-                stimulation=np.array(data["stimulation"], dtype=np.int64),
-                patterns=np.array(data["patterns"], dtype=np.int64),
+                recording=_electrodes(data["recording"], 1),
+                stimulation=_electrodes(data["stimulation"], 1),
+                patterns=_electrodes(data["patterns"], 2),
                 rule=SelectionRule(**data["rule"]),
-                seed=int(data["seed"]),
-                scanned=int(data["scanned"]),
-                passed=int(data["passed"]),
+                seed=_whole(data["seed"]),
+                scanned=_whole(data["scanned"]),
+                passed=_whole(data["passed"]),
             )
+        except InvalidArgument:
+            raise
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InvalidArgument(f"selection: expected what Selection.to_dict writes, got {error!r}") from error
+            raise InvalidArgument(
+                f"selection: expected what Selection.to_dict writes, got {shown(error, 200)}"
+            ) from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
@@ -149,12 +164,26 @@ class Selection:
             InvalidFile: if the file is missing, damaged, or something else.
         """
         try:
-            return Selection.from_dict(json.loads(Path(path).read_text()))
-        except FileNotFoundError as error:
-            raise InvalidFile(f"{path}: no such file") from error
-        except (OSError, ValueError) as error:
+            return Selection.from_dict(json.loads(read_plain_text(path, _MOST_BYTES)))
+        except (ValueError, RecursionError) as error:
             # Text that is no JSON and data that is no selection both raise a ValueError.
-            raise InvalidFile(f"{path}: expected an electrode selection in JSON: {error}") from error
+            said = str(error).partition(";")[0]
+            raise InvalidFile(f"{path}: expected an electrode selection in JSON: {said}") from error
+
+
+def _electrodes(data: Any, dimensions: int) -> Int64[np.ndarray, "..."]:
+    """Numbers of electrodes as JSON holds them: a list of them, or of lists as long as each other."""
+    values = np.array(data) if data else np.empty((0,) * dimensions, np.int64)
+    # A part of a number, or a text of one, would be made whole in silence.
+    if not isinstance(data, list) or values.dtype.kind != "i":
+        raise InvalidArgument(f"selection: expected whole numbers of electrodes, got {shown(data)}")
+    return values.astype(np.int64)
+
+
+def _whole(data: Any) -> int:
+    if not isinstance(data, int) or isinstance(data, bool) or not 0 <= data < 2**63:
+        raise InvalidArgument(f"selection: expected a whole number, got {shown(data)}")
+    return data
 
 
 def select_electrodes(

@@ -24,10 +24,10 @@ def draw_array(recording: Recording) -> Figure:
     A stimulated electrode is drawn where a channel reads it; the title counts those whose position is not known.
     """
     channels, stimuli = recording.channels, recording.stimuli
-    figure = new_figure(8.5, 5.2)
-    axes = figure.subplots()
     rate_hz = rates_of_sites(recording)
     known = np.isfinite(channels.x_um) & np.isfinite(channels.y_um)
+    figure = _figure_for(channels.x_um[known], channels.y_um[known])
+    axes = figure.subplots()
     # A few channels of a very high rate must not leave all others dark.
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
     drawn = axes.scatter(
@@ -83,6 +83,14 @@ def draw_selection(selection: Selection) -> Figure:
     return figure
 
 
+def _figure_for(x_um: Float64[np.ndarray, " sites"], y_um: Float64[np.ndarray, " sites"]) -> Figure:
+    """A figure in the shape of what is drawn, with room for title, legend and colour bar."""
+    width_um, height_um = (max(float(np.ptp(along)), 1.0) if len(along) else 1.0 for along in (x_um, y_um))
+    shape = float(np.clip(width_um / height_um, 0.4, 2.5))
+    across_in, down_in = (6.5, 6.5 / shape) if shape > 1.5 else (4.2 * shape, 4.2)
+    return new_figure(max(across_in + 1.8, 5.0), down_in + 1.4)
+
+
 def _ring(axes: Axes, x_um: np.ndarray, y_um: np.ndarray, label: str) -> None:
     if len(x_um):
         axes.scatter(x_um, y_um, s=55, facecolors="none", edgecolors=RED, linewidths=1.2, label=label)
@@ -92,6 +100,8 @@ def _finish(axes: Axes, title: str) -> None:
     axes.set_aspect("equal")
     # Rows are counted from the top, as on the chip.
     axes.invert_yaxis()
-    style_axes(axes, title, "x (um)", "y (um)")
+    style_axes(axes, "", "x (um)", "y (um)")
+    # Of the whole figure, as axes that are narrow would cut it off.
+    axes.figure.suptitle(title, fontsize=10, x=0.02, ha="left")
     if axes.get_legend_handles_labels()[0]:
         add_legend(axes, loc="upper left", bbox_to_anchor=(0, -0.14), ncols=3)

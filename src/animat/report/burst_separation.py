@@ -17,36 +17,40 @@ if TYPE_CHECKING:
 
 _RATE = "response x (Hz per channel)"
 _RATIO = "ratio of active channels (fraction)"
+_NONE = "no response is set apart as a burst"
 
 
 def draw_burst_separation(responses: Responses) -> Figure:
-    """All x; x against the ratio of active channels; that ratio with the threshold; x against it, labelled."""
-    figure = new_figure(9.0, 6.8)
-    (all_x, plain), (ratios, labelled) = figure.subplots(2, 2)
+    """All x; x against the ratio of active channels; that ratio with the threshold; x against it, labelled.
+
+    Where no response is a burst, there is no threshold and no fourth panel.
+    """
+    n_bursts = int(np.count_nonzero(responses.is_burst))
+    figure = new_figure(9.0, 6.8) if n_bursts else new_figure(12.0, 3.6)
+    all_x, plain, ratios, *more = figure.subplots(2, 2).flat if n_bursts else figure.subplots(1, 3)
     all_x.hist(responses.rate_hz, bins=rate_edges(responses, responses.rate_hz, 40).tolist(), color=BLUE)
     style_axes(all_x, f"{len(responses):,} responses", _RATE, "responses (count)")
     _scatter(plain, responses, np.ones(len(responses), dtype=bool), BLUE, None)
     style_axes(plain, "response against active channels", _RATIO, _RATE)
     # A bar for every possible ratio, k/N, up to 40 bars: bins that are no multiple of 1/N show a comb.
     ratios.hist(responses.active_ratio, bins=_ratio_edges(responses).tolist(), color=BLUE)
-    style_axes(ratios, f"separability {responses.separability:.2f}", _RATIO, "responses (count)")
-    n_bursts = int(np.count_nonzero(responses.is_burst))
-    _scatter(labelled, responses, ~responses.is_burst, NON_BURST, f"non-burst ({len(responses) - n_bursts:,})")
-    _scatter(labelled, responses, responses.is_burst, BURST, f"burst ({n_bursts:,})")
-    style_axes(labelled, "bursts set apart", _RATIO, _RATE)
-    for axes in (ratios, labelled):
-        if np.isfinite(responses.threshold) and responses.threshold < 1:
-            # Between the largest ratio that is no burst and the next possible one.
-            axes.axvline(
-                responses.threshold + 0.5 / responses.n_channels,
-                color=BLACK,
-                linestyle="--",
-                linewidth=1,
-                label=f"threshold {responses.threshold:.3f}",
-            )
-            add_legend(axes, loc="best", markerscale=2)
-            for handle in axes.get_legend().legend_handles:
-                handle.set_alpha(1)
+    style_axes(ratios, f"separability {responses.separability:.2f}" if n_bursts else _NONE, _RATIO, "responses (count)")
+    for labelled in more:
+        _scatter(labelled, responses, ~responses.is_burst, NON_BURST, f"non-burst ({len(responses) - n_bursts:,})")
+        _scatter(labelled, responses, responses.is_burst, BURST, f"burst ({n_bursts:,})")
+        style_axes(labelled, "bursts set apart", _RATIO, _RATE)
+    for axes in (ratios, *more) if n_bursts else ():
+        # Between the largest ratio that is no burst and the next possible one.
+        axes.axvline(
+            responses.threshold + 0.5 / responses.n_channels,
+            color=BLACK,
+            linestyle="--",
+            linewidth=1,
+            label=f"threshold {responses.threshold:.3f}",
+        )
+        add_legend(axes, loc="best", markerscale=2)
+        for handle in axes.get_legend().legend_handles:
+            handle.set_alpha(1)
     return figure
 
 

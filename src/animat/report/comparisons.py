@@ -40,7 +40,7 @@ class Pair:
 
     Attributes:
         title: with the minute it was made at.
-        p: two-sided.
+        p: two-sided, corrected as in the table beside it.
         u: Mann-Whitney's.
     """
 
@@ -77,7 +77,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         low, high = whole.get_ylim()
         room = high - low
         whole.plot([0, 0, 1, 1], high + room * np.array([0.03, 0.06, 0.06, 0.03]), color=BLACK, linewidth=0.9)
-        words = f"{stars(pair.p)}  p = {pair.p:.3g}, U = {pair.u:g}"
+        words = f"{stars(pair.p)}  p corrected = {pair.p:.3g}, U = {pair.u:g}"
         whole.text(0.5, high + 0.08 * room, words, ha="center", va="bottom", fontsize=8)
         whole.set_ylim(low, high + 0.2 * room)
         for axes, words in ((whole, pair.title), (close, "close up")):

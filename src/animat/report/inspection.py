@@ -7,12 +7,15 @@ import os
 from pathlib import Path
 
 from animat.neurons.inspection import Inspection
+from animat.neurons.network_bursts import NetworkBursts
 from animat.neurons.psth import PostStimulusHistogram, post_stimulus_histogram
 from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
+from animat.report.spontaneous import draw_spontaneous
 from animat.report.style import save_figure
 
 _MOST_CONDITIONS = 16
@@ -23,11 +26,9 @@ def inspection_text(inspection: Inspection) -> str:
     """Lines for a terminal: what the recording holds, its responses, the conditions, the findings, the verdict."""
     responses = inspection.responses
     start_ms, end_ms = responses.window_ms
-    duration_min = inspection.duration_s / 60
     lines = [
         f"{inspection.name}: {inspection.verdict}",
-        f"  {inspection.n_spikes:,} spikes on {inspection.n_channels:,} channels in {inspection.duration_s:,.1f} s "
-        f"({duration_min:.1f} min), from {inspection.start_min:g} min on the culture's clock",
+        f"  {_held(inspection)}, from {inspection.start_min:g} min on the culture's clock",
         f"  {inspection.n_stimuli:,} stimuli"
         + (
             f" in {inspection.n_presentations:,} presentations"
@@ -36,6 +37,8 @@ def inspection_text(inspection: Inspection) -> str:
         )
         + (f", {inspection.presentation}" if inspection.presentation else ""),
     ]
+    if inspection.network_bursts is not None:
+        lines += _spontaneous(inspection, inspection.network_bursts)
     if math.isfinite(inspection.mean_spikes_per_stimulus):
         lines.append(
             f"  {inspection.mean_spikes_per_stimulus:.2f} spikes in {start_ms:g}-{end_ms:g} ms per stimulus"
@@ -49,6 +52,8 @@ def inspection_text(inspection: Inspection) -> str:
         lines.append(
             f"  bursts: {inspection.n_bursts:,} of {len(responses):,} responses, above {responses.threshold:.3f} of "
             f"the channels active (separability {responses.separability:.2f})"
+            if inspection.n_bursts
+            else "  bursts: none is set apart"
         )
         lines += ["", *_table(inspection)]
     if inspection.findings:
@@ -56,8 +61,33 @@ def inspection_text(inspection: Inspection) -> str:
     return "\n".join(lines)
 
 
+def _held(inspection: Inspection) -> str:
+    """What was measured, as far as it is known."""
+    spikes = "rates" if inspection.n_spikes is None else f"{inspection.n_spikes:,} spikes"
+    of_s = inspection.duration_s
+    span = f" in {of_s:,.1f} s ({of_s / 60:.1f} min)" if math.isfinite(of_s) else ""
+    return f"{spikes} on {inspection.n_channels:,} channels{span}"
+
+
+def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:
+    """The activity of a culture that nobody stimulated."""
+    lines = [f"  {inspection.spontaneous_rate_hz:.3g} Hz per channel"] if inspection.duration_s else []
+    if len(bursts):
+        a_minute = 60 * len(bursts) / inspection.duration_s
+        lines.append(
+            f"  {len(bursts):,} network bursts ({a_minute:.3g} a minute) of {bursts.median_s:.2f} s (median) hold "
+            f"{100 * bursts.share:.0f} % of all spikes"
+        )
+    elif inspection.n_spikes:
+        lines.append("  no network bursts")
+    return lines
+
+
 def draw_inspection(
-    recording: Recording, inspection: Inspection, folder: str | os.PathLike[str], file_format: str = "png"
+    recording: Recording | ResponseTable,
+    inspection: Inspection,
+    folder: str | os.PathLike[str],
+    file_format: str = "png",
 ) -> list[Path]:
     """Draw raster, post-stimulus histogram, burst separation and response histograms into a folder.
 
@@ -68,15 +98,22 @@ def draw_inspection(
         file_format: `"png"`, `"svg"` or `"pdf"`.
 
     Returns:
-        The files. A recording without stimuli has a raster only.
+        The files. A recording without stimuli has a raster and its bursts only, a table of responses no raster and no
+        post-stimulus histogram.
 
     Raises:
         InvalidFile: if a file cannot be written.
     """
     responses = inspection.responses
     stem = figure_stem(inspection.name)
-    figures = {"raster": draw_raster(recording, responses)}
-    if inspection.n_presentations:
+    figures = {}
+    if isinstance(recording, Recording):
+        figures["raster"] = (
+            draw_raster(recording, responses)
+            if inspection.network_bursts is None
+            else draw_spontaneous(recording, inspection.network_bursts)
+        )
+    if isinstance(recording, Recording) and inspection.n_presentations:
         figures["psth"] = draw_psth(
             _histogram(recording, inspection), responses.window_ms, inspection.spontaneous_rate_hz
         )

@@ -41,7 +41,8 @@ def draw_psth(
     title = f"{histogram.n_stimuli:,} stimuli, {histogram.n_channels:,} channels, bins of {width_ms:g} ms"
     centres_ms = 0.5 * (histogram.edges_ms[1:] + histogram.edges_ms[:-1])
     # What lies in the window is read as the response, however near to the stimulus that is.
-    clear = (np.abs(centres_ms) > _ARTEFACT_MS) | ((centres_ms > window_ms[0]) & (centres_ms < window_ms[1]))
+    inside = (histogram.edges_ms[:-1] >= window_ms[0] - 1e-9) & (histogram.edges_ms[1:] <= window_ms[1] + 1e-9)
+    clear = (np.abs(centres_ms) > _ARTEFACT_MS) | inside
     highest_hz = 1.1 * float(max(rate_hz[clear].max(initial=0.0), 2 * np.nan_to_num(spontaneous_hz or 0.0)))
     if highest_hz and rate_hz.max() > 1.5 * highest_hz:
         title += f"; the artefact, up to {rate_hz.max():.3g} Hz, is cut off"

@@ -39,9 +39,9 @@ def draw_raster(
 
 
 def _draw_stretch(axes: Axes, recording: Recording) -> None:
-    """All channels over the time of the recording's middle six stimuli."""
+    """All channels over the time of the recording's middle six stimuli; without any, over the whole recording."""
     times_s = recording.stimuli.time_s
-    from_s, to_s = recording.start_s, min(recording.stop_s, recording.start_s + 2.0)
+    from_s, to_s = recording.start_s, max(recording.stop_s, recording.start_s + 1e-3)
     if len(times_s):
         middle = times_s[max(0, len(times_s) // 2 - 3) : len(times_s) // 2 + 3]
         margin_s = max(0.05, 0.1 * (middle[-1] - middle[0]))
@@ -73,24 +73,26 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     chosen = chosen[np.argsort(responses.condition[chosen], kind="stable")]
     row, spike = spikes_in(recording, times_s[chosen] + from_ms * 1e-3, times_s[chosen] + to_ms * 1e-3)
     condition = responses.condition[chosen]
-    colours = condition_colours([c.unit for c in responses.conditions])
     axes.axvspan(start_ms, end_ms, color=WINDOW, alpha=0.25, linewidth=0, label=f"window {start_ms:g}-{end_ms:g} ms")
     for edge_ms in (start_ms, end_ms):
         # On top of the dots, which can hide the band.
         axes.axvline(edge_ms, color=WINDOW, linewidth=1.2, zorder=3)
     axes.axvline(0, color=RED, linewidth=1, label="stimulus")
-    for i, c in enumerate(responses.conditions):
+    drawn = np.unique(condition).tolist()
+    for i, colour in zip(drawn, condition_colours([responses.conditions[i].unit for i in drawn]), strict=True):
         of = condition[row] == i
         lag_ms = 1e3 * (recording.spike_times_s[spike[of]] - times_s[chosen[row[of]]])
         axes.scatter(
             lag_ms,
             row[of],
             s=2.5,
-            color=colours[i],
+            color=colour,
             linewidths=0,
             rasterized=True,
-            label=c.label if i < _MOST_LABELS else None,
+            label=responses.conditions[i].label if i in drawn[:_MOST_LABELS] else None,
         )
+    if len(drawn) > _MOST_LABELS:
+        axes.plot([], [], " ", label=f"and {len(drawn) - _MOST_LABELS} more")
     axes.set_xlim(from_ms, to_ms)
     axes.set_ylim(-1, max(len(chosen), 1))
     thinned = "" if len(chosen) == len(times_s) else f"{len(chosen)} of "

@@ -17,12 +17,12 @@ from animat.report.style import save_figure
 
 
 def draw_series(
-    first: Recording, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
+    first: Recording | None, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
 ) -> list[Path]:
     """Draw a series: `series-array`, `series-responses`, `series-over-time` (of the first condition), `series-drift`.
 
     Args:
-        first: the first recording, for the array.
+        first: the first recording, for the array; None: it is not drawn.
         series: responses of all recordings, in any order.
         folder: where to; it is made if it is missing.
         file_format: `"png"`, `"svg"` or `"pdf"`.
@@ -45,7 +45,7 @@ def draw_series(
                 f"min are others than those at {ordered[0].start_min:g} min: inspect them apart"
             )
     figures = {}
-    if first.channels.has_positions:
+    if first is not None and first.channels.has_positions:
         figures["array"] = draw_array(first)
     if len(ordered) > 1 and all(len(responses) for responses in ordered):
         figures["responses"] = draw_first_and_last(ordered)

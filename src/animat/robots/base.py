@@ -9,13 +9,22 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, final
 
 from jaxtyping import Bool, Float
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 
 if TYPE_CHECKING:
     from jax import Array
 
 State = TypeVar("State")
 """A robot's state: a NamedTuple of float32 scalars; batches of robots are `jax.vmap` outside."""
+
+LONGEST_EPISODE = 1_000_000
+"""Iterations of an episode at most: each has a random key of its own, drawn before the first."""
+
+MOST_AT_ONCE = 5_000_000
+"""Episodes side by side at most: each takes some 300 bytes."""
+
+LEAST_SCALE, LARGEST_SCALE = 1e-12, 1e12
+"""Of an observed quantity: within them a network of float32 computes with what it is divided by."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +72,11 @@ class Robot(abc.ABC, Generic[State]):
     @abc.abstractmethod
     def quantities(self) -> tuple[Quantity, ...]:
         """What the numbers of an observation are, in order."""
+
+    @property
+    def return_range(self) -> tuple[float, float]:
+        """What the return of an episode can be at least and at most; infinite where that is not known."""
+        return -math.inf, math.inf
 
     @abc.abstractmethod
     def reset(self, key: Array) -> State:
@@ -118,9 +132,9 @@ def check_parameters(robot: Any, **allowed: tuple[float, float]) -> None:
         )
         try:
             number = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             number = math.nan
         is_number = math.isfinite(number) and not isinstance(value, bool | str)
         if not is_number or not low <= number <= high or (is_whole and number != int(number)):
-            raise InvalidArgument(f"{robot.name}: {field.name}: expected {expected}, got {value!r}")
+            raise InvalidArgument(f"{robot.name}: {field.name}: expected {expected}, got {shown(value)}")
         object.__setattr__(robot, field.name, int(number) if is_whole else number)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, final
 
 from jaxtyping import Bool, Float
 
-from animat.robots.base import Quantity, Robot, check_parameters
+from animat.robots.base import LONGEST_EPISODE, Quantity, Robot, check_parameters
 
 if TYPE_CHECKING:
     from jax import Array
@@ -84,8 +84,15 @@ class Cartpole(Robot[CartpoleState]):
             force_n=(0.0, _HUGE),
             force_noise=(0.0, _HUGE),
             step_s=positive,
-            episode_limit=(1, _HUGE),
+            episode_limit=(1, LONGEST_EPISODE),
         )
+
+    @property
+    def return_range(self) -> tuple[float, float]:
+        """Of an episode that fails in its first or its last iteration, or never."""
+        up, last = self.reward_upright, self.episode_limit - 1
+        returns = (self.reward_failed, last * up + self.reward_failed, last * up + up)
+        return min(returns), max(returns)
 
     @classmethod
     def as_printed(cls) -> Cartpole:

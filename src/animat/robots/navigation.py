@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, final
 
 from jaxtyping import Bool, Float
 
-from animat.robots.base import Quantity, Robot, check_parameters
+from animat.robots.base import LONGEST_EPISODE, Quantity, Robot, check_parameters
 
 if TYPE_CHECKING:
     from jax import Array
@@ -76,8 +76,19 @@ class Navigation(Robot[NavigationState]):
             goal_x_m=(0.0, self.arena_width_m),
             goal_y_m=(0.0, self.arena_height_m),
             goal_radius_m=positive,
-            episode_limit=(1, _HUGE),
+            episode_limit=(1, LONGEST_EPISODE),
         )
+
+    @property
+    def return_range(self) -> tuple[float, float]:
+        """Of an episode far from the goal until its end, or one that reaches it at once."""
+        farthest_m = math.hypot(
+            max(self.goal_x_m, self.arena_width_m - self.goal_x_m),
+            max(self.goal_y_m, self.arena_height_m - self.goal_y_m),
+        )
+        away = min(self.goal_radius_m / farthest_m - 1, 0.0)
+        last = (self.episode_limit - 1) * away
+        return min(last + away, last + self.reward_goal, self.reward_goal), max(0.0, self.reward_goal)
 
     @classmethod
     def as_printed(cls) -> Navigation:

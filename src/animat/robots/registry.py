@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.robots.base import Robot
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
@@ -27,12 +27,12 @@ def robot_named(name: str, /, **parameters: float) -> Robot[Any]:
         InvalidArgument: for a name or parameter that is not known, or a value that the robot refuses.
     """
     if not isinstance(name, str) or name not in ROBOTS:
-        raise InvalidArgument(f"robot: expected one of {', '.join(ROBOTS)}, got {name!r}")
+        raise InvalidArgument(f"robot: expected one of {', '.join(ROBOTS)}, got {shown(name)}")
     robot = ROBOTS[name]
     known = [field.name for field in dataclasses.fields(robot)]  # type: ignore[arg-type]
     for parameter in parameters:
         if parameter not in known:
-            raise InvalidArgument(f"{name}: expected parameters among {', '.join(known)}, got {parameter!r}")
+            raise InvalidArgument(f"{name}: expected parameters among {', '.join(known)}, got {shown(parameter)}")
     return robot(**parameters)
 
 
@@ -54,3 +54,21 @@ def robot_from_dict(data: Mapping[str, Any]) -> Robot[Any]:
     ):
         raise InvalidArgument(f'robot: expected {{"name": ..., "parameters": {{...}}}}, got {data!r}')
     return robot_named(data["name"], **data["parameters"])
+
+
+def expect_loadable_robot(robot: Robot[Any]) -> None:
+    """Refuse a robot that a file could name and nothing could give back.
+
+    Raises:
+        InvalidArgument: for a robot of one's own, which cannot be registered yet.
+    """
+    try:
+        if robot_from_dict(robot_to_dict(robot)) == robot:
+            return
+    except (InvalidArgument, TypeError):
+        pass
+    raise InvalidArgument(
+        f"robot: expected one that a policy's file can name ({', '.join(ROBOTS)}), got one of one's own "
+        f"({type(robot).__name__}), with which no policy could be loaded again; until robots can be registered, train "
+        "in memory: train(training, timeline, None)"
+    )

@@ -48,8 +48,8 @@ ROBOT: dict[str, tuple[str, str]] = {
     "comparisons": (
         "comparisons",
         "Every point is a policy's mean return. Boxes: quartiles and median. * p < 0.05, ** p < 0.01, *** p < 0.001, "
-        "two-sided Mann-Whitney U, normal approximation, not corrected. Under each condition: (mean − random) / (best "
-        "possible − random).",
+        "two-sided Mann-Whitney U, normal approximation, corrected by Holm as in the table. Under each condition: "
+        "(mean − random) / (best possible − random).",
     ),
     "over-time": (
         "at every recording",

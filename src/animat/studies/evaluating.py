@@ -28,6 +28,8 @@ HEAD = ("at_min", "actor", "episode", "return", "iterations", "ended")
 class Evaluate(Task):
     """Run a condition's policies at the minutes of its comparisons, at every recording, and once for their paths."""
 
+    grows_with = ("policies", "episodes", "episodes_over_time")
+
     body: Body
     condition: StudyCondition
 
@@ -73,6 +75,8 @@ class Control(Task):
     Attributes:
         plain: condition that gives the mapping; the one whose policies are used, if it is trained as usual.
     """
+
+    grows_with = ("policies", "episodes", "episodes_over_time")
 
     body: Body
     plain: StudyCondition

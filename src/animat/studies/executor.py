@@ -74,6 +74,7 @@ class Processes(Executor):
         self._idle: list[int] = list(reversed(self._cores))
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
         self._jobs: dict[int, str] = {}
+        self._needs: dict[int, str] = {}
         self._selector = selectors.DefaultSelector()
 
     @property
@@ -87,6 +88,7 @@ class Processes(Executor):
         pipe = self._processes[core].stdin
         assert pipe is not None
         self._jobs[core] = job.name
+        self._needs[core] = job.task.needs(study)
         try:
             pickle.dump((job.task, study, folder), pipe)
             pipe.flush()
@@ -144,6 +146,6 @@ class Processes(Executor):
     def _ended(self, core: int) -> AnimatError:
         status = self._processes[core].wait()
         return AnimatError(
-            f"{self._jobs.get(core, 'a worker')}: its process ended with status {status} (is there memory enough?); "
-            "start again to go on"
+            f"{self._jobs.get(core, 'a worker')}: its process ended with status {status} (is there memory "
+            f"enough? {self._needs.get(core, 'it is not known what for')}); start again to go on"
         )

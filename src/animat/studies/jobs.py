@@ -7,8 +7,9 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from animat.errors import InvalidFile
 from animat.studies.specification import Study
@@ -20,6 +21,14 @@ Report = Callable[[float, str], None]
 
 class Task(abc.ABC):
     """What a job does: a picklable value without any state."""
+
+    grows_with: ClassVar[tuple[str, ...]] = ("policies", "episodes")
+    """Settings of the study that its memory grows with."""
+
+    def needs(self, study: Study) -> str:
+        """What memory is needed for, in a sentence's end: the settings, with what they are in the study."""
+        told = ", ".join(f"{name} ({attrgetter(name)(study)!r})" for name in self.grows_with)
+        return f"it grows with {told}: ask for less, or use a machine with more memory"
 
     @abc.abstractmethod
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:

@@ -52,6 +52,8 @@ class Limit(Task):
             anything is evaluated at.
     """
 
+    grows_with = ("limit_resolution", "limit_episodes")
+
     body: Body
     over_time: bool = False
 

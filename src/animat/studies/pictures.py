@@ -225,7 +225,7 @@ def _pairs(study: Study, folder: Path, body: Body, known: References, last: floa
                 )
             )
         row = rows[compared.name]
-        pairs.append(Pair(f"at {at_min:g} min", groups[0], groups[1], row["p_normal"], row["u"]))
+        pairs.append(Pair(f"at {at_min:g} min", groups[0], groups[1], row["p_holm"], row["u"]))
     return pairs
 
 

@@ -15,6 +15,7 @@ from animat.report.style import FORMATS
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
+from animat.studies.heuristic import not_outperforming
 from animat.studies.jobs import Report, Task
 from animat.studies.learned import as_good_as_the_limit_allows, learned_of
 from animat.studies.places import REPORT, RESPONSES, read_table, table_file
@@ -22,6 +23,7 @@ from animat.studies.shown import (
     comparisons_shown,
     controllability_shown,
     controls_shown,
+    heuristic_shown,
     limits_shown,
     returns_shown,
     scores_shown,
@@ -83,9 +85,10 @@ def _short(study: Study, folder: Path) -> Section:
     paragraphs.append(
         "A policy's performance is its mean return over the episodes. Policies are compared by the two-sided "
         "Mann-Whitney U test: p by the normal approximation with continuity correction, as in the paper, and "
-        "exactly; p corrected is Holm's for the number of comparisons. The outcome, and stars in figures, go by the "
-        f"first of the three: the better one of two conditions counts as found at p < {LEVEL:g}; that none was found "
-        "does not say that there is no difference. The effect is the rank-biserial correlation, +1 where every "
+        "exactly; p corrected is Holm's for the number of comparisons. Stars in figures are of the corrected p. The "
+        "outcome goes by the first p, as in the paper: the better one of two conditions counts as found at p < "
+        f"{LEVEL:g}, and where the corrected p is not below that, the table says so. That none was found does not say "
+        "that there is no difference. The effect is the rank-biserial correlation, +1 where every "
         "policy of the second condition is better, with Newcombe's 95 % interval."
     )
     return Section(
@@ -109,7 +112,10 @@ def _as_in_paper(rows: list[dict[str, Any]]) -> str:
 def _scores(study: Study, folder: Path) -> Section:
     rows = read_table(table_file(folder, "scores"))
     learned = learned_of(study, rows)
-    tables = [scores_shown(rows), limits_shown(read_table(table_file(folder, "limits")))]
+    tables = [
+        scores_shown(rows),
+        limits_shown(read_table(table_file(folder, "limits")), read_table(table_file(folder, "findings"))),
+    ]
     paragraphs = [
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     ]
@@ -174,8 +180,12 @@ def _controls(study: Study, folder: Path) -> Section:
         ("silent", "The trained policies on a culture that always answers 0."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
     )
+    beside = heuristic_shown(folder)
     return Section(
-        "Is it the culture?", ("Each control takes something away.",), points, (controls_shown(study, folder),)
+        "Is it the culture?",
+        ("Each control takes something away.", *not_outperforming(folder)),
+        points,
+        ((beside,) if beside.rows else ()) + (controls_shown(study, folder),),
     )
 
 
@@ -196,7 +206,11 @@ def _done(study: Study) -> Section:
             f"{simulators.kind}"
             + (f", {simulators.bins} bins" if simulators.kind == "histogram" else "")
             + f"; responses from {simulators.window_ms[0]:g} to {simulators.window_ms[1]:g} ms; bursts set apart "
-            + ("by Otsu's method." if simulators.burst_threshold is None else f"above {simulators.burst_threshold:g}."),
+            + (
+                "by Otsu's method where that finds two groups."
+                if simulators.burst_threshold is None
+                else f"above {simulators.burst_threshold:g}."
+            ),
         ),
         (
             "Training",

@@ -26,6 +26,8 @@ class Record(Task):
         base: what a specification's file names are relative to.
     """
 
+    grows_with = ("culture.presentations", "culture.pulses", "culture.channels")
+
     base: Path
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:

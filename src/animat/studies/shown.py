@@ -10,10 +10,11 @@ from typing import Any, TypeAlias
 from animat.evaluation.optimum import bracket_findings
 from animat.neurons.fidelity import LARGEST_LOSS
 from animat.report.html import Table, cell, with_error
+from animat.studies.heuristic import NOT
 from animat.studies.limits import rough_kinds
 from animat.studies.places import limits_file, read_table, table_file
 from animat.studies.specification import Study
-from animat.studies.tabulating import named_mapping
+from animat.studies.tabulating import FIRST, LEVEL, SECOND, named_mapping
 
 Columns: TypeAlias = list[tuple[str, "str | Callable[[dict[str, Any]], Any]"]]
 """Of a table that is shown: their names, and the key or a function of a row that gives the cell."""
@@ -42,7 +43,7 @@ def comparisons_shown(rows: list[dict[str, Any]]) -> Table:
         ("p exact", "p_exact"),
         ("p corrected", "p_holm"),
         ("effect", _interval("effect", "effect_low_95", "effect_high_95")),
-        ("outcome", "outcome"),
+        ("outcome", _outcome),
     ]
     if printed:
         columns += [("the paper's p (U it implies)", _printed), ("as in the paper", "as_in_paper")]
@@ -106,8 +107,11 @@ def scores_shown(rows: list[dict[str, Any]]) -> Table:
     )
 
 
-def limits_shown(limits: list[dict[str, Any]]) -> Table:
-    """The best possible returns as brackets."""
+def limits_shown(limits: list[dict[str, Any]], findings: list[dict[str, Any]]) -> Table:
+    """The best possible returns as brackets; where conditions have few responses, that is said."""
+    few = [row["sentence"] for row in findings if row["name"] == "few-samples"]
+    promised = f" These limits promise too much where responses are few: {few[0]}" if few else ""
+    promised += f" (and {len(few) - 1} more like it)." if len(few) > 1 else "." if few else ""
     return Table(
         "Best possible returns",
         *_columns(
@@ -126,7 +130,7 @@ def limits_shown(limits: list[dict[str, Any]]) -> Table:
         "controller that takes the best actions, on the robot itself, ± its standard error: a return that can be "
         "had. The best possible return lies between the two; scores keep to the value, the upper end. Highlighted: "
         "they part by more than 3 standard errors and the grid's error. Without clock: the same controller if it "
-        "does not know the time left, as policies do not. On a rough grid at every recording: limits/.",
+        "does not know the time left, as policies do not. On a rough grid at every recording: limits/." + promised,
         beside="tables/limits.csv",
         marked=tuple(i for i, row in enumerate(limits) if _parted(row)),
     )
@@ -213,6 +217,31 @@ def controls_shown(study: Study, folder: Path) -> Table:
     )
 
 
+def heuristic_shown(folder: Path) -> Table:
+    """Trained policies beside the rule made by hand, episode by episode."""
+    rows = read_table(table_file(folder, "heuristic"))
+    return Table(
+        "Policies beside the rule made by hand",
+        *_columns(
+            rows,
+            [
+                ("robot", "robot"),
+                ("condition", "condition"),
+                ("at (min)", "at_min"),
+                ("policies", "mean_return"),
+                ("made by hand", "heuristic"),
+                ("p", "p"),
+                ("pairs won", "wins"),
+                ("the policies", "outcome"),
+            ],
+        ),
+        note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
+        "return is larger, ties half. Highlighted: learning brought no more than the rule did.",
+        beside="tables/heuristic.csv",
+        marked=tuple(i for i, row in enumerate(rows) if row["outcome"] == NOT),
+    )
+
+
 def _columns(rows: Sequence[dict[str, Any]], columns: Columns) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
     """Head and cells of a table: a column is a name and the key, or a function of the row."""
     cells = tuple(tuple(key(row) if callable(key) else row[key] for _, key in columns) for row in rows)
@@ -229,6 +258,12 @@ def _interval(value: str, low: str, high: str) -> Callable[[dict[str, Any]], str
 
 def _printed(row: dict[str, Any]) -> str | None:
     return None if row["paper_p"] is None else f"{cell(row['paper_p'])}\u00a0({cell(row['paper_u'])})"
+
+
+def _outcome(row: dict[str, Any]) -> str:
+    """The outcome by the paper's p; where correction takes it back, it says so."""
+    taken_back = row["outcome"] in (FIRST, SECOND) and row["p_holm"] >= LEVEL
+    return f"{row['outcome']}, not after correction" if taken_back else row["outcome"]
 
 
 def _parted(row: dict[str, Any]) -> bool:

@@ -35,15 +35,17 @@ _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulato
 class Fit(Task):
     """Read the responses of all recordings and fit a simulator to each."""
 
+    grows_with = ("culture.sessions", "culture.presentations", "simulators.bins")
+
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         series = read_series(study, folder)
         settings = study.simulators
         timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
-        if len(timeline.conditions) < 2 and "one-condition" not in settings.despite:
+        if len(timeline.conditions) < 2 and "one-condition" not in settings.allow:
             raise UnusableData(
                 "simulators.conditions: expected two or more for an agent to choose from, got one "
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
-                '(to go on in spite of it: simulators.despite = ["one-condition"])'
+                '(to go on in spite of it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)
@@ -85,7 +87,7 @@ def read_series(study: Study, folder: Path) -> list[Responses]:
         conditions_named(settings.conditions) if settings.conditions else None,
         settings.window_ms,
         burst_threshold=settings.burst_threshold,
-        despite=settings.despite,
+        allow=settings.allow,
     )
 
 

@@ -4,77 +4,35 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
-from animat.errors import InvalidArgument
+from animat.cultures.series import LONGEST_MIN
+from animat.errors import InvalidArgument, shown
 from animat.mapping import MAPPING_NAMES
-from animat.robots.base import Robot
+from animat.recordings.made_up import MadeUpCulture
+from animat.recordings.protocol import Protocol
+from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import robot_named
-
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,60}")
+from animat.studies.bounds import (
+    MOST_PRESENTATIONS,
+    MOST_SESSIONS,
+    check_algorithm,
+    check_name,
+    expect_at_once,
+    expect_choices,
+    expect_counts,
+    expect_positive,
+    expect_resolution,
+    expect_seed,
+    expect_trained,
+    expect_unlike,
+)
+from animat.training.bounds import MOST_ITERATIONS, MOST_POLICIES
 
 MAPPINGS = (*MAPPING_NAMES, "none")
 """Names of mappings that a condition may have; none is the baseline without neurons."""
-
-
-def _check_algorithm(settings: dict[str, float]) -> None:
-    from animat.training.sac import SAC
-
-    known = get_type_hints(SAC)
-    for name, value in settings.items():
-        if name not in known:
-            raise InvalidArgument(f"algorithm: expected settings among {', '.join(known)}, got {name!r}")
-        # 64.0 is as large as 64, but no shape of an array.
-        if known[name] is int and not isinstance(value, int):
-            raise InvalidArgument(f"algorithm.{name}: expected a whole number, got {value!r}")
-    SAC(**settings)  # type: ignore[arg-type]
-
-
-def _check_name(what: str, name: str) -> None:
-    if not _NAME.fullmatch(name):
-        raise InvalidArgument(f"{what}: expected letters, digits, spaces, dots and dashes, got {name!r}")
-    try:
-        float(name)
-    except ValueError:
-        return
-    raise InvalidArgument(f"{what}: expected a name, got {name!r}, which in a table would be a number")
-
-
-def _unlike(what: str, names: Sequence[str]) -> None:
-    for name, times in Counter(names).items():
-        if times > 1:
-            raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times")
-
-
-def _at_least(where: str, owner: object, **least: int) -> None:
-    for name, value in least.items():
-        if getattr(owner, name) < value:
-            prefix = f"{where}." if where else ""
-            raise InvalidArgument(f"{prefix}{name}: expected at least {value}, got {getattr(owner, name)}")
-
-
-def _one_of(where: str, owner: object) -> None:
-    """Every choice is one of those that its type names."""
-    for name, hint in get_type_hints(type(owner)).items():
-        if get_origin(hint) is Literal and getattr(owner, name) not in get_args(hint):
-            prefix = f"{where}." if where else ""
-            expected = ", ".join(get_args(hint))
-            raise InvalidArgument(f"{prefix}{name}: expected one of {expected}, got {getattr(owner, name)!r}")
-
-
-def _seed(name: str, value: int) -> None:
-    # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
-    if not 0 <= value < 2**32:
-        raise InvalidArgument(f"{name}: expected a whole number from 0 to 4294967295, got {value}")
-
-
-def _positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise InvalidArgument(f"{name}: expected a positive number, got {value:g}")
 
 
 @dataclass(frozen=True)
@@ -103,10 +61,25 @@ class Source:
     def __post_init__(self) -> None:
         if (self.kind == "files") != bool(self.files):
             raise InvalidArgument(f"culture.files: expected some for kind = 'files' only, got {len(self.files)}")
-        _one_of("culture", self)
-        _seed("culture.seed", self.seed)
-        _at_least("culture", self, sessions=1, pulses=1, presentations=2, channels=1)
-        _positive("culture.interval_min", self.interval_min)
+        expect_choices("culture", self)
+        expect_seed("culture.seed", self.seed)
+        expect_counts(
+            "culture",
+            self,
+            sessions=(1, MOST_SESSIONS),
+            pulses=(1, MOST_PRESENTATIONS),
+            presentations=(2, MOST_PRESENTATIONS),
+            channels=(1, 1024),
+        )
+        expect_positive("culture.interval_min", self.interval_min)
+        if self.sessions * self.interval_min > LONGEST_MIN:
+            raise InvalidArgument(
+                f"culture.sessions, culture.interval_min: expected recordings within a year, got {self.sessions} every "
+                f"{self.interval_min:g} min"
+            )
+        for file in self.files:
+            if not file or not file.isprintable():
+                raise InvalidArgument(f"culture.files: expected names of files, got {shown(file)}")
         if self.kind == "files":
             for each in fields(self):
                 if each.name not in ("kind", "files") and getattr(self, each.name) != each.default:
@@ -115,6 +88,14 @@ class Source:
                     )
         if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
             raise InvalidArgument("culture.order: a made-up culture is recorded blocked with one pulse, got otherwise")
+        # What the recordings themselves refuse is refused before there is a folder.
+        try:
+            if self.kind == "virtual":
+                Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations)
+            elif self.kind == "made-up":
+                MadeUpCulture(self.seed, patterns=self.presentations, channels=self.channels)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"culture.{error}") from error
 
 
 @dataclass(frozen=True)
@@ -125,8 +106,9 @@ class Simulators:
         kind, bins, range_hz: of the simulators; by default 20 bins with edges at each recording's own percentiles.
         conditions: what the agent picks from, such as `frequency` or `interval:5,10+-25%`; empty: by frequency.
         window_ms: start and end of the response window.
-        burst_threshold: share of active channels above which a response is a burst; None: by Otsu's method.
-        despite: findings to go on in spite of.
+        burst_threshold: share of active channels above which a response is a burst; None: Otsu's, where there are two
+            groups.
+        allow: findings to go on in spite of.
     """
 
     kind: Literal["histogram", "empirical", "memory"] = "histogram"
@@ -135,27 +117,27 @@ class Simulators:
     conditions: str = ""
     window_ms: tuple[float, float] = (2.0, 10.0)
     burst_threshold: float | None = None
-    despite: tuple[str, ...] = ()
+    allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         from animat.neurons.conditions import conditions_named
-        from animat.neurons.series import check_despite
+        from animat.neurons.series import check_allowed
         from animat.neurons.simulator import LARGEST_BINS
         from animat.neurons.windows import check_window
 
         # All before anything is recorded: whoever corrects it later needs another folder.
-        _one_of("simulators", self)
+        expect_choices("simulators", self)
         if not 1 <= self.bins <= LARGEST_BINS:
             raise InvalidArgument(f"simulators.bins: expected 1 to {LARGEST_BINS}, got {self.bins}")
         if self.range_hz is not None:
-            _positive("simulators.range_hz", self.range_hz)
+            expect_positive("simulators.range_hz", self.range_hz)
         if self.burst_threshold is not None and not 0 <= self.burst_threshold <= 1:
             raise InvalidArgument(
                 f"simulators.burst_threshold: expected a share of channels from 0 to 1, got {self.burst_threshold:g}"
             )
         try:
             check_window(self.window_ms)
-            check_despite(self.despite)
+            check_allowed(self.allow)
             if self.conditions:
                 conditions_named(self.conditions)
         except InvalidArgument as error:
@@ -184,15 +166,15 @@ class Body:
 
     def __post_init__(self) -> None:
         if self.kind:
-            _check_name("robots.name", self.name)
+            check_name("robots.name", self.name)
             if self.name == "culture":
                 raise InvalidArgument(
                     "robots.name: expected another name than the culture's figures have, got 'culture'"
                 )
-        if self.iterations is not None and self.iterations < 1:
-            raise InvalidArgument(f"robots.iterations: expected at least 1, got {self.iterations}")
+        if self.iterations is not None:
+            expect_counts("robots", self, iterations=(1, MOST_ITERATIONS))
         if self.limit_resolution is not None:
-            _positive("robots.limit_resolution", self.limit_resolution)
+            expect_resolution("robots.limit_resolution", self.limit_resolution)
         self.robot()
 
     def robot(self) -> Robot[Any]:
@@ -226,8 +208,8 @@ class StudyCondition:
     trained: bool = True
 
     def __post_init__(self) -> None:
-        _check_name("conditions.name", self.name)
-        _one_of("conditions", self)
+        check_name("conditions.name", self.name)
+        expect_choices("conditions", self)
         if self.mapping not in MAPPINGS:
             raise InvalidArgument(f"conditions.mapping: expected one of {', '.join(MAPPINGS)}, got {self.mapping!r}")
 
@@ -265,14 +247,13 @@ class Compared:
     episodes: int = 100
 
     def __post_init__(self) -> None:
-        _check_name("comparisons.name", self.name)
+        check_name("comparisons.name", self.name)
         if self.first == self.second:
             raise InvalidArgument(
                 f"comparisons.second: expected another condition than the first, got {self.second!r} twice in "
                 f"{self.name!r}"
             )
-        if self.episodes < 1:
-            raise InvalidArgument(f"comparisons.episodes: expected at least 1, got {self.episodes}")
+        expect_counts("comparisons", self, episodes=(1, MOST_AT_ONCE))
         if self.at_min is not None and not math.isfinite(self.at_min):
             raise InvalidArgument(f"comparisons.at_min: expected finite minutes, got {self.at_min:g}")
 
@@ -322,14 +303,28 @@ class Study:
         for what in ("robots", "conditions"):
             if not getattr(self, what):
                 raise InvalidArgument(f"{what}: expected at least one, got none")
-        _unlike("robots", [body.name for body in self.robots])
-        _unlike("conditions", [condition.slug for condition in self.conditions])
-        _unlike("comparisons", [compared.name for compared in self.comparisons])
-        _one_of("", self)
-        _seed("seed", self.seed)
-        _at_least("", self, policies=1, episodes=1, episodes_over_time=1, limit_episodes=2)
-        _positive("training_min", self.training_min)
-        _positive("limit_resolution", self.limit_resolution)
+        expect_unlike("robots", [body.name for body in self.robots])
+        expect_unlike("conditions", [condition.slug for condition in self.conditions])
+        expect_unlike("comparisons", [compared.name for compared in self.comparisons])
+        expect_choices("", self)
+        expect_seed("seed", self.seed)
+        expect_counts(
+            "",
+            self,
+            policies=(1, MOST_POLICIES),
+            episodes=(1, MOST_AT_ONCE),
+            episodes_over_time=(1, MOST_AT_ONCE),
+            limit_episodes=(2, MOST_AT_ONCE),
+        )
+        for name, episodes in (
+            ("episodes", self.episodes),
+            ("episodes_over_time", self.episodes_over_time),
+            *(("comparisons.episodes", compared.episodes) for compared in self.comparisons),
+        ):
+            expect_at_once(name, episodes, self.policies)
+        expect_trained(len(self.robots) * len(self.conditions) * self.policies)
+        expect_positive("training_min", self.training_min)
+        expect_resolution("limit_resolution", self.limit_resolution)
         known = [condition.name for condition in self.conditions]
         for compared in self.comparisons:
             for side in ("first", "second"):
@@ -343,7 +338,7 @@ class Study:
             for compared in self.comparisons:
                 self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
         if self.algorithm:
-            _check_algorithm(self.algorithm)
+            check_algorithm(self.algorithm)
 
     def condition(self, name: str) -> StudyCondition:
         """The condition of this name."""

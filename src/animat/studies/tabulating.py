@@ -15,6 +15,7 @@ from animat.errors import InvalidArgument
 from animat.evaluation.optimum import bracket_findings
 from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
+from animat.studies.heuristic import HEAD, rows_beside_heuristic
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of
 from animat.studies.paper import PRINTED
@@ -108,7 +109,7 @@ CURVES = ("robot", "condition", "policy", "iterations", "episodes", "mean_return
 @final
 @dataclass(frozen=True)
 class Tabulate(Task):
-    """Write `tables/`: scores, comparisons, controls, learning-curves, limits, controllability, findings."""
+    """Write `tables/`: scores, comparisons, controls, heuristic, learning-curves, limits, controllability, findings."""
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
         study, timeline = as_recorded(study, folder)
@@ -123,6 +124,7 @@ class Tabulate(Task):
         table("comparisons", COMPARISONS, _comparisons(study, folder, last, references))
         controls = [row for body in study.robots for row in _controls(study, folder, body, references[body.name])]
         table("controls", CONTROLS, controls)
+        table("heuristic", HEAD, [row for body in study.robots for row in rows_beside_heuristic(study, folder, body)])
         table("learning-curves", CURVES, _curves(study, folder))
         limits = [(body.name, row) for body in study.robots for row in read_table(limits_file(folder, body.name))]
         if limits:
@@ -218,7 +220,7 @@ def _scores(
         for condition in study.conditions:
             for at_min, episodes in sorted(study.minutes_of(condition, first, last).items()):
                 means = performances(folder, body, condition, at_min)
-                middle = interquartile_mean(means)
+                middle = interquartile_mean(means, within=body.robot().return_range)
                 limit = known.limit(condition, at_min) or {}
                 yield (
                     body.name,

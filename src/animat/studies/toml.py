@@ -7,13 +7,19 @@ import json
 import os
 import tomllib
 import types
-from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.plain_file import read_plain_text
 from animat.studies.specification import Study
 
 T = TypeVar("T")
+
+MOST_BYTES, MOST_ENTRIES = 2**20, 1_000
+"""Of a specification, and of a list in it."""
+
+_FORMER_KEYS = {"despite": "allow"}
+"""What settings were called in files that are still read."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
@@ -25,15 +31,15 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
     """
-    path = Path(path)
+    text = read_plain_text(path, MOST_BYTES)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidFile(f"{path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InvalidFile(f"{path}: expected TOML, got a mistake: {error}") from error
+        data = tomllib.loads(text)
+    except RecursionError as error:
+        raise InvalidFile(f"{path}: expected TOML, got lists or tables nested without end") from error
+    except ValueError as error:
+        # Also a number of more digits than Python reads.
+        said = str(error).partition(";")[0]
+        raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error
     try:
         return _read(Study, data, "")
     except InvalidArgument as error:
@@ -47,10 +53,14 @@ def study_to_toml(study: Study) -> str:
 
 def _read(kind: type[T], data: dict[str, Any], where: str) -> T:
     hints = get_type_hints(kind)
+    for former, key in _FORMER_KEYS.items():
+        if former in data and key in data:
+            raise InvalidArgument(f"{_join(where, former)}: expected {key} alone, which it was called before, got both")
+    data = {_FORMER_KEYS.get(key, key): value for key, value in data.items()}
     for key in data:
         if key not in hints:
             place = f"in [{where}]" if where else "at the top"
-            raise InvalidArgument(f"{key}: no such setting {place}; expected some of {', '.join(hints)}")
+            raise InvalidArgument(f"{_key(key)}: no such setting {place}; expected some of {', '.join(hints)}")
     required = [
         each.name
         for each in dataclasses.fields(kind)  # type: ignore[arg-type]
@@ -69,7 +79,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         return _value(next(each for each in arguments if each is not type(None)), value, where)
     if origin is Literal:
         if value not in arguments:
-            raise InvalidArgument(f"{where}: expected one of {', '.join(arguments)}, got {value!r}")
+            raise InvalidArgument(f"{where}: expected one of {', '.join(arguments)}, got {shown(value)}")
         return value
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, dict):
@@ -82,7 +92,10 @@ def _value(hint: Any, value: Any, where: str) -> Any:
             raise _wrong(where, "a table of numbers", value)
         return {key: _number(each, _join(where, key)) for key, each in value.items()}
     if hint is float:
-        return float(_number(value, where))
+        try:
+            return float(_number(value, where))
+        except OverflowError as error:
+            raise _wrong(where, "a number", value) from error
     expected = {int: "a whole number", str: "text", bool: "true or false"}[hint]
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
         raise _wrong(where, expected, value)
@@ -92,6 +105,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
 def _tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, list):
         raise _wrong(where, "a list", value)
+    if len(value) > MOST_ENTRIES:
+        raise InvalidArgument(f"{where}: expected at most {MOST_ENTRIES:,} entries, got {len(value):,}")
     if arguments[-1] is Ellipsis:
         return tuple(_value(arguments[0], each, where) for each in value)
     if len(value) != len(arguments):
@@ -106,11 +121,16 @@ def _number(value: Any, where: str) -> float | int:
 
 
 def _wrong(where: str, expected: str, value: Any) -> InvalidArgument:
-    return InvalidArgument(f"{where}: expected {expected}, got {value!r}")
+    return InvalidArgument(f"{where}: expected {expected}, got {shown(value)}")
 
 
 def _join(where: str, key: str) -> str:
-    return f"{where}.{key}" if where else key
+    return f"{where}.{_key(key)}" if where else _key(key)
+
+
+def _key(key: str) -> str:
+    """A key as a message names it; in quotes TOML lets it be any text."""
+    return key if key.isprintable() and len(key) < 60 else shown(key)
 
 
 def _lines(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:

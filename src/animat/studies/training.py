@@ -27,6 +27,8 @@ from animat.writing import written_whole
 class TrainGroup(Task):
     """Train some policies of a condition on a robot, going on from where a killed run stopped."""
 
+    grows_with = ("algorithm",)
+
     body: Body
     condition: StudyCondition
     members: tuple[int, ...]

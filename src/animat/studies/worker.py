@@ -14,7 +14,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from animat.errors import AnimatError
+from animat.errors import AnimatError, out_of_memory
 from animat.studies.jobs import Task
 from animat.studies.specification import Study
 from animat.training.worker import settle_on
@@ -60,7 +60,8 @@ def main() -> int:
             continue
         except Exception as error:
             # Nobody foresaw it: where it came from is told too, in one line, and the next job finds a worker.
-            tell(kind="failed", words=_unforeseen(error))
+            memory = out_of_memory(error)
+            tell(kind="failed", words=_unforeseen(error) if memory is None else f"{memory}: {task.needs(study)}")
             continue
         leaves = _resident_mib() > _LARGEST_MIB
         cpu_s = time.process_time() - began_s

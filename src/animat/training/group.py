@@ -50,14 +50,17 @@ class Group:
     provenance: dict[str, Any]
 
 
-def train_group(group: Group, checkpoint: Path, report: Report, *, checkpoint_s: float = CHECKPOINT_S) -> list[Policy]:
+def train_group(
+    group: Group, checkpoint: Path | None, report: Report, *, checkpoint_s: float = CHECKPOINT_S
+) -> list[Policy]:
     """Train a group of policies, going on from its checkpoint where there is one.
 
     The result is the same, bit for bit, however often the training was stopped and started again.
 
     Args:
         group: the policies to train.
-        checkpoint: file to write now and then, complete or absent; the caller removes it when it is done with.
+        checkpoint: file to write now and then, complete or absent; the caller removes it when it is done with. None:
+            none is written.
         report: told after each chunk.
         checkpoint_s: seconds between checkpoints; they change how much is done again, never the result.
 
@@ -68,14 +71,14 @@ def train_group(group: Group, checkpoint: Path, report: Report, *, checkpoint_s:
     if timeline is not None and training.percentiles == "first":
         timeline = timeline.with_first_percentiles()
     together = SideBySide(group)
-    done = together.resume(checkpoint) if checkpoint.exists() else 0
+    done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
     start_min = 0.0 if timeline is None else float(timeline.start_min[0])
     written = time.monotonic()
     for index in range(done, CHUNKS):
         mean_return = together.train(
             index, None if timeline is None else timeline.at(start_min + training.minute(index))
         )
-        if time.monotonic() - written > checkpoint_s:
+        if checkpoint is not None and time.monotonic() - written > checkpoint_s:
             together.keep(checkpoint)
             written = time.monotonic()
         report(index + 1, mean_return)
@@ -181,13 +184,20 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
     try:
         # Opened here, as numpy leaves a file open that it cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            # Before anything is read of it: an archive of some kilobytes can unpack to any size.
+            unpacked, most = sum(member.file_size for member in file.zip.infolist()), 2 * _bytes_of(leaves) + 2**22
+            if unpacked > most:
+                raise InvalidFile(
+                    f"{path}: expected a checkpoint of at most {most:,} bytes, got {unpacked:,}; remove it"
+                )
             if str(file["fingerprint"]) != fingerprint:
                 raise InvalidFile(f"{path}: expected a checkpoint of this training, got one of another; remove it")
             kept = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]
-            if [(a.shape, a.dtype) for a in kept] != [(a.shape, a.dtype) for a in leaves]:
+            done, curve = int(file["done"]), file["curve"]
+            forms = [[(a.shape, a.dtype) for a in arrays] for arrays in (kept, leaves)]
+            if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, len(leaves[0]), 3):
                 raise InvalidFile(f"{path}: expected a checkpoint as this animat writes it, got another's; remove it")
             read = [jnp.asarray(array) for array in kept]
-            done, curve = int(file["done"]), file["curve"]
     except InvalidFile:
         raise
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
@@ -196,6 +206,10 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
         ) from error
     learners = jax.tree.unflatten(structure, read)
     return done, learners._replace(key=jax.random.wrap_key_data(learners.key)), curve
+
+
+def _bytes_of(leaves: list[Any]) -> int:
+    return sum(leaf.nbytes for leaf in leaves)
 
 
 def split_groups(policies: int, largest: int = 5) -> list[tuple[int, ...]]:

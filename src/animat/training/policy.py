@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Mapping as Dict
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,29 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from animat.errors import AnimatError, InvalidArgument, InvalidFile
-from animat.mapping import Mapping, mapping_named
+from animat.brief import briefly
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, shown
+from animat.mapping import Mapping, expect_loadable_mapping, mapping_named
 from animat.neurons.conditions import Condition
+from animat.neurons.windows import check_window
+from animat.plain_file import expect_plain_file, is_folder
 from animat.recordings.protocol import Presentation
-from animat.robots.base import Robot
-from animat.robots.registry import robot_from_dict, robot_to_dict
+from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
+from animat.robots.registry import expect_loadable_robot, robot_from_dict, robot_to_dict
+from animat.training.provenance import expect_provenance, is_number
 from animat.writing import written_whole
 
 FORMAT = "animat-policy-1"
+HIDDEN_ACTIVATION = "relu"
+"""Of both hidden layers, max(0, x); said in every file, for whoever runs the network without this package."""
+_LAYERS = 3
+_ARRAYS = ("scales", "learning_curve", *(f"layer{i}.{part}" for i in range(_LAYERS) for part in ("weight", "bias")))
+_MOST_BYTES = 2**28
+_LARGEST = 1e6
+"""Trained weights are of order one; with larger ones than this the outputs overflow, and the actions mean nothing."""
+
+FITTED = ("kind", "bins", "range_hz", "by", "burst_threshold")
+"""What of `SimulatorTimeline.fitted` decides what a simulator of a recording is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +60,8 @@ class Policy:
         learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
     """
 
+    __repr__ = briefly
+
     weights: tuple[Float32[np.ndarray, "inputs outputs"], ...]
     biases: tuple[Float32[np.ndarray, " outputs"], ...]
     scales: Float32[np.ndarray, " observations"]
@@ -58,26 +75,49 @@ class Policy:
     learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
-        n_outputs = 2 if self.n_actions is None else self.n_actions
-        widths = [len(self.robot.quantities), *(len(bias) for bias in self.biases)]
-        shapes = [weight.shape for weight in self.weights]
-        if widths[-1] != n_outputs or shapes != list(itertools.pairwise(widths)):
-            raise InvalidArgument(
-                f"weights: expected layers from {widths[0]} observations of {self.robot.name} to {n_outputs} outputs, "
-                f"got shapes {shapes}"
-            )
-        if self.scales.shape != (widths[0],):
-            raise InvalidArgument(f"scales: expected one for each of {widths[0]} observations, got {self.scales.shape}")
-        if not all(np.all(np.isfinite(array)) for array in (*self.weights, *self.biases, self.scales)):
-            raise InvalidArgument("weights: expected finite numbers, got NaN or infinite ones")
-        if not np.all(self.scales > 0):
-            raise InvalidArgument(f"scales: expected positive numbers, got {self.scales.tolist()}")
-        if self.window_ms is not None and not (len(self.window_ms) == 2 and self.window_ms[0] < self.window_ms[1]):
-            raise InvalidArgument(f"window_ms: expected a start and a later end, got {self.window_ms}")
-        if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3:
+        self._expect_network()
+        if self.window_ms is not None:
+            if not (
+                isinstance(self.window_ms, tuple) and len(self.window_ms) == 2 and all(map(is_number, self.window_ms))
+            ):
+                raise InvalidArgument(f"window_ms: expected a start and a later end, got {shown(self.window_ms)}")
+            check_window(self.window_ms)
+        if self.commands is not None and not (
+            isinstance(self.commands, tuple) and all(is_number(u) and abs(u) <= 1 for u in self.commands)
+        ):
+            raise InvalidArgument(f"commands: expected numbers from -1 to 1, got {shown(self.commands)}")
+        if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
             raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
-        if not isinstance(self.provenance, Dict):
-            raise InvalidArgument(f"provenance: expected named data, got {self.provenance!r}")
+        expect_provenance(self.provenance)
+
+    def _expect_network(self) -> None:
+        """Refuse weights of which no action can be made, or one that means nothing."""
+        n_outputs = 2 if self.n_actions is None else self.n_actions
+        widths = [len(self.robot.quantities), *(bias.size for bias in self.biases)]
+        shapes = [weight.shape for weight in self.weights]
+        if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
+            raise InvalidArgument(
+                f"weights: expected three layers from {widths[0]} observations of {self.robot.name} to {n_outputs} "
+                f"outputs, got shapes {shapes}"
+            )
+        if any(bias.ndim != 1 for bias in self.biases) or self.scales.shape != (widths[0],):
+            raise InvalidArgument(
+                f"scales, biases: expected one for each of {widths[0]} observations and of each layer's outputs, got "
+                f"shapes {self.scales.shape} and {[bias.shape for bias in self.biases]}"
+            )
+        for name, arrays in (("weights", self.weights), ("biases", self.biases), ("scales", (self.scales,))):
+            for array in arrays:
+                if array.dtype != np.float32:
+                    raise InvalidArgument(f"{name}: expected float32, got {array.dtype}")
+                # Also false for NaN.
+                if name != "scales" and not np.all(np.abs(array) <= _LARGEST):
+                    raise InvalidArgument(
+                        f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN, infinite or larger ones"
+                    )
+        if not np.all((self.scales >= LEAST_SCALE) & (self.scales <= LARGEST_SCALE)):
+            raise InvalidArgument(
+                f"scales: expected numbers from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got {self.scales.tolist()}"
+            )
 
     @property
     def n_actions(self) -> int | None:
@@ -98,16 +138,28 @@ class Policy:
 
     @property
     def fitted(self) -> Dict[str, Any]:
-        """How the simulators it was trained on were made: `kind`, `bins`, `range_hz`; empty where that is not known."""
+        """How the simulators it was trained on were made: `FITTED` of a timeline; empty where that is not known."""
         told = self.provenance.get("simulators")
         if not (isinstance(told, Dict) and isinstance(told.get("kind"), str)):
             return {}
-        return {name: told.get(name) for name in ("kind", "bins", "range_hz")}
+        return {name: told[name] for name in FITTED if name in told}
 
     @property
     def _trained(self) -> Dict[str, Any]:
         told = self.provenance.get("training")
         return told if isinstance(told, Dict) else {}
+
+    def trained_until_min(self, first_min: float) -> float | None:
+        """The minute of the culture's clock that its training came to, where the first recording is of `first_min`.
+
+        None where that is not known.
+        """
+        trained = self._trained
+        if not trained:
+            return None
+        if not trained.get("shadowing") or trained.get("duration_min") is None:
+            return first_min
+        return first_min + float(trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"])
 
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
         """The network's outputs for an observation in the robot's own units."""
@@ -147,14 +199,20 @@ class Policy:
 
         Raises:
             InvalidFile: if it cannot be written; what stood there before is unchanged.
+            InvalidArgument: for a robot or mapping of one's own: the file could not be loaded again.
         """
         from safetensors.numpy import save
+
+        expect_loadable_robot(self.robot)
+        if self.mapping is not None:
+            expect_loadable_mapping(self.mapping)
 
         arrays = {"scales": self.scales, "learning_curve": self.learning_curve}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"layer{i}.weight": weight, f"layer{i}.bias": bias}
         described = {
             "format": FORMAT,
+            "hidden_activation": HIDDEN_ACTIVATION,
             "robot": robot_to_dict(self.robot),
             "mapping": None if self.mapping is None else self.mapping.name,
             "conditions": [asdict(condition) for condition in self.conditions],
@@ -176,29 +234,12 @@ class Policy:
         Raises:
             InvalidFile: if the file is missing, damaged, or not a policy of this format.
         """
-        from safetensors import SafetensorError, safe_open
-
-        path = Path(path)
-        if not path.is_file():
-            raise InvalidFile(f"{path}: expected a policy file, got {'a folder' if path.is_dir() else 'no such file'}")
+        path = expect_plain_file(path, _MOST_BYTES)
+        arrays, described = _read(path)
         try:
-            with safe_open(path, framework="numpy") as file:
-                metadata = file.metadata() or {}
-                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError, ValueError) as error:
-            raise InvalidFile(
-                f"{path}: expected a policy (safetensors), got a file that cannot be read: {error}"
-            ) from error
-        if "animat" not in metadata:
-            raise InvalidFile(f"{path}: expected a policy of animat, got a safetensors file of other origin")
-        try:
-            described = json.loads(metadata["animat"])
-            if described["format"] != FORMAT:
-                raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {described['format']!r}")
-            layers = range(sum(name.endswith(".weight") for name in arrays))
             return Policy(
-                weights=tuple(arrays[f"layer{i}.weight"] for i in layers),
-                biases=tuple(arrays[f"layer{i}.bias"] for i in layers),
+                weights=tuple(arrays[f"layer{i}.weight"] for i in range(_LAYERS)),
+                biases=tuple(arrays[f"layer{i}.bias"] for i in range(_LAYERS)),
                 scales=arrays["scales"],
                 robot=robot_from_dict(described["robot"]),
                 mapping=None if described["mapping"] is None else mapping_named(described["mapping"]),
@@ -209,10 +250,43 @@ class Policy:
                 provenance=described["provenance"],
                 learning_curve=arrays["learning_curve"],
             )
-        except (KeyError, TypeError, ValueError, AnimatError) as error:
-            raise InvalidFile(
-                f"{path}: expected a whole policy, got one that does not fit together: {error}"
-            ) from error
+        except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
+            said = f"nothing called {error}" if isinstance(error, KeyError) else error
+            raise InvalidFile(f"{path}: expected a whole policy, got one that does not fit together: {said}") from error
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+    """A policy's arrays and its description; nothing is read of a file with other arrays."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if "animat" not in metadata:
+                raise InvalidFile(f"{path}: expected a policy of animat, got a safetensors file of other origin")
+            kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
+            if set(kinds) != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
+                told = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
+                raise InvalidFile(
+                    f"{path}: expected a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64, got {told[:400]}"
+                )
+            arrays = {name: file.get_tensor(name) for name in kinds}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InvalidFile(
+            f"{path}: expected a policy (safetensors), got a file that cannot be read: {error}"
+        ) from error
+    try:
+        described = json.loads(metadata["animat"])
+    except (ValueError, RecursionError) as error:
+        raise InvalidFile(f"{path}: metadata: expected JSON, got something else ({error})") from error
+    found = described.get("format") if isinstance(described, dict) else described
+    if found != FORMAT:
+        raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {shown(found)}")
+    # Files written before it was said have none, and are of this one.
+    activation = described.get("hidden_activation", HIDDEN_ACTIVATION)
+    if activation != HIDDEN_ACTIVATION:
+        raise InvalidFile(f"{path}: expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
+    return arrays, described
 
 
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
@@ -222,9 +296,12 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
         InvalidFile: if there is none, or one cannot be read.
     """
     path = Path(path)
-    if not path.exists():
-        raise InvalidFile(f"{path}: expected a policy file or a folder of them, got no such file; train them first")
-    if not path.is_dir():
+    if not is_folder(path):
+        with suppress(OSError, ValueError):
+            if not path.exists():
+                raise InvalidFile(
+                    f"{path}: expected a policy file or a folder of them, got no such file; train them first"
+                )
         return {path.stem: Policy.load(path)}
     # Hidden files are unfinished ones: a process was killed while it wrote them.
     whole = [file for file in path.glob("*.safetensors") if not file.name.startswith(".")]

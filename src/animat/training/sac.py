@@ -28,8 +28,9 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from animat.animat import Environment, EpisodeState
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.neurons.simulator import NeuronSimulator
+from animat.training.bounds import MOST_OF
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class SAC:
         entropy_nats: the entropy that a continuous action keeps.
 
     Raises:
-        InvalidArgument: for a count below 1, a rate or a share outside what it may be, or a replay that is no multiple
-            of the environments.
+        InvalidArgument: for a count below 1 or beyond what fits, a rate or a share outside what it may be, or a replay
+            that is no multiple of the environments.
     """
 
     environments: int = 32
@@ -71,11 +72,12 @@ class SAC:
     entropy_nats: float = -1.0
 
     def __post_init__(self) -> None:
-        if self.replay > 2**23:
-            raise InvalidArgument(f"replay: expected at most 8388608, as float32 numbers no more, got {self.replay}")
-        for name in ("environments", "updates", "batch", "replay", "hidden", "averaging"):
-            if not (getattr(self, name) >= 1 and float(getattr(self, name)).is_integer()):
-                raise InvalidArgument(f"{name}: expected a whole number from 1 on, got {getattr(self, name)}")
+        for name, most in MOST_OF.items():
+            count: Any = getattr(self, name)
+            if not (count >= 1 and count % 1 == 0):
+                raise InvalidArgument(f"{name}: expected a whole number from 1 on, got {shown(count)}")
+            if count > most:
+                raise InvalidArgument(f"{name}: expected at most {most}, got {shown(count)}")
         for name in ("learning_rate", "reward_scale", "first_alpha"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")

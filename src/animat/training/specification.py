@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, get_args
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Generic, Literal, TypeVar, get_args
+
+import numpy as np
 
 from animat.animat import Animat, Delivery, Environment, WithoutNeurons
-from animat.errors import InvalidArgument
-from animat.mapping import Mapping
+from animat.errors import InvalidArgument, shown
+from animat.mapping import Mapping, mapping_named
+from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.base import Robot
-from animat.robots.registry import robot_to_dict
+from animat.robots.registry import robot_named, robot_to_dict
+from animat.training.bounds import MOST_ITERATIONS, MOST_POLICIES
 from animat.training.sac import SAC
 
 Percentiles = Literal["moving", "first"]
@@ -19,18 +24,43 @@ CHUNKS = 60
 """Parts that training is cut into: the units of progress, refresh and checkpoint; a culture minute each by default."""
 
 
+T = TypeVar("T")
+
+
+class _Named(Generic[T]):
+    """A field that is given a thing or its name, and holds the thing."""
+
+    def __init__(self, named: Callable[[str], T]) -> None:
+        self._named = named
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, training: object, owner: type) -> T:
+        if training is None:
+            # So a dataclass learns that the field has no default.
+            raise AttributeError(self._name)
+        value: T = vars(training)[self._name]
+        return value
+
+    def __set__(self, training: object, value: T | str) -> None:
+        vars(training)[self._name] = self._named(value) if isinstance(value, str) else value
+
+
 @dataclass(frozen=True)
 class Training:
     """Everything that decides how policies come out, but for the recordings.
 
     Attributes:
-        robot: the robot to be driven.
-        mapping: from responses to commands; None trains the baseline without neurons, which moves the robot directly.
+        robot: the robot to be driven, or its name.
+        mapping: from responses to commands, or its name; None trains the baseline without neurons, which moves the
+            robot directly.
         policies: how many are trained, each from its own random numbers.
         iterations: of the robot, for each policy; rounded up to whole rounds of `algorithm.environments`.
         seed: decides every random draw.
         shadowing: whether simulators are refreshed during training; if not, the first one is used throughout.
-        duration_min: minutes of the culture's clock that the whole training stands for (the paper: 60).
+        duration_min: minutes of the culture's clock that the whole training stands for (the paper: 60); None: as long
+            as the recordings that it is trained on (`SimulatorTimeline.span_min`).
         percentiles: `"moving"` with the simulator in use, or those of the `"first"` recording held.
         delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random whatever it chose.
         commands: without neurons, the commands to pick from; None: any in [-1, 1].
@@ -40,30 +70,33 @@ class Training:
         InvalidArgument: for counts or durations that are not positive.
     """
 
-    robot: Robot[Any]
-    mapping: Mapping | None
+    robot: _Named[Robot[Any]] = _Named(robot_named)
+    mapping: _Named[Mapping | None] = _Named(mapping_named)
     policies: int = 10
     iterations: int = 800_000
     seed: int = 1
     shadowing: bool = True
-    duration_min: float = 60.0
+    duration_min: float | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
     commands: tuple[float, ...] | None = None
     algorithm: SAC = field(default_factory=SAC)
 
     def __post_init__(self) -> None:
-        for name in ("policies", "iterations"):
-            if getattr(self, name) < 1:
-                raise InvalidArgument(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if self.iterations > 2**31 - 1 - self.algorithm.environments:
-            raise InvalidArgument(
-                f"iterations: expected at most 2e9, as they are counted in int32, got {self.iterations}"
-            )
-        # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
-        if not 0 <= self.seed < 2**32:
-            raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {self.seed}")
-        if not (math.isfinite(self.duration_min) and self.duration_min > 0):
+        for what, kind in (("robot", Robot), ("mapping", Mapping)):
+            value: Any = getattr(self, what)
+            if not isinstance(value, kind) and (what, value) != ("mapping", None):
+                raise InvalidArgument(f"{what}: expected a {what} or the name of one, got {shown(value)}")
+        for name, most in (("policies", MOST_POLICIES), ("iterations", MOST_ITERATIONS), ("seed", 2**32 - 1)):
+            number: Any = getattr(self, name)
+            least = 0 if name == "seed" else 1
+            if not isinstance(number, int | np.integer) or isinstance(number, bool) or not least <= number <= most:
+                raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
+        if self.commands is not None:
+            object.__setattr__(self, "commands", tuple(map(float, self.commands)))
+            if not self.commands or not all(abs(u) <= 1 for u in self.commands):
+                raise InvalidArgument(f"commands: expected numbers from -1 to 1, got {shown(self.commands)}")
+        if self.duration_min is not None and not (math.isfinite(self.duration_min) and self.duration_min > 0):
             raise InvalidArgument(f"duration_min: expected positive minutes, got {self.duration_min:g}")
         for name, allowed in (("percentiles", get_args(Percentiles)), ("delivery", get_args(Delivery))):
             if getattr(self, name) not in allowed:
@@ -80,7 +113,15 @@ class Training:
 
     def minute(self, index: int) -> float:
         """The minute of the culture's clock, from the first recording on, that a chunk starts at."""
-        return self.duration_min * index / CHUNKS if self.shadowing else 0.0
+        if not self.shadowing or self.duration_min is None:
+            return 0.0
+        return self.duration_min * index / CHUNKS
+
+    def over(self, timeline: SimulatorTimeline | None) -> Training:
+        """The same with a duration: as long as the recordings, unless one was given."""
+        if self.duration_min is not None or timeline is None:
+            return self
+        return replace(self, duration_min=timeline.span_min)
 
     def environment(self, n_conditions: int) -> Environment[Any]:
         """What the policies act in."""

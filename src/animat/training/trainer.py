@@ -22,9 +22,12 @@ import numpy as np
 
 from animat.differences import first_difference
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
+from animat.mapping import check_mapping, expect_loadable_mapping
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress, Silent
-from animat.training.group import CHECKPOINT_S, Group, split_groups
+from animat.robots.checking import check_robot
+from animat.robots.registry import expect_loadable_robot
+from animat.training.group import CHECKPOINT_S, Group, split_groups, train_group
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import alone_in, clear_away, written_whole
@@ -38,7 +41,7 @@ _NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
 def train(
     training: Training,
     timeline: SimulatorTimeline | None,
-    folder: str | os.PathLike[str],
+    folder: str | os.PathLike[str] | None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -53,7 +56,8 @@ def train(
     Args:
         training: what is trained.
         timeline: the culture's simulators; None for a training without neurons.
-        folder: where the policies go; made where it is missing.
+        folder: where the policies go; made where it is missing. None: nowhere; they are trained in this process, and
+            a training that is stopped begins anew. So can robots and mappings of one's own, which no file can name.
         workers: processes to use, each pinned to a core of its own; None: as many as there are cores.
         progress: told how far it is.
         checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
@@ -63,7 +67,8 @@ def train(
         The policies by name, `p0` first.
 
     Raises:
-        InvalidArgument: if neurons are missing for a mapping or given without one, or for fewer workers than one.
+        InvalidArgument: if neurons are missing for a mapping or given without one, for fewer workers than one, or as
+            `expect_trainable` does.
         Mismatch: if the folder holds another training, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
     """
@@ -74,24 +79,47 @@ def train(
         )
     if workers is not None and workers < 1:
         raise InvalidArgument(f"workers: expected at least 1, got {workers}")
+    expect_trainable(training, is_saved=folder is not None)
     progress = progress or Silent()
-    folder = Path(folder)
+    training = training.over(timeline)
     manifest = describe(training, timeline, sources)
+    groups = [
+        Group(training, members, _on_host(timeline), manifest["fingerprint"], provenance_of(manifest))
+        for members in split_groups(training.policies)
+    ]
+    if folder is None:
+        return _in_memory(groups, progress)
+    folder = Path(folder)
     # Seen before it is touched: somebody else's folder stays as it is.
     _is_ours(folder, manifest)
     with alone_in(folder):
         if not _is_ours(folder, manifest):
             with written_whole(folder / MANIFEST) as beside:
                 beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
-        groups = [
-            Group(training, members, _on_host(timeline), manifest["fingerprint"], provenance_of(manifest))
-            for members in split_groups(training.policies)
-        ]
         _run([group for group in groups if not _is_trained(group, folder)], folder, workers, checkpoint_s, progress)
         shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)
         for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)
     return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+
+
+def expect_trainable(training: Training, *, is_saved: bool) -> None:
+    """Refuse, before the first iteration, what cannot be trained, or could not be loaded once it is.
+
+    Args:
+        training: what is to be trained.
+        is_saved: whether its policies go to files.
+
+    Raises:
+        InvalidArgument: naming what of the robot or the mapping was expected, what came, and what can be done.
+    """
+    check_robot(training.robot)
+    if training.mapping is not None:
+        check_mapping(training.mapping)
+    if is_saved:
+        expect_loadable_robot(training.robot)
+        if training.mapping is not None:
+            expect_loadable_mapping(training.mapping)
 
 
 def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
@@ -136,7 +164,10 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
         if fingerprint != manifest["fingerprint"]:
-            difference = first_difference(found, manifest, ignoring=_NOT_TOLD) or "other responses"
+            # What follows from the robot, such as the usual iterations, is not what differs.
+            there, now = (each.get("training", {}).get("robot", {}).get("name") for each in (found, manifest))
+            difference = first_difference(there, now, "training.robot.name")
+            difference = difference or first_difference(found, manifest, ignoring=_NOT_TOLD) or "other responses"
             raise Mismatch(
                 f"{folder}: expected a folder of this training, got one of another ({difference}); "
                 "give another folder, or remove this one"
@@ -169,6 +200,20 @@ def _on_host(timeline: SimulatorTimeline | None) -> Any:
     from dataclasses import replace
 
     return replace(timeline, simulators=jax.device_get(timeline.simulators))
+
+
+def _in_memory(groups: list[Group], progress: Progress) -> dict[str, Policy]:
+    """Train the groups in this process, one after the other."""
+    trained: dict[str, Policy] = {}
+    for number, group in enumerate(groups):
+
+        def told(done: int, mean_return: float, number: int = number) -> None:
+            note = "" if math.isnan(mean_return) else f"return {mean_return:.1f}"
+            progress.update(number * CHUNKS + done, len(groups) * CHUNKS, note)
+
+        policies = train_group(group, None, told)
+        trained |= {f"p{member}": policy for member, policy in zip(group.members, policies, strict=True)}
+    return trained
 
 
 def _run(groups: list[Group], folder: Path, workers: int | None, checkpoint_s: float, progress: Progress) -> None:
@@ -222,8 +267,11 @@ def _start(group: Group, folder: Path, core: int, checkpoint_s: float) -> subpro
     checkpoint = folder / _UNFINISHED / f"from-p{group.members[0]}.npz"
     # From a file, not a pipe: the job may be larger than a pipe holds, and is read only once JAX is imported.
     with tempfile.TemporaryFile() as job:
-        pickle.dump((group, folder, checkpoint, checkpoint_s), job)
-        job.seek(0)
+        try:
+            pickle.dump((group, folder, checkpoint, checkpoint_s), job)
+            job.seek(0)
+        except OSError as error:
+            raise InvalidFile(f"{tempfile.gettempdir()}: cannot be written to: {error.strerror or error}") from error
         # In a process group of its own: Ctrl-C reaches this process alone, which then ends the worker without a word.
         return subprocess.Popen(
             [sys.executable, "-m", "animat.training.worker", str(core)],

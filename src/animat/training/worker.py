@@ -19,7 +19,7 @@ def main() -> int:
     settle_on(int(sys.argv[1]))
 
     from animat.compilation import keep_compilations
-    from animat.errors import AnimatError
+    from animat.errors import AnimatError, out_of_memory
     from animat.training.group import Group, train_group
 
     keep_compilations()
@@ -37,8 +37,13 @@ def main() -> int:
         for member, policy in zip(group.members, policies, strict=True):
             policy.save(folder / f"p{member}.safetensors")
         checkpoint.unlink(missing_ok=True)
-    except AnimatError as error:
-        print(json.dumps({"error": str(error)}), flush=True)
+    except Exception as error:
+        memory = out_of_memory(error)
+        if memory is None and not isinstance(error, AnimatError):
+            raise
+        sizes = "environments, replay, batch, hidden"
+        told = f"{memory}: it grows with the algorithm's {sizes}, got {group.training.algorithm}" if memory else error
+        print(json.dumps({"error": str(told)}), flush=True)
         return 1
     return 0
 

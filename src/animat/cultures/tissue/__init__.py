@@ -2,6 +2,7 @@
 
 from animat.cultures.tissue.coupling import Pulse
 from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
-from animat.cultures.tissue.tissue import Snapshot, Spikes, Tissue
+from animat.cultures.tissue.snapshot import Snapshot
+from animat.cultures.tissue.tissue import Spikes, Tissue
 
 __all__ = ["Pulse", "ShortTerm", "Snapshot", "Spikes", "Tissue", "TissueParameters"]

@@ -22,22 +22,21 @@ class Fatigue:
         self._parameters = parameters
         self._draws = np.random.default_rng([seed, 2])
         self._kept = float(np.exp(-MARK_S / (60 * parameters.drift_min)))
-        self._drift = 0.0
-        self._gains: list[float] = []
+        self._drifts = [0.0]
+        self._last = -1, 1.0
 
     def gain(self, mark: int) -> float:
         """The factor on all excitatory weights from `mark` to the next, marks being `MARK_S` apart."""
-        while len(self._gains) <= mark:
-            self._gains.append(self._next())
-        return self._gains[mark]
+        if mark != self._last[0]:
+            self._last = mark, self._gain(mark)
+        return self._last[1]
 
-    def _next(self) -> float:
-        """The gain after those that are known."""
-        mark, parameters = len(self._gains), self._parameters
-        if mark:
-            # Every mark takes one draw, in order: the drift is one function of time, however time is passed.
-            draw = self._draws.standard_normal() * parameters.drift_share * np.sqrt(1 - self._kept**2)
-            self._drift = self._drift * self._kept + float(draw)
+    def _gain(self, mark: int) -> float:
+        parameters, kept = self._parameters, self._kept
+        # Every mark takes one draw, in order: the drift is one function of time, however time is passed.
+        draws = self._draws.standard_normal(max(0, mark + 1 - len(self._drifts)))
+        for draw in (draws * parameters.drift_share * np.sqrt(1 - kept**2)).tolist():
+            self._drifts.append(self._drifts[-1] * kept + draw)
         minutes = mark * MARK_S / 60
         lost = parameters.fatigue_share * (1 - np.exp(-minutes / parameters.fatigue_min))
-        return float(max(0.0, 1 - lost + self._drift))
+        return float(max(0.0, 1 - lost + self._drifts[mark]))

@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
+
+from animat.compilation import kept_njit
 
 f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
@@ -106,9 +107,9 @@ def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
     return record
 
 
-compiled = numba.njit(cache=True, error_model="numpy", fastmath=False)
+compiled = kept_njit(error_model="numpy", fastmath=False)
 # Without inlining, every call copies the description of every array of its arguments.
-inlined = numba.njit(cache=True, error_model="numpy", fastmath=False, forceinline=True)
+inlined = kept_njit(error_model="numpy", fastmath=False, forceinline=True)
 
 
 @inlined

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isfinite
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from animat.cultures.tissue.fatigue import MARK_S, Fatigue
 from animat.cultures.tissue.network import grow
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.cultures.tissue.preparation import fresh_state, prepare_constants, prepare_wiring
+from animat.cultures.tissue.snapshot import Snapshot, expect_sound
 from animat.errors import InvalidArgument, Mismatch
 
 NS = 1_000_000_000
@@ -34,18 +34,6 @@ class Spikes(NamedTuple):
 
 
 NO_SPIKES = Spikes(np.empty(0), np.empty(0, np.int64))
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """The state of a tissue at one time, made by `Tissue.snapshot`, for tissues of the same seed and parameters."""
-
-    seed: int
-    parameters: TissueParameters
-    now_ns: int
-    step: int
-    kicks: Kicks
-    state: kernel.State
 
 
 class Tissue:
@@ -196,12 +184,14 @@ class Tissue:
 
         Raises:
             Mismatch: for a snapshot of another seed or other parameters.
+            InvalidArgument: for numbers that no tissue comes to; nothing has then changed.
         """
         if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
             raise Mismatch(
                 f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or of "
                 "other parameters: make a tissue with those"
             )
+        expect_sound(snapshot, self._state, self._wiring, self._step_ns)
         self._state = kernel.State(*(values.copy() for values in snapshot.state))
         self._run = self._constants, tuple(self._wiring), tuple(self._state)
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks

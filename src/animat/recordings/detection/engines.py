@@ -48,7 +48,9 @@ def steps_of(engine: Engine) -> Steps:
     """
     installed = importlib.util.find_spec("spikeinterface") is not None
     if engine == "spikeinterface" and not installed:
-        raise InvalidArgument("engine: expected an installed package, got spikeinterface: pip install 'animat[raw]'")
+        raise InvalidArgument(
+            "engine: expected an installed package, got spikeinterface: pip install 'spikeinterface>=0.104'"
+        )
     if engine == "scipy" or not installed:
         return SCIPY
     from animat.recordings.detection import with_spikeinterface

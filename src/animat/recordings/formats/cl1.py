@@ -8,7 +8,8 @@
 The rig keeps no amplitude, frequency or pattern: animat's driver puts them into a data stream of its own, one text a
 request (`animat.recordings.formats.stimulus_text`), which holds for the pulses from its timestamp on until the next.
 Pulses of one timestamp on several channels are one stimulus. Attributes that are dictionaries are pickles: they are
-never opened. A channel is an electrode on this rig, so its number stands for both.
+never opened. A channel is an electrode on this rig, so its number stands for both. Of its 64 channels ground and
+reference are no electrodes: they do not count, as in animat's own recordings, and spikes on them are left out.
 """
 
 from __future__ import annotations
@@ -22,16 +23,13 @@ import numpy as np
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
+from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.stimulus_text import LONGEST, padded, stimulus_columns
 from animat.recordings.recording import Recording
 
 WHAT = "CL1 recording"
 USUAL_RATE_HZ = 25_000.0
-USUAL_CHANNELS = 64
-STIMULUS_STREAM = "animat_stimuli"
-"""Name of the data stream that animat's driver keeps the stimuli's parameters in."""
-
 _TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
 _LARGEST_CHANNEL_COUNT = 4096
 
@@ -68,9 +66,9 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         n_channels = file.attribute("/", "channel_count")
         if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
             findings.append(
-                Finding("channel-count-missing", "note", f"the number of channels is not in the file: {USUAL_CHANNELS}")
+                Finding("channel-count-missing", "note", f"the number of channels is not in the file: {CHANNELS}")
             )
-            n_channels = USUAL_CHANNELS
+            n_channels = CHANNELS
         stimulus_frame, columns = _stimuli(file)
         start = _first_frame(file, frame, stimulus_frame)
         columns |= _parameters(file, stimulus_frame)
@@ -78,6 +76,21 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         created = file.attribute("/", "created_utc")
     if len(channel) and int(channel.max()) >= n_channels:
         n_channels = int(channel.max()) + 1
+    electrodes = np.array(SITES if n_channels == CHANNELS else range(n_channels), dtype=np.int64)
+    on_electrode = np.isin(channel, electrodes)
+    if stray := int(np.count_nonzero(~on_electrode)):
+        names = ", ".join(
+            f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in np.unique(channel[~on_electrode]).tolist()
+        )
+        findings.append(
+            Finding(
+                "spikes-not-on-electrodes",
+                "note",
+                f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes; left out",
+                float(stray),
+            )
+        )
+    frame, channel = frame[on_electrode], channel[on_electrode]
     spike_time_s, stimulus_time_s = (frame - start) / rate_hz, (stimulus_frame - start) / rate_hz
     times = np.concatenate([spike_time_s, stimulus_time_s])
     if isinstance(frames, int) and frames > 0:
@@ -91,8 +104,8 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         spike_time_s=spike_time_s,
         spike_channel=channel,
         stimulus_time_s=stimulus_time_s,
-        channel_label=np.arange(n_channels),
-        channel_electrode=np.arange(n_channels),
+        channel_label=electrodes,
+        channel_electrode=electrodes,
         sampling_rate_hz=rate_hz,
         **columns,
     ).to_recording(provenance, tuple(findings))

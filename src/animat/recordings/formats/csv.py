@@ -1,7 +1,8 @@
 """CSV: spikes in `NAME_spikes.csv[.gz]`, stimuli beside them in `NAME_stimuli.csv[.gz]`.
 
-Both have a header line and columns separated by commas, semicolons or tabs; a stimulus file may also be one bare
-column of times. Column names are those of `animat.recordings.columns.PlainColumns`, or short ones:
+Both have a header line and columns separated by commas, semicolons or tabs (`animat.recordings.formats.text_table`); a
+stimulus file may also be one bare column of times. Column names are those of
+`animat.recordings.columns.PlainColumns`, or short ones:
 
     spikes     spike_time_s, time_s or time (seconds); spike_channel, channel or unit (a number or a name)
     stimuli    stimulus_time_s, time_s or time (seconds); and, if known, stimulus_frequency_hz or frequency_hz,
@@ -13,11 +14,7 @@ Other columns are left out, which is noted. There is no table of channels: those
 
 from __future__ import annotations
 
-import csv
-import gzip
-import io
 import os
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +24,7 @@ import numpy as np
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
+from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
 from animat.recordings.recording import UNKNOWN, Recording
 
 SPIKE_COLUMNS = {
@@ -42,7 +40,8 @@ STIMULUS_COLUMNS = {
 }
 MOST_ELECTRODES = 50_000_000
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
-UNPACKED_BYTES, UNPACKED_RATIO = 2**22, 20
+NAMES = ("spike_channel", "stimulus_pattern")
+"""Columns that may be text."""
 SUFFIXES = (".csv", ".csv.gz")
 
 
@@ -52,10 +51,10 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
     Args:
         path: the spikes.
         stimuli_path: the stimuli; by default `NAME_stimuli.csv` or `NAME_stimuli.csv.gz` beside `NAME_spikes.csv`
-            (or beside `NAME.csv`). Where there is none, the recording has no stimuli.
+            (or beside `NAME.csv`). Where there is none, the recording has no stimuli, which is noted.
 
     Raises:
-        InvalidFile: if a file is missing, damaged or lacks a required column.
+        InvalidFile: if a file is missing, damaged or lacks a required column, or the two seem to be swapped.
         UnusableData: if a column is not what it should be.
     """
     path = Path(path)
@@ -66,11 +65,17 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
     else:
         stimuli = Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
-    columns, findings = _table(path, SPIKE_COLUMNS)
+    columns, findings = _columns(read_text_table(path), SPIKE_COLUMNS)
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
+        looked_for = " or ".join(file.name for file in _stimuli_beside(path))
+        sentence = (
+            f"{path.name} has {len(columns['spike_time_s']):,} spikes but no stimuli beside it, so there are no "
+            f"responses to learn from: {looked_for} was looked for; name the file of stimuli so"
+        )
+        findings.append(Finding("no-stimuli", "refuse", sentence))
     else:
-        stimulus_columns, stimulus_findings = _table(stimuli, STIMULUS_COLUMNS)
+        stimulus_columns, stimulus_findings = _columns(read_text_table(stimuli, "stimulus_time_s"), STIMULUS_COLUMNS)
         columns |= stimulus_columns
         findings += stimulus_findings
         provenance["stimuli"] = stimuli.name
@@ -83,118 +88,108 @@ def read_stimuli_csv(path: Path) -> dict[str, Any]:
     Raises:
         InvalidFile: if the file is missing, damaged or lacks the times.
     """
-    return _table(path, STIMULUS_COLUMNS)[0]
+    return _columns(read_text_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)[0]
 
 
 def stimuli_beside(path: Path) -> Path | None:
     """The file of stimuli that belongs to a file of spikes, if there is one."""
+    return next((file for file in _stimuli_beside(path) if file.exists()), None)
+
+
+def _stimuli_beside(path: Path) -> list[Path]:
     name = _stem(path).removesuffix("_spikes")
-    found = [path.with_name(f"{name}_stimuli{suffix}") for suffix in SUFFIXES]
-    return next((file for file in found if file.exists()), None)
+    return [path.with_name(f"{name}_stimuli{suffix}") for suffix in SUFFIXES]
 
 
 def _stem(path: Path) -> str:
     return path.name.removesuffix(".gz").removesuffix(".csv")
 
 
-def _table(path: Path, known: Mapping[str, tuple[str, ...]]) -> tuple[dict[str, Any], list[Finding]]:
-    """The known columns of a file under our names, and what was left out."""
-    text = _text(path)
-    first_line = text[: text.find("\n")] if "\n" in text else text
-    rows = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=first_line.count))
-    try:
-        lines = [row for row in rows if row]
-    except csv.Error as error:
-        raise InvalidFile(f"{path}: expected CSV (text in columns), got something else ({error})") from error
-    if not lines:
-        raise InvalidFile(f"{path}: expected a header line and a line an event, got an empty file")
-    header = [name.strip() for name in lines[0]]
-    if len(header) == 1 and _is_number(header[0]) and "stimulus_time_s" in known:
-        header = ["stimulus_time_s"]
-    else:
-        del lines[0]
+def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[dict[str, Any], list[Finding]]:
+    """The known columns of a file under our names, and what was noticed and left out."""
     place = {}
     for name, names in known.items():
-        found = [header.index(n) for n in names if n in header]
-        if found:
-            place[name] = found[0]
+        found = table.place(names)
+        if found is not None:
+            place[name] = found
         elif name in REQUIRED:
-            found_names = ", ".join(repr(h)[1:-1][:40] for h in header[:12]) + (", ..." if len(header) > 12 else "")
-            raise InvalidFile(f"{path}: expected a column named {' or '.join(names)}, found {found_names}")
-    left_out = [name for i, name in enumerate(header) if i not in place.values()]
-    findings = []
+            raise InvalidFile(
+                f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {_listed(table)}"
+                f"{_advice(table, name)}"
+            )
+    columns = {name: plain_column(table, i, name) for name, i in place.items()}
+    left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
     if left_out:
-        sentence = f"columns of {path.name} that are not known were left out: {', '.join(left_out)}"
-        findings.append(Finding("columns-left-out", "note", sentence, float(len(left_out))))
-    try:
-        cells = {name: [line[i] for line in lines] for name, i in place.items()}
-    except IndexError as error:
-        short, line = next((n, line) for n, line in enumerate(lines, 1) if len(line) < len(header))
-        raise InvalidFile(
-            f"{path}: expected {len(header)} columns in each line, got {len(line)} in data line {short}; "
-            "is the file cut off?"
-        ) from error
-    return {name: _column(path, name, column) for name, column in cells.items()}, findings
+        sentence = f"columns of {table.path.name} that are not known were left out: {', '.join(left_out)}"
+        table.findings.append(Finding("columns-left-out", "note", sentence, float(len(left_out))))
+    return columns, table.findings
 
 
-def _text(path: Path) -> str:
-    try:
-        content = path.read_bytes()
-        if content[:2] == b"\x1f\x8b":
-            content = _unpacked(path, content)
-        return content.decode("utf-8-sig")
-    except FileNotFoundError as error:
-        raise InvalidFile(f"{path}: no such file") from error
-    except UnicodeDecodeError as error:
-        raise InvalidFile(f"{path}: expected CSV (text in UTF-8), got something else ({error.reason})") from error
-    except (OSError, EOFError, zlib.error) as error:
-        raise InvalidFile(
-            f"{path}: expected a whole file, but it cannot be read or is cut off ({error}); copy it again"
-        ) from error
+def _listed(table: TextTable) -> str:
+    header = table.header
+    return ", ".join(repr(name)[1:-1][:40] for name in header[:12]) + (", ..." if len(header) > 12 else "")
 
 
-def _unpacked(path: Path, content: bytes) -> bytes:
-    """What is in a gzipped file, unless it is far more than text of that size packs."""
-    limit = UNPACKED_BYTES + UNPACKED_RATIO * len(content)
-    with gzip.open(io.BytesIO(content)) as packed:
-        unpacked = packed.read(limit + 1)
-    if len(unpacked) > limit:
-        raise InvalidFile(f"{path}: unpacks to more than {limit:,} bytes, more than text of its size: it is damaged")
-    return unpacked
+def _advice(table: TextTable, missing: str) -> str:
+    """What to do about a column that is missing, where the others tell."""
+    heads = {folded(name) for name in table.header}
+    if table.header[0].startswith("<"):
+        return ": it is a web page, perhaps the answer of a server in place of the file; get it again"
+    if len(heads) == 1 and len(table.header[0].split()) > 1:
+        return ": separate the columns by commas, semicolons or tabs"
+    if table.header[0].startswith("sep="):
+        return ": take this first line out"
+    if any(is_number(name) for name in table.header):
+        return ": write the names of the columns into a line above"
+    if missing == "spike_channel" and any(heads & set(names) for names in list(STIMULUS_COLUMNS.values())[1:]):
+        return ": it looks like a file of stimuli; are spikes and stimuli swapped?"
+    other_unit = next((name for name in heads if name.endswith(("time_ms", "time_us", "sample", "frame"))), None)
+    if missing != "spike_channel" and other_unit is not None:
+        return f": bring the times of {other_unit} in seconds, and call them time_s"
+    return ""
 
 
-def _column(path: Path, name: str, cells: list[str]) -> Column:
-    """One column of text as numbers, or as text where it may be names."""
+def plain_column(table: TextTable, place: int, name: str) -> Column:
+    """One column of spikes or stimuli under its name in `PlainColumns`: numbers, or text where it may be names.
+
+    Raises:
+        InvalidFile: for a cell that is neither, with its line.
+    """
     if name == "stimulus_electrodes":
-        return _electrodes(path, cells)
+        return _electrodes(table, place)
+    if name not in NAMES:
+        numbers = table.numbers(place, name, required=name in REQUIRED)
+        if name == "stimulus_frequency_hz" and np.any(numbers <= 0):
+            row = int(np.flatnonzero(numbers <= 0)[0])
+            raise table.wrong(
+                row, f"{name}: expected positive frequencies in Hz, or empty fields, got {numbers[row]:g}"
+            )
+        return numbers
+    cells = table.text(place)
+    if name in REQUIRED and "" in cells:
+        missing = "expected a channel for each spike"
+        raise table.wrong(cells.index(""), f"{name}: {missing}, got {cells.count('')} without one, here the first")
     try:
         return np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
-    except ValueError as error:
-        if name in ("spike_channel", "stimulus_pattern"):
-            return np.array(cells, dtype=np.str_)
-        line, cell = next((n, cell) for n, cell in enumerate(cells, 1) if cell and not _is_number(cell))
-        raise InvalidFile(f"{path}: {name}: expected a number in data line {line}, got {cell!r}") from error
+    except ValueError:
+        return np.array(cells, dtype=np.str_)
 
 
-def _electrodes(path: Path, cells: list[str]) -> Column:
-    try:
-        lists = [[int(electrode) for electrode in cell.split()] for cell in cells]
-    except (ValueError, OverflowError) as error:
-        raise InvalidFile(
-            f"{path}: stimulus_electrodes: expected whole numbers separated by spaces ({error})"
-        ) from error
+def _electrodes(table: TextTable, place: int) -> Column:
+    lists = []
+    for row, cell in enumerate(table.text(place)):
+        try:
+            lists.append([int(electrode) for electrode in cell.split()])
+        except (ValueError, OverflowError) as error:
+            raise table.wrong(
+                row, f"stimulus_electrodes: expected whole numbers separated by spaces, got {cell[:40]!r}"
+            ) from error
     width = max([1, *map(len, lists)])
     if width * len(lists) > MOST_ELECTRODES or any(abs(e) >= 2**53 for electrodes in lists for e in electrodes):
-        raise InvalidFile(f"{path}: stimulus_electrodes: expected a few electrodes a stimulus, got {width} in one line")
-    table = np.full((len(lists), width), UNKNOWN)
-    for row, electrodes in zip(table, lists, strict=True):
-        row[: len(electrodes)] = electrodes
-    return table
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+        raise InvalidFile(
+            f"{table.path}: stimulus_electrodes: expected a few electrodes a stimulus, got {width} in one line"
+        )
+    electrodes = np.full((len(lists), width), UNKNOWN)
+    for row_of, numbers in zip(electrodes, lists, strict=True):
+        row_of[: len(numbers)] = numbers
+    return electrodes

@@ -36,6 +36,8 @@ OTHER_NAMES = {
     **{key.replace("stimulus_", "stim_"): key for key in KEYS if key.startswith("stimulus_")},
     **{key.replace("channel_", "unit_"): key for key in KEYS if key.startswith("channel_")},
 }
+SPREADSHEET = "[Content_Types].xml"
+"""In the archives that spreadsheets are, too."""
 ROUTING = ("mapping_electrode", "mapping_xy_um")
 
 
@@ -50,7 +52,7 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
         UnusableData: if a column is not what it should be.
     """
     path = Path(path)
-    columns, routing, left_out = _loaded(path)
+    columns, routing, left_out = load_columns(path)
     missing = [key for key in REQUIRED if key not in columns]
     if missing:
         keys = [*columns, *routing, *left_out]
@@ -58,8 +60,8 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
         if counts and "spike_time_s" in missing and "stimulus_time_s" in missing:
             raise InvalidFile(
                 f"{path}: expected times of spikes and of stimuli (spike_time_s, spike_channel, stimulus_time_s), "
-                f"found none: only counts ({', '.join(counts[:4])}), of which neither a response window nor "
-                "what happens outside it can be seen; bring the times"
+                f"found none: only counts ({', '.join(counts[:4])}); bring the times, or bring counts a stimulus and "
+                "channel as a table of responses (response_count)"
             )
         found = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
         raise InvalidFile(
@@ -78,21 +80,31 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     return PlainColumns(**columns).to_recording(provenance, tuple(findings))
 
 
-def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
-    """What the archive holds: values by our names, the array's routing, and the names of what is left out."""
+def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
+    """What an archive holds: values by our names, the array's routing, and the names of what is left out.
+
+    Args:
+        path: the file.
+        others: keys that are known besides those of a recording.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged, or holds pickled objects.
+    """
     columns: dict[str, Any] = {}
     routing: dict[str, Column] = {}
     left_out = []
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             _check_size(path, archive.zip)
+            if SPREADSHEET in archive.zip.namelist():
+                raise InvalidFile(f"{path}: expected NPZ, got a spreadsheet; save its tables as CSV")
             for key in archive.files:
                 name = OTHER_NAMES.get(key, key)
                 if name in columns:
                     raise InvalidFile(f"{path}: expected {name} once, got it under two names (one is {key})")
                 if name in SINGLE:
                     columns[name] = _single(path, key, _array(archive, key))
-                elif name in KEYS:
+                elif name in KEYS or key in others:
                     columns[name] = _array(archive, key)
                 elif key in ROUTING:
                     routing[key] = archive[key]

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,8 +28,10 @@ import h5py
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.compilation import user_cache
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
+from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.protocol import Presentation
 from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
 from animat.writing import written_whole
@@ -50,28 +52,86 @@ LARGEST_VALUES = 10_000_000
 T = TypeVar("T", int, float, str)
 
 
-def write_nwb(recording: Recording, path: str | os.PathLike[str]) -> None:
+def write_nwb(
+    recording: Recording,
+    path: str | os.PathLike[str],
+    spikes: Iterable[SpikeBlock] | None = None,
+    counts: SpikeCounts | None = None,
+) -> None:
     """Write a recording as one NWB file, complete or absent.
 
     Args:
         recording: what to write.
         path: the file; parent folders are made, an old file is replaced only by a complete new one.
+        spikes: in place of the recording's own, which are none: more than memory holds, in any order.
+        counts: of `spikes`.
 
     Raises:
         InvalidFile: if the file cannot be written (no permission, a full disk).
         InvalidArgument: for text that HDF5 cannot hold, or a `recorded_at` that is no date.
+        UnusableData: for `spikes` that are not finite, of no channel, or outside of the recording.
     """
-    from pynwb import NWBHDF5IO
+    with user_cache():
+        from pynwb import NWBHDF5IO
 
-    from animat.recordings.formats.nwb_tables import nwb_file
+        from animat.recordings.formats.nwb_tables import nwb_file
 
-    # The file is put together in memory: HDF5 does not recover from a disk that fills up under it, and a recording
-    # is small (2 MB for 205,000 spikes).
-    buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file, NWBHDF5IO(file=file, mode="w") as nwb_io:
-        nwb_io.write(nwb_file(recording))
-    with written_whole(path) as beside:
-        beside.write_bytes(buffer.getbuffer())
+    if spikes is None or counts is None:
+        own = recording.spike_times_s, recording.spike_channels
+        spikes, counts = [own], SpikeCounts(len(recording.channels))
+        counts.add(*own)
+    of_channels, (first_s, last_s) = counts.of_channels, counts.span_s
+    if np.any(of_channels) and not recording.start_s <= first_s <= last_s <= recording.stop_s:
+        raise UnusableData(
+            f"spike_times_s: expected times within the recording ({recording.start_s:g} to {recording.stop_s:g} s), "
+            f"got {first_s:g} to {last_s:g} s"
+        )
+    tree = nwb_file(recording, of_channels)
+    with written_whole(path) as beside, beside.open("r+b", buffering=0) as raw:
+        disk = _Disk(raw)
+        try:
+            with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w") as nwb_io:
+                nwb_io.write(tree)
+                if len(recording.channels):
+                    write_spikes(file[f"{UNITS_TABLE}/spike_times"], spikes, of_channels)
+        except Exception as error:
+            # What HDF5 made of what it could not read back.
+            raise disk.error or error from None
+        if disk.error is not None:
+            raise disk.error
+
+
+class _Disk(io.RawIOBase):
+    """A file that takes everything, and remembers what it could not write: HDF5 does not recover from a full disk."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self.error: OSError | None = None
+        self._file = file
+
+    def readinto(self, buffer: Any) -> int:
+        return self._file.readinto(buffer) or 0
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data)
+        try:
+            while left and self.error is None:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            self.error = error
+        return len(data)
+
+    def seek(self, place: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(place, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
 
 
 def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Recording:

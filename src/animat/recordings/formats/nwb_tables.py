@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import numpy as np
+from hdmf.backends.hdf5.h5_utils import H5DataIO
 from hdmf.common import DynamicTable, DynamicTableRegion, VectorData, VectorIndex
+from jaxtyping import Int64
 from pynwb import NWBFile
 from pynwb.ecephys import ElectrodesTable
 from pynwb.epoch import TimeIntervals
@@ -21,6 +23,13 @@ from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
 UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
 """NWB demands a date; a recording without `recorded_at` gets this one, which every reader sees to be none."""
 
+UNKNOWN_SUBJECT = {
+    "subject_id": "unknown",
+    "sex": "U",
+    "age": "P0D/",
+    "description": "neuronal culture; nothing more was said of it",
+}
+"""Sex U is unknown, and an age from 0 days on, without an upper end, is any."""
 _SUBJECT_KEYS = {
     "subject_id": "subject_id",
     "species": "species",
@@ -31,8 +40,13 @@ _SUBJECT_KEYS = {
 _FILE_KEYS = ("experiment_description", "lab", "institution")
 
 
-def nwb_file(recording: Recording) -> NWBFile:
-    """The whole recording as pynwb's object tree; see `animat.recordings.formats.nwb` for what lies where."""
+def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> NWBFile:
+    """A recording as pynwb's object tree, with room for spikes; see `animat.recordings.formats.nwb` for its places.
+
+    Args:
+        recording: all but its spikes are taken.
+        spike_counts: of each channel: their times are for the caller to write.
+    """
     words = {_text("provenance", k): _text("provenance", v) for k, v in recording.provenance.items()}
     nwb = NWBFile(
         session_description=words.get(
@@ -46,12 +60,12 @@ def nwb_file(recording: Recording) -> NWBFile:
         source_script_file_name="nwb.py",
         **{key: words[key] for key in _FILE_KEYS if key in words},
     )
-    subject = {field: words[key] for key, field in _SUBJECT_KEYS.items() if key in words}
-    if subject:
-        nwb.subject = Subject(**subject)
+    # NWB's checkers demand a subject; of one that nothing is said of, that is what is written.
+    known = {field: words[key] for key, field in _SUBJECT_KEYS.items() if key in words}
+    nwb.subject = Subject(**(UNKNOWN_SUBJECT | known))
     if len(recording.channels):
         _add_electrodes(nwb, recording.channels)
-        _add_units(nwb, recording)
+        _add_units(nwb, recording, spike_counts)
     nwb.add_stimulus(_stimulus_table(recording.stimuli))
     module = nwb.create_processing_module(name="ecephys", description="What the recording is, for the package animat.")
     module.add(_recording_table(recording))
@@ -82,12 +96,12 @@ def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
     )
 
 
-def _add_units(nwb: NWBFile, recording: Recording) -> None:
+def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> None:
     """The units table, one row a channel, so that a silent channel stays a channel."""
     rows = len(recording.channels)
-    by_channel = np.argsort(recording.spike_channels, kind="stable")
-    ends = np.cumsum(np.bincount(recording.spike_channels, minlength=rows)).astype(np.int64)
-    times = VectorData(name="spike_times", description="spike times, s", data=recording.spike_times_s[by_channel])
+    ends = np.cumsum(spike_counts).astype(np.int64)
+    room = H5DataIO(shape=(int(spike_counts.sum()),), dtype=np.dtype(np.float64))
+    times = VectorData(name="spike_times", description="spike times, s", data=room)
     observed = VectorData(
         name="obs_intervals",
         description="from the start to the end of the recording, s",
@@ -118,14 +132,15 @@ def _add_units(nwb: NWBFile, recording: Recording) -> None:
 def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
 
     # A row keeps its electrodes up to the last known one, so that padding between known ones survives too.
-    known = stimuli.electrodes != UNKNOWN
-    position = np.arange(1, stimuli.electrodes.shape[1] + 1)
-    lengths = np.max(known * position, axis=1, initial=0)
-    kept = position[None, :] <= lengths[:, None]
+    known, columns = stimuli.electrodes != UNKNOWN, stimuli.electrodes.shape[1]
+    lengths = np.zeros(len(stimuli), np.int64)
+    for column in range(columns):
+        lengths[known[:, column]] = column + 1
+    kept = np.arange(columns)[None, :] < lengths[:, None]
     electrodes = VectorData(
         name="electrode_ids", description="electrodes on the array pulsed together", data=stimuli.electrodes[kept]
     )
-    columns = [
+    table = [
         VectorData(name="start_time", description="start of the pulse, s", data=stimuli.time_s),
         # NWB demands an end; the pulse's length is not kept, and readers take an empty interval for a mistake.
         VectorData(name="stop_time", description="nominal: 1 us after start_time", data=stimuli.time_s + 1e-6),
@@ -138,12 +153,12 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
     if len(electrodes.data):
         # A column without any value is valid, but other programs stumble over it.
         index = VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths).astype(np.int64), target=electrodes)
-        columns += [electrodes, index]
+        table += [electrodes, index]
     return TimeIntervals(
         name="stimuli",
         description="Stimulation pulses, one row a pulse.",
         id=np.arange(len(stimuli)),
-        columns=columns,
+        columns=table,
     )
 
 

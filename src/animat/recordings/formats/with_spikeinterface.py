@@ -24,7 +24,7 @@ from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.raw import in_microvolts
 from animat.recordings.recording import Channels, Recording
 
-MISSING = "expected the package SpikeInterface, which is not installed: pip install 'animat[raw]'"
+MISSING = "expected the package SpikeInterface, which is not installed: pip install 'spikeinterface>=0.104'"
 REFUSED = ("binary_folder", "zarr", "python", "npz_folder", "npz_sorting")
 """Readers of SpikeInterface's own saved objects."""
 

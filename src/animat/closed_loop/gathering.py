@@ -1,0 +1,178 @@
+"""What a session's records come to, gathered as they are written, or read again by `animat recover`: the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Self
+
+from animat.closed_loop.header import Header
+from animat.closed_loop.log import Record, Records
+from animat.closed_loop.outline import Outline
+from animat.closed_loop.pulses import Pulses
+from animat.closed_loop.tick import Ending
+from animat.closed_loop.tick_table import TickTable
+from animat.errors import AnimatError, InvalidFile
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb_spikes import SpikeCounts
+from animat.recordings.recording import Recording
+from animat.writing import written_whole
+
+LOG_FILE = "session.log"
+RECORDING_FILE = "session.nwb"
+TICKS_FILE = "ticks.csv"
+
+
+class Gathered:
+    """All that a session's files need of its records but the spikes, which stay in the log.
+
+    Args:
+        header: of the session.
+
+    Attributes:
+        outline: what the records came to.
+        spike_counts: of each channel.
+    """
+
+    def __init__(self, header: Header) -> None:
+        self.outline = Outline(header.presentation.pulses)
+        self.spike_counts = SpikeCounts(len(header.channels))
+        self._header = header
+        self._pulses = Pulses()
+        self._watched_s = self._end_s = 0.0
+
+    def add(self, record: Record) -> None:
+        """Take in one record."""
+        words = record.words
+        self.outline.add(words)
+        self.spike_counts.add(record.spike_times_s, record.spike_channels)
+        if words["kind"] == "seen":
+            self._pulses.add(words)
+            self._watched_s += words["duration_s"]
+            self._end_s = max(self._end_s, words["start_s"] + words["duration_s"])
+
+    def recording_without_spikes(self, ending: Ending) -> Recording:
+        """The session as a recording, but for its spikes.
+
+        Args:
+            ending: how the session ended.
+
+        Raises:
+            UnusableData: for records that do not fit together.
+        """
+        header, outline, stimuli = self._header, self.outline, self._pulses.stimuli()
+        duration_s = max(0.0, self._end_s, self.spike_counts.span_s[1], self._pulses.last_s)
+        return Recording(
+            spike_times_s=[],  # type: ignore[arg-type]
+            spike_channels=[],  # type: ignore[arg-type]
+            channels=header.channels,
+            stimuli=stimuli,
+            sampling_rate_hz=header.sampling_rate_hz,
+            start_s=0.0,
+            duration_s=duration_s,
+            start_min=header.start_min,
+            presentation=header.presentation,
+            provenance={
+                **header.provenance,
+                "session_description": _described(header),
+                "recorded_at": header.recorded_at,
+                "closed_loop": header.loop,
+                "closed_loop_ended": f"{ending.by}: {ending.sentence}",
+                "closed_loop_unwatched_s": f"{max(0.0, duration_s - self._watched_s):.6f}",
+                **({"left_out": in_words(outline.left_out)} if outline.left_out else {}),
+                "closed_loop_unanswered_pulses": str(unanswered_pulses(outline)),
+            },
+        )
+
+
+class SessionFiles:
+    """Makes `ticks.csv` and `session.nwb` of records that are added one by one; within a `with`, complete or absent.
+
+    Args:
+        folder: of the session.
+        header: of the session.
+
+    Raises:
+        InvalidFile: on entering, if nothing can be written.
+    """
+
+    def __init__(self, folder: Path, header: Header) -> None:
+        self.gathered = Gathered(header)
+        self._folder, self._header = folder, header
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        beside = self._stack.enter_context(written_whole(self._folder / TICKS_FILE))
+        file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
+        self._table = TickTable(file, self._header.conditions, self._header.observed)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.give_up()
+
+    def give_up(self) -> None:
+        """Remove what was not finished."""
+        # That there is no room to end it by then is known.
+        with suppress(OSError, InvalidFile):
+            self._stack.__exit__(_Unfinished, _Unfinished(), None)
+
+    def add(self, record: Record) -> None:
+        """Take in one record.
+
+        Raises:
+            OSError: if its line cannot be written.
+            UnusableData: for spikes that cannot be, perhaps those of an earlier record.
+        """
+        self.gathered.add(record)
+        if record.words["kind"] == "seen" and record.words["tick"]:
+            self._table.add(record.words["tick"])
+
+    def finish(self, records: Records, ending: Ending) -> None:
+        """Put the ticks in their place, and the recording after it: once it is there, so are both.
+
+        Args:
+            records: of the log, all of which were added.
+            ending: how the session ended.
+
+        Raises:
+            InvalidFile: if a file cannot be written.
+            UnusableData: for records that do not fit together.
+        """
+        self._stack.close()
+        recording = self.gathered.recording_without_spikes(ending)
+        counts = self.gathered.spike_counts
+        write_nwb(recording, self._folder / RECORDING_FILE, records.spike_blocks(), counts)
+
+
+class _Unfinished(Exception):
+    """Files that are no longer wanted."""
+
+
+@contextmanager
+def expecting_a_session(file: Path) -> Iterator[None]:
+    """Raise InvalidFile where a log's records are whole and yet not those of a session."""
+    try:
+        yield
+    except InvalidFile:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, AnimatError) as error:
+        raise InvalidFile(f"{file}: expected a session's log, got {error!r}") from error
+
+
+def unanswered_pulses(outline: Outline) -> int:
+    """How many pulses were asked for and never answered."""
+    return sum(len(words["stimuli"]) for words in outline.unanswered)
+
+
+def in_words(left_out: Mapping[str, int]) -> str:
+    """What the session does not have."""
+    return ", ".join(f"{count} {what}" for what, count in left_out.items())
+
+
+def _described(header: Header) -> str:
+    return (
+        "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
+        f"from episode to episode ({', '.join(header.contenders)}): {TICKS_FILE} beside this file tells whose each "
+        "stimulus was, and what came of it."
+    )

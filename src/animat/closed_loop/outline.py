@@ -1,0 +1,149 @@
+"""What a session came to, counted record by record: its episodes, its ticks in numbers, and what was never answered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from animat.closed_loop.tick import Ending
+
+
+@dataclass
+class Acted:
+    """What was presented in an episode while its robot moved; what led in is none of it.
+
+    Attributes:
+        presentations: repeated ones among them.
+        actions: that the robot was moved by.
+        pulses: that the culture was given.
+        pulses_s: of each presentation, its pulses over its frequency.
+        bursts: responses that were bursts.
+        late: presentations that came late.
+    """
+
+    presentations: int = 0
+    actions: int = 0
+    pulses: int = 0
+    pulses_s: float = 0.0
+    bursts: int = 0
+    late: int = 0
+
+
+@dataclass
+class Episode:
+    """One episode of a contender.
+
+    Attributes:
+        number: in the session, from 0.
+        contender: who acted.
+        start: what was observed before the first step; empty where the log is of before this was written.
+        total: the sum of rewards, in the task's own units.
+        iterations: of the robot.
+        terminated: whether it ended by itself and not at the limit.
+        is_whole: whether it came to its end; what the session broke off has no return.
+        pulses: that the culture was given, what led in among them.
+        bursts: responses that were bursts, also of what led in.
+        late: pulses that came late, also of what led in.
+        acted: the same without what led in, and more.
+    """
+
+    number: int
+    contender: str
+    start: tuple[float, ...] = ()
+    total: float = 0.0
+    iterations: int = 0
+    terminated: bool = False
+    is_whole: bool = False
+    pulses: int = 0
+    bursts: int = 0
+    late: int = 0
+    acted: Acted = field(default_factory=Acted)
+
+
+class Outline:
+    """Counts as records are added, in their order.
+
+    Args:
+        pulses: of a presentation.
+
+    Attributes:
+        ending: what was written about it, None where nothing was.
+        left_out: what the culture's device reported and the session does not have, by what it is; known at the end.
+        ticks: how many.
+        pulses: that the culture was given.
+        bursts: responses that were bursts.
+        late: ticks whose pulses came late.
+        latest_s: the largest lateness.
+    """
+
+    def __init__(self, pulses: int) -> None:
+        self.ending: Ending | None = None
+        self.left_out: dict[str, int] = {}
+        self.ticks = self.pulses = self.bursts = self.late = 0
+        self.latest_s = 0.0
+        self._presented = pulses
+        self._starts: dict[int, tuple[float, ...]] = {}
+        self._episodes: dict[int, Episode] = {}
+        self._asked: dict[int, dict[str, Any]] = {}
+        self._answered = -1
+
+    @property
+    def episodes(self) -> tuple[Episode, ...]:
+        """Every episode that was begun, in the order of time."""
+        return tuple(episode for _, episode in sorted(self._episodes.items()))
+
+    @property
+    def unanswered(self) -> tuple[dict[str, Any], ...]:
+        """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
+        known, and they are in no recording. The words of its record: when, which stimuli."""
+        return tuple(words for words in self._asked.values() if words["stimuli"] and words.get("is_admitted", True))
+
+    def add(self, words: Mapping[str, Any]) -> None:
+        """Count one record in."""
+        kind, stretch = words["kind"], words.get("stretch")
+        if kind == "seen":
+            # Sessions that were logged before this was have no stretches.
+            if stretch is not None:
+                self._asked.pop(stretch, None)
+                self._answered = max(self._answered, stretch)
+            if words["tick"]:
+                self._add_tick(words["tick"])
+        elif kind in ("asked", "event"):
+            # What is under way is looked at while it is answered: it may be written down after its answer.
+            # So may it be after the event that ended it, which knows more.
+            if stretch is not None and stretch > self._answered and (kind == "event" or stretch not in self._asked):
+                self._asked[stretch] = dict(words)
+        elif kind == "start":
+            self._starts[words["episode"]] = tuple(words["observation"])
+        elif kind == "end":
+            self.ending = Ending(words["by"], words["sentence"])
+            self.left_out = words.get("left_out", {})
+
+    def _add_tick(self, tick: Mapping[str, Any]) -> None:
+        number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
+        episode = self._episodes.get(number)
+        if episode is None:
+            episode = Episode(number, tick["contender"], self._starts.pop(number, ()))
+            self._episodes[number] = episode
+        self.ticks += 1
+        self.pulses += n_pulses
+        self.bursts += tick["is_burst"]
+        self.late += is_late
+        self.latest_s = max(self.latest_s, tick["late_s"])
+        if tick["reward"] is not None:
+            episode.total += tick["reward"]
+            episode.iterations += 1
+        episode.terminated = tick["terminated"]
+        episode.is_whole = tick["terminated"] or tick["truncated"]
+        episode.pulses += n_pulses
+        episode.bursts += tick["is_burst"]
+        episode.late += is_late
+        if tick["handled"] != "lead-in":
+            acted = episode.acted
+            acted.presentations += 1
+            acted.actions += tick["command"] is not None
+            acted.pulses += n_pulses
+            acted.pulses_s += self._presented / tick["frequency_hz"]
+            acted.bursts += tick["is_burst"]
+            acted.late += is_late

@@ -1,0 +1,96 @@
+"""A tissue's state at one time, and whether it is one that a tissue can come to.
+
+The compiled kernel checks no index and no clock: what it is given must have been checked before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from animat.cultures.tissue import kernel
+from animat.cultures.tissue.coupling import Kicks
+from animat.cultures.tissue.parameters import TissueParameters
+from animat.errors import InvalidArgument, shown
+
+LONGEST_NS = 366 * 86_400 * 1_000_000_000
+"""A tissue's clock goes to a year: its slow drift is computed from the start."""
+KICKS_WITHIN_NS = 1_000_000_000
+"""Kicks under way arrive within this time: axons are shorter."""
+LARGEST = 1e6
+"""No potential (mV) and no conductance (in those of the leak) comes near it."""
+_SHARES = ("x", "u", "available", "release")
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The state of a tissue at one time, made by `Tissue.snapshot`, for tissues of the same seed and parameters."""
+
+    seed: int
+    parameters: TissueParameters
+    now_ns: int
+    step: int
+    kicks: Kicks
+    state: kernel.State
+
+
+def expect_sound(snapshot: Snapshot, like: kernel.State, wiring: kernel.Wiring, step_ns: int) -> None:
+    """Refuse a snapshot whose clock, shapes, indices or values are none of a tissue's.
+
+    Args:
+        snapshot: to be restored.
+        like: a state of the same tissue, whose shapes and types the snapshot's must have.
+        wiring: of the tissue.
+        step_ns: its time step.
+
+    Raises:
+        InvalidArgument: naming the number or the array, what was expected and what came.
+    """
+    expect_whole("tissue_now_ns", snapshot.now_ns, 0, LONGEST_NS)
+    step = snapshot.now_ns // step_ns
+    expect_whole("tissue_step", snapshot.step, step, step)
+    neurons = len(wiring.needed)
+    for name, values in snapshot.state._asdict().items():
+        expect_array(name, values, getattr(like, name).dtype, getattr(like, name).shape)
+        low, high = (0.0, 1.0) if name in _SHARES else (-LARGEST, LARGEST)
+        if values.dtype.kind == "f":
+            # A share is the difference of two: rounding may take it past its end by a last bit.
+            expect_within(name, values, low - 1e-9 * (low == 0), high + 1e-9 * (low == 0))
+    expect_within("refractory", snapshot.state.refractory, 0, int(wiring.refractory_steps.max(initial=0)))
+    expect_within("last_spike", snapshot.state.last_spike, 0, step)
+    for name, values in snapshot.kicks._asdict().items():
+        expect_array(f"kicks.{name}", values, np.float32 if name == "mv" else np.int64, (len(snapshot.kicks.step),))
+    expect_within("kicks.neuron", snapshot.kicks.neuron, 0, neurons - 1)
+    expect_within("kicks.mv", snapshot.kicks.mv, -LARGEST, LARGEST)
+    expect_within("kicks.step", snapshot.kicks.step, step, step + KICKS_WITHIN_NS // step_ns)
+    expect_rising("kicks.step", snapshot.kicks.step)
+
+
+def expect_whole(name: str, value: object, low: int, high: int) -> None:
+    """Refuse what is no whole number from `low` to `high`."""
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        expected = f"{low}" if low == high else f"a whole number from {low} to {high}"
+        raise InvalidArgument(f"{name}: expected {expected}, got {shown(value)}")
+
+
+def expect_array(name: str, values: np.ndarray[Any, Any], dtype: Any, shape: tuple[int, ...]) -> None:
+    """Refuse an array of another type or shape."""
+    if values.dtype != dtype or values.shape != shape:
+        raise InvalidArgument(
+            f"{name}: expected {np.dtype(dtype)} of shape {shape}, got {values.dtype} of shape {values.shape}"
+        )
+
+
+def expect_within(name: str, values: np.ndarray[Any, Any], low: float, high: float) -> None:
+    """Refuse values, NaN among them, that do not lie from `low` to `high`."""
+    outside = ~((values >= low) & (values <= high))
+    if outside.any():
+        raise InvalidArgument(f"{name}: expected values from {low:g} to {high:g}, got {values[outside].flat[0]}")
+
+
+def expect_rising(name: str, values: np.ndarray[Any, Any]) -> None:
+    """Refuse values of which one is less than the one before it."""
+    if np.any(np.diff(values) < 0):
+        raise InvalidArgument(f"{name}: expected values that do not fall, got some that do")

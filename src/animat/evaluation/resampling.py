@@ -1,0 +1,112 @@
+"""How well responses tell the best possible return: which conditions have enough, and what redrawing them changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from animat.animat import Animat
+from animat.errors import UnusableData
+from animat.evaluation.grid import Grid, grid_for
+from animat.evaluation.optimum import Optimum, rough_values
+from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.neurons.conditions import Condition
+from animat.neurons.quality import FEW_SAMPLES
+from animat.neurons.responses import Responses
+from animat.neurons.simulator import NeuronSimulator
+from animat.progress import Progress
+
+RESAMPLES = 39
+"""The fewest whose smallest and largest are their 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
+ROUGH = 0.5
+"""Steps along each axis of the grid that redrawn responses are solved on, as a part of the usual ones."""
+
+
+def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
+    """Responses to the conditions with 30 or more that are no bursts, and the labels of the other conditions.
+
+    The best of several values is the luckiest of them, so a condition of three responses promises what is not there:
+    from 30 on, nine of ten intervals hold the true optimum, at 10 three of four (docs/evaluation.md).
+
+    Raises:
+        UnusableData: where no condition has as many.
+    """
+    n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
+    few = too_few(responses.conditions, n)
+    if len(few) == len(n):
+        raise UnusableData(
+            f"expected {FEW_SAMPLES} non-burst responses or more to some condition, got {max(n, default=0)} at most: "
+            "record more of them"
+        )
+    return responses.only([i for i, count in enumerate(n) if count >= FEW_SAMPLES]) if few else responses, few
+
+
+def too_few(conditions: Sequence[Condition], n: Sequence[int]) -> tuple[str, ...]:
+    """The conditions with fewer than 30 non-burst responses, each with their number; n: of each condition."""
+    return tuple(f"{c.label} ({count})" for c, count in zip(conditions, n, strict=True) if count < FEW_SAMPLES)
+
+
+def with_intervals(
+    optima: Sequence[Optimum],
+    environments: Sequence[Animat[Any]],
+    responses: Responses,
+    fit: Callable[[Responses], NeuronSimulator],
+    *,
+    resolution: float = 1.0,
+    resamples: int = RESAMPLES,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> tuple[Optimum, ...]:
+    """Best possible returns with intervals for those that the distributions of all responses would give.
+
+        low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
+
+    with v the optimum, v_0 the same on a rough grid and v_b that of responses redrawn, condition by condition, 39
+    times. The lower end is the lower one of the percentile and the reversed interval, as an optimum is the best of
+    several values and few responses raise it. Where the responses do not tell that conditions differ at all
+    (Kruskal-Wallis, p > 0.05), it reaches down to the return of stimuli drawn at random. e is the grid's error. Nothing
+    is outside of what returns can be.
+
+    Args:
+        optima: as `best_returns` gave them.
+        environments: that they are of, all of one robot.
+        responses: that the simulator in them was made of.
+        fit: makes a simulator of responses.
+        resolution: of the optima's grid, which the rough one is not finer than.
+        resamples: how often responses are redrawn; 0: there are no intervals.
+        seed: decides what is drawn.
+        progress: told after each optimum.
+    """
+    from scipy.stats import kruskal
+
+    if not resamples:
+        return tuple(optima)
+    rng = np.random.default_rng(seed)
+    simulators = [fit(each) for each in (responses, *(responses.redrawn(rng) for _ in range(resamples)))]
+    grid = _rough(grid_for(environments[0].robot), min(ROUGH, resolution))
+    rates_hz = [responses.rates_of(i) for i in range(len(responses.conditions))]
+    differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE
+    known = []
+    for optimum, environment in zip(optima, environments, strict=True):
+        values, (least, most) = rough_values([(environment, simulator) for simulator in simulators], grid, seed)
+        low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
+        low, high = min(low, -high, 0.0), max(high, 0.0)
+        if not differ:
+            at_random = replace(environment, delivery="shuffled")
+            low = min(low, float(rough_values([(at_random, simulators[0])], grid, seed)[0][0] - values[0]))
+        error = optimum.grid_error
+        ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
+        known.append(replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE)))
+        if progress is not None:
+            progress.update(len(known), len(optima), "how well it is known")
+    return tuple(known)
+
+
+def _rough(grid: Grid, resolution: float) -> Grid:
+    """Fewer steps, three commands in place of five, and no noise of the robot: what differs is the responses."""
+    smooth = None if grid.smooth_commands is None else min(grid.smooth_commands, 3)
+    noise = None if grid.noise_in_command is None else 0.0
+    return replace(grid.scaled(resolution, periodic=True), smooth_commands=smooth, noise_in_command=noise)

@@ -1,0 +1,116 @@
+"""What keeps a closed loop on the culture from the returns that a simulator predicts, as far as it is known beforehand.
+
+Whoever shows such a return says so in these words: training, evaluation, and the closed loop itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from animat.recordings.findings import Finding
+from animat.recordings.protocol import Presentation
+
+UNKNOWN = "unknown-presentation"
+
+OLD_MIN = 30.0
+"""Age of a recording from which on a warning says that the culture may be another by now."""
+
+
+def other_presentation(recorded: Presentation | None, presented: Presentation) -> Iterator[Finding]:
+    """Where a loop presents stimuli otherwise than the recordings that its policies were trained on."""
+    if recorded is None:
+        sentence = (
+            f"how the policy's recordings were presented is not known; a closed loop presents {presented}, and a "
+            "culture answers otherwise to another presentation"
+        )
+        yield Finding(UNKNOWN, "warning", sentence)
+        return
+    if recorded.order != presented.order:
+        sentence = (
+            f"the policy's recordings were {recorded.order}: all stimuli of a frequency together; a closed loop "
+            "presents them mixed, and a culture answers otherwise then: expect less than predicted (record with "
+            "--order mixed, the default, for a closed loop)"
+        )
+        yield Finding("other-presentation", "warning", sentence)
+    if recorded.pulses != presented.pulses:
+        sentence = (
+            f"the policy's recordings had {recorded.pulses} pulse(s) a presentation, the loop has {presented.pulses}; "
+            "the response after another number of pulses is another"
+        )
+        yield Finding("other-presentation", "warning", sentence)
+
+
+def other_calibration(trained: Presentation | None, predicting: Presentation | None) -> Iterator[Finding]:
+    """Where the recording that predicts was presented otherwise than those that policies were trained on."""
+    if predicting is not None and predicting != trained:
+        sentence = (
+            f"the prediction is from a recording presented {predicting}, the policies' recordings were "
+            f"{trained or 'unknown'}"
+        )
+        yield Finding("other-calibration", "warning", sentence)
+
+
+def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Iterator[Finding]:
+    """Where a simulator is made otherwise than those that policies were trained on (`Policy.fitted`)."""
+
+    def rule(name: str, value: Any) -> Any:
+        # Which frequencies there are is in the conditions themselves; a tolerance is not.
+        return None if name == "by" and str(value).startswith("frequency") else value
+
+    differing = [name for name in trained if rule(name, trained[name]) != rule(name, given.get(name))]
+    if differing:
+        reported = ", ".join(f"{_WORDS.get(name, name)} {trained[name]}, here {given.get(name)}" for name in differing)
+        sentence = f"the policies were trained on simulators made otherwise: {reported}"
+        yield Finding("other-simulator", "warning", sentence)
+
+
+_WORDS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}
+
+
+def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Finding]:
+    """Where the culture is much older than the recording that predicts.
+
+    Args:
+        recorded_at_min: of the recording, on the culture's clock.
+        culture_min: of the culture, or of its newest recording.
+    """
+    age_min = culture_min - recorded_at_min
+    if age_min > OLD_MIN:
+        sentence = (
+            f"percentiles and prediction are of {recorded_at_min:.0f} min, and the culture is at {culture_min:.0f} "
+            "min: cultures drift; take a later recording (--at-min), or train on later ones"
+        )
+        yield Finding("old-calibration", "warning", sentence, age_min)
+
+
+def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, has_memory: bool) -> Iterator[Finding]:
+    """Where the recording shows that the culture remembers, and the simulator that predicts does not.
+
+    Args:
+        noticed: findings on the recording.
+        presentation: of the recording.
+        has_memory: whether the simulator does.
+    """
+    remembers = next((finding for finding in noticed if finding.name == "memory"), None)
+    if remembers is None or has_memory:
+        return
+    blocked = presentation is not None and presentation.order == "blocked"
+    remedy = "record with --order mixed" if blocked else "--simulator memory"
+    sentence = f"{remembers.sentence}: a closed loop measures another return than is predicted ({remedy})"
+    yield Finding("no-memory", "warning", sentence, remembers.value)
+
+
+def other_recording(trained_until_min: float, evaluated_at_min: float) -> Iterator[Finding]:
+    """Where policies are evaluated on another recording than the one that would calibrate their closed loop."""
+    if trained_until_min != evaluated_at_min:
+        sentence = (
+            f"this is the culture at {evaluated_at_min:g} min; the policies were last trained on the recording at "
+            f"{trained_until_min:g} min, which is the one that calibrates their closed loop"
+        )
+        yield Finding("other-recording", "warning", sentence, evaluated_at_min - trained_until_min)
+
+
+NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", "no-memory", "other-recording")
+"""Of the findings above that say why a culture would answer otherwise. Another simulator is not among them: which one
+predicts is asked for, and a loop has none."""

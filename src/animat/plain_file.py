@@ -1,0 +1,65 @@
+"""Files that are read: plain ones of a bounded size, so that no device, pipe or lie about a size is waited for."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from animat.errors import InvalidFile
+
+
+def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> Path:
+    """Refuse whatever cannot be read to its end: a folder, a device, a pipe, no file at all.
+
+    Args:
+        path: the file.
+        most_bytes: the largest size that what it should hold can have.
+
+    Raises:
+        InvalidFile: naming the file and what it is.
+    """
+    if not os.fspath(path):
+        raise InvalidFile("expected the name of a file, got an empty name")
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        kind = "a folder" if path.is_dir() else None if path.is_file() else "a device or a pipe"
+    except FileNotFoundError as error:
+        raise InvalidFile(f"{path}: no such file") from error
+    except (OSError, ValueError) as error:
+        # A name too long for the system is an OSError, one with a zero byte a ValueError.
+        said = error.strerror if isinstance(error, OSError) else error
+        raise InvalidFile(f"{str(path)[:200]!r}: cannot be read: {said}") from error
+    if kind is not None:
+        raise InvalidFile(f"{path}: expected a file, got {kind}")
+    if most_bytes is not None and size > most_bytes:
+        raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got {size:,}")
+    return path
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there; not, and no error either, for a name that the system cannot have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
+    """The text of a file, in UTF-8.
+
+    Raises:
+        InvalidFile: for what is no file of text, or a larger one.
+    """
+    path = expect_plain_file(path, most_bytes)
+    try:
+        with path.open("rb") as file:
+            # What a system makes up while it is read has no size until then.
+            content = file.read(most_bytes + 1)
+        if len(content) > most_bytes:
+            raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InvalidFile(f"{path}: expected text in UTF-8, got something else ({error.reason})") from error
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -1,0 +1,260 @@
+"""Tables of responses as CSV and NPZ: a count or a rate a stimulus and channel, without times of spikes.
+
+    NAME_responses.csv[.gz]   wide: a line a stimulus; a column count_CHANNEL or rate_hz_CHANNEL for each channel
+                              long: a line a stimulus and channel; trial (or stimulus_time_s), channel, count or rate_hz
+                              both: stimulus columns as in a file of stimuli, condition for pattern; window_start_ms,
+                              window_end_ms and start_min, the same in all lines
+    NAME.npz                  response_count or response_rate_hz (stimuli, channels); response_window_ms (2,);
+                              stimulus_... and channel_... as in an NPZ of spikes, all optional
+
+Lines are in the order of presentation, or have times. Of a long table a stimulus and channel without a line are 0.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import InvalidFile, UnusableData
+from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.findings import Finding
+from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, plain_column
+from animat.recordings.formats.npz import load_columns
+from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
+from animat.recordings.noticed import as_provenance
+from animat.recordings.response_table import Kind, ResponseTable
+
+KINDS: tuple[Kind, ...] = ("count", "rate_hz")
+TABLE_COLUMNS = STIMULUS_COLUMNS | {"stimulus_pattern": (*STIMULUS_COLUMNS["stimulus_pattern"], "condition")}
+NPZ_KEYS = {f"response_{kind}": kind for kind in KINDS}
+_Read = tuple[
+    Float64[np.ndarray, "stimuli channels"],
+    Kind,
+    Column,
+    Int64[np.ndarray, " stimuli"],
+    Int64[np.ndarray, " lines"],
+    set[int],
+]
+"""Values, their kind, the channels, the first line of each stimulus, the stimulus of each line, the columns used."""
+WINDOW = ("window_start_ms", "window_end_ms")
+TRIAL = "trial"
+
+
+def is_response_csv(path: Path) -> bool:
+    """Whether a text file holds a table of responses, by its header.
+
+    Raises:
+        InvalidFile: if it holds no text.
+    """
+    names = {folded(name) for name in read_header(path)}
+    # Spikes may have columns of counts and rates of their own.
+    if names & SPIKE_COLUMNS.keys() or path.name.lower().endswith(("_spikes.csv", "_spikes.csv.gz")):
+        return False
+    long = "channel" in names and bool(names & set(KINDS))
+    return long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
+
+
+def is_response_npz(path: Path) -> bool:
+    """Whether an archive holds a table of responses."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (OSError, zipfile.BadZipFile, NotImplementedError):
+        return False
+    # Where there are spikes too, they say more.
+    return any(f"{key}.npy" in names for key in NPZ_KEYS) and "spike_time_s.npy" not in names
+
+
+def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
+    """Read a table of responses from a numpy archive; nothing in it is ever unpickled.
+
+    Raises:
+        InvalidFile: if the file is damaged, or holds counts and rates.
+        UnusableData: if an array is not what it should be.
+    """
+    path = Path(path)
+    arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms"))
+    given = [key for key in NPZ_KEYS if key in arrays]
+    if len(given) != 1:
+        raise InvalidFile(f"{path}: expected {' or '.join(NPZ_KEYS)}, one of them, got {' and '.join(given) or 'none'}")
+    values = np.asarray(arrays.pop(given[0]))
+    if values.ndim != 2 or values.dtype.kind not in "iufb":
+        raise UnusableData(
+            f"{given[0]}: expected numbers of shape (stimuli, channels), got {values.dtype} {values.shape}"
+        )
+    per_stimulus = {len(a) for key, a in arrays.items() if key.startswith("stimulus_") and np.ndim(a)}
+    if per_stimulus == {values.shape[1]} and values.shape[0] != values.shape[1]:
+        raise UnusableData(
+            f"{given[0]}: expected a row for each of {values.shape[1]} stimuli, got {values.shape}: transpose it"
+        )
+    window = arrays.pop("response_window_ms", None)
+    if window is not None and np.shape(window) != (2,):
+        raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
+    findings = []
+    if left_out:
+        sentence = f"keys that are not known were left out: {', '.join(left_out)}"
+        findings.append(Finding("keys-left-out", "note", sentence, float(len(left_out))))
+    labels = arrays.pop("channel_label", np.arange(values.shape[1]))
+    return _table(
+        values,
+        NPZ_KEYS[given[0]],
+        labels,
+        arrays,
+        None if window is None else (float(window[0]), float(window[1])),
+        {"source": path.name, "format": "NPZ of responses"},
+        findings,
+    )
+
+
+def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
+    """Read a table of responses from text, wide or long.
+
+    Raises:
+        InvalidFile: for what cannot be read, with its line.
+        UnusableData: if a column is not what it should be.
+    """
+    table = read_text_table(Path(path))
+    is_long = table.place(("channel",)) is not None
+    values, kind, labels, first, stimulus_of, used = _long(table) if is_long else _wide(table)
+    columns: dict[str, Any] = {}
+    for name, names in TABLE_COLUMNS.items():
+        place = table.place(names)
+        if place is not None:
+            used.add(place)
+            columns[name] = _per_stimulus(table, place, name, first[stimulus_of])[first]
+    single = {name: _constant(table, name, used) for name in (*WINDOW, "start_min")}
+    start_ms, end_ms = single["window_start_ms"], single["window_end_ms"]
+    if (start_ms is None) != (end_ms is None):
+        raise InvalidFile(f"{table.path}, line 1: expected window_start_ms and window_end_ms, or neither; got one")
+    if single["start_min"] is not None:
+        columns["start_min"] = single["start_min"]
+    left_out = [name for i, name in enumerate(table.header) if i not in used]
+    if left_out:
+        sentence = f"columns of {table.path.name} that are not known were left out: {', '.join(left_out)}"
+        table.findings.append(Finding("columns-left-out", "note", sentence, float(len(left_out))))
+    window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
+    provenance = {"source": table.path.name, "format": "CSV of responses"}
+    return _table(values, kind, labels, columns, window_ms, provenance, table.findings)
+
+
+def _wide(table: TextTable) -> _Read:
+    """Of a line a stimulus."""
+    places = {kind: [i for i, h in enumerate(table.header) if folded(h).startswith(f"{kind}_")] for kind in KINDS}
+    kinds = [kind for kind in KINDS if places[kind]]
+    if len(kinds) != 1:
+        raise InvalidFile(
+            f"{table.path}, line 1: expected a column count_CHANNEL or rate_hz_CHANNEL for each channel, "
+            f"got {'both' if kinds else 'neither'}"
+        )
+    kind = kinds[0]
+    labels = np.array([_label(table.header[i], kind) for i in places[kind]], dtype=np.str_)
+    values = np.column_stack([table.numbers(i, table.header[i], required=True) for i in places[kind]])
+    trial = table.place((TRIAL,))
+    used = {*places[kind], *([] if trial is None else [trial])}
+    rows = np.arange(len(table.rows))
+    return values, kind, labels, rows, rows, used
+
+
+def _label(head: str, kind: Kind) -> str:
+    """What a header says after the kind, as it stands there: 12 of `Rate (Hz) 12`."""
+    return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
+
+
+def _long(table: TextTable) -> _Read:
+    """Of a line a stimulus and channel."""
+    there = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
+    trial = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"]))
+    if len(there) != 1 or trial is None:
+        raise InvalidFile(
+            f"{table.path}, line 1: expected trial (or stimulus_time_s), channel, and count or rate_hz, found "
+            + ", ".join(table.header[:12])
+        )
+    (kind, place), channel = next(iter(there.items())), table.place(("channel",))
+    assert channel is not None
+    numbers = table.numbers(place, kind, required=True)
+    trials, first, row_of = np.unique(table.text(trial), return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(trials), dtype=np.int64)
+    rank[order] = np.arange(len(trials))
+    labels, column_of = np.unique(table.text(channel), return_inverse=True)
+    stimulus_of = rank[row_of.reshape(-1)]
+    cells = stimulus_of * len(labels) + column_of.reshape(-1)
+    distinct, counts = np.unique(cells, return_counts=True)
+    if np.any(counts > 1):
+        again = int(np.flatnonzero(cells == distinct[counts > 1][0])[1])
+        raise table.wrong(again, "expected one line a stimulus and channel, got this one again")
+    values = np.zeros(len(trials) * len(labels))
+    values[cells] = numbers
+    if missing := len(values) - len(distinct):
+        sentence = f"{missing:,} of {len(values):,} pairs of a stimulus and a channel have no line: taken for 0"
+        table.findings.append(Finding("pairs-missing", "note", sentence, float(missing)))
+    used = {place, channel, trial}
+    return values.reshape(len(trials), len(labels)), kind, labels, first[order], stimulus_of, used
+
+
+def _per_stimulus(table: TextTable, place: int, name: str, first: Int64[np.ndarray, " lines"]) -> Column:
+    """A column of the stimuli, the same in each line of one; first: the first line of each line's stimulus."""
+    column = plain_column(table, place, name)
+    same = column == column[first]
+    if column.dtype.kind == "f":
+        same |= np.isnan(column) & np.isnan(column[first])
+    if not np.all(same):
+        row = int(np.argwhere(~same)[0, 0])
+        cells, line = table.text(place), table.lines[first[row]]
+        expected = f"expected {cells[first[row]]!r} as in line {line}, which is of the same stimulus"
+        raise table.wrong(row, f"{name}: {expected}, got {cells[row]!r}")
+    return column
+
+
+def _constant(table: TextTable, name: str, used: set[int]) -> float | None:
+    """The one number of a column, None where there is no such column."""
+    place = table.place((name,))
+    if place is None:
+        return None
+    used.add(place)
+    values = table.numbers(place, name, required=True)
+    if not len(values):
+        return None
+    if np.any(values != values[0]):
+        row = int(np.flatnonzero(values != values[0])[0])
+        raise table.wrong(
+            row, f"{name}: expected the same in all lines, {values[0]:g} as in the first, got {values[row]:g}"
+        )
+    return float(values[0])
+
+
+def _table(
+    values: Column,
+    kind: Kind,
+    labels: Column,
+    columns: dict[str, Any],
+    window_ms: tuple[float, float] | None,
+    provenance: dict[str, str],
+    findings: list[Finding],
+) -> ResponseTable:
+    """The table, its stimuli and channels checked as those of plain columns are."""
+    has_times = "stimulus_time_s" in columns
+    times = np.asarray(columns.pop("stimulus_time_s", np.arange(len(values), dtype=np.float64)))
+    plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, channel_label=labels, **columns)
+    recording = plain.to_recording({}, tuple(findings))
+    if len(values) != len(times):
+        raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
+    if not has_times:
+        order = "the table has no times of stimuli: its rows are taken for the order of presentation"
+        provenance = provenance | as_provenance([Finding("stimulus-times-unknown", "note", order)])
+    return ResponseTable(
+        values=np.asarray(values, dtype=np.float64)[np.argsort(times, kind="stable")],
+        kind=kind,
+        channels=recording.channels,
+        stimuli=recording.stimuli,
+        has_times=has_times,
+        window_ms=window_ms,
+        start_min=recording.start_min,
+        presentation=recording.presentation,
+        provenance={**provenance, **recording.provenance},
+    )

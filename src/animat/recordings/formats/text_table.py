@@ -1,0 +1,223 @@
+"""Tables as text: a header line, and a line a row; separated by commas, semicolons or tabs, gzipped or not.
+
+Headers are read whatever their capitals, blanks and brackets (`Time (s)` is `time_s`), and numbers with decimal commas
+where nothing else can be meant; both are said. What cannot be read is named with its line in the file.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.errors import InvalidFile
+from animat.plain_file import expect_plain_file
+from animat.recordings.findings import Finding
+
+UNPACKED_BYTES, UNPACKED_RATIO = 2**22, 20
+LONGEST_HEADER = 2**20
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
+
+
+@dataclass(frozen=True, eq=False)
+class TextTable:
+    """A table of text, its cells still as they stand in the file.
+
+    Attributes:
+        path: the file.
+        header: the names of its columns, as they stand there.
+        rows: the cells, as many in each row as the header has names.
+        lines: the line of the file that each row ends on, the first line being 1.
+        findings: what was noticed; methods add to it.
+    """
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+    lines: list[int]
+    findings: list[Finding] = field(default_factory=list)
+
+    def place(self, names: Sequence[str]) -> int | None:
+        """The column of the first of several names that the header has, whatever its capitals; None without any.
+
+        Raises:
+            InvalidFile: if two columns go by that name.
+        """
+        for name in names:
+            found = [i for i, head in enumerate(self.header) if head == name] or [
+                i for i, head in enumerate(self.header) if folded(head) == name
+            ]
+            if len(found) > 1:
+                twice = " and ".join(repr(self.header[i]) for i in found[:2])
+                raise InvalidFile(f"{self.path}, line 1: expected one column {name}, got {twice}; rename one")
+            if found:
+                if self.header[found[0]] != name:
+                    self._note_once(
+                        "headers-read-as", f"{self.header[found[0]]!r} of {self.path.name} is read as {name}"
+                    )
+                return found[0]
+        return None
+
+    def text(self, column: int) -> list[str]:
+        """The cells of a column, without blanks around them."""
+        return [row[column].strip() for row in self.rows]
+
+    def numbers(self, column: int, name: str, *, required: bool = False) -> Float64[np.ndarray, " rows"]:
+        """The numbers of a column, NaN for an empty cell.
+
+        Args:
+            column: its place.
+            name: what it is called in errors.
+            required: whether each must be there and finite.
+
+        Raises:
+            InvalidFile: for a cell that is no number, with its line.
+        """
+        cells = self.text(column)
+        try:
+            values = np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+        except ValueError:
+            values = self._with_decimal_commas(cells, name)
+        if required and not np.all(np.isfinite(values)):
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            got = repr(cells[row]) if cells[row] else "an empty field"
+            raise self.wrong(row, f"{name}: expected a finite number, got {got}")
+        return values
+
+    def wrong(self, row: int, what: str) -> InvalidFile:
+        """The error of a row, with its line."""
+        return InvalidFile(f"{self.path}, line {self.lines[row]}: {what}")
+
+    def _with_decimal_commas(self, cells: list[str], name: str) -> Float64[np.ndarray, " rows"]:
+        commas = [row for row, cell in enumerate(cells) if _DECIMAL_COMMA.fullmatch(cell)]
+        for row, cell in enumerate(cells):
+            if cell and not is_number(cell) and not _DECIMAL_COMMA.fullmatch(cell):
+                raise self.wrong(row, f"{name}: expected a number, got {cell!r}")
+        # 1,234 may be a thousand and more; 0,123 and 12,5 are not, and one such tells of all. A dot elsewhere says that
+        # commas are no points.
+        if any("." in cell for cell in cells) or all(_THOUSANDS.fullmatch(cells[row]) for row in commas):
+            row = commas[0] if commas else 0
+            raise self.wrong(row, f"{name}: expected a number with a decimal point, got {cells[row]!r}")
+        self._note_once("decimal-commas", f"{name} of {self.path.name} has decimal commas, read as points")
+        return np.array([cell.replace(",", ".") or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+
+    def _note_once(self, name: str, sentence: str) -> None:
+        if not any(finding.sentence == sentence for finding in self.findings):
+            self.findings.append(Finding(name, "note", sentence))
+
+
+def read_text_table(path: Path, bare: str | None = None) -> TextTable:
+    """Read a file of text in columns.
+
+    Args:
+        path: the file, in UTF-8, gzipped or not.
+        bare: the name of the one column of a file without a header; None: there must be one.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged or no such text, or a row has not as many fields as the header.
+    """
+    text = _text(path)
+    first_line = text.lstrip("\r\n").partition("\n")[0]
+    separator = _separator(first_line)
+    reader = csv.reader(io.StringIO(text), delimiter=separator)
+    rows, lines = [], []
+    try:
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                rows.append(row)
+                lines.append(reader.line_num)
+    except csv.Error as error:
+        raise InvalidFile(f"{path}: expected CSV (text in columns), got something else ({error})") from error
+    if not rows:
+        raise InvalidFile(f"{path}: expected a header line and a line an event, got an empty file")
+    header = [name.strip() for name in rows[0]]
+    if bare is not None and len(header) == 1 and is_number(header[0]):
+        header = [bare]
+    else:
+        del rows[0], lines[0]
+    for row, line in zip(rows, lines, strict=True):
+        # Spreadsheets end lines with the separators of empty cells.
+        while len(row) > len(header) and not row[-1].strip():
+            row.pop()
+        if len(row) != len(header):
+            raise InvalidFile(
+                f"{path}, line {line}: expected {len(header)} fields, as in the header, got {len(row)}: "
+                + (_advice(row, separator) if len(row) > len(header) else "is a field missing, or the file cut off?")
+            )
+    return TextTable(path, header, rows, lines)
+
+
+def read_header(path: Path) -> list[str]:
+    """The names of a file's columns, as they stand there.
+
+    Raises:
+        InvalidFile: if the file is missing, damaged or no text.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(LONGEST_HEADER)
+        if content.startswith(b"\x1f\x8b"):
+            content = zlib.decompressobj(wbits=31).decompress(content, LONGEST_HEADER)
+        line = content.lstrip(b"\r\n").partition(b"\n")[0].decode("utf-8-sig")
+    except (OSError, zlib.error, UnicodeDecodeError) as error:
+        raise InvalidFile(f"{path}: expected CSV (text in UTF-8), got something else ({error})") from error
+    return [name.strip().strip('"') for name in line.strip("\r").split(_separator(line))]
+
+
+def _separator(line: str) -> str:
+    return max(",;\t", key=line.count)
+
+
+def folded(name: str) -> str:
+    """A header in small letters, with underscores for blanks and without brackets: `Time (s)` is `time_s`."""
+    return re.sub(r"[\s_\-]+", "_", re.sub(r"[()\[\]{}\"']", "", name).strip().casefold())
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number, NaN and infinity among them."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _advice(row: list[str], separator: str) -> str:
+    if separator == "," and all(is_number(cell) for cell in row if cell.strip()):
+        return "write numbers with decimal points, or separate the columns by semicolons where they have decimal commas"
+    return "quote the text that holds the separator, or take the field out"
+
+
+def _text(path: Path) -> str:
+    try:
+        content = expect_plain_file(path).read_bytes()
+        if content[:2] == b"\x1f\x8b":
+            content = _unpacked(path, content)
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InvalidFile(
+            f"{path}: expected CSV (text in UTF-8), got something else ({error.reason}); save it as CSV in UTF-8"
+        ) from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise InvalidFile(
+            f"{path}: expected a whole file, but it cannot be read or is cut off ({error}); copy it again"
+        ) from error
+
+
+def _unpacked(path: Path, content: bytes) -> bytes:
+    """What is in a gzipped file, unless it is far more than text of that size packs."""
+    limit = UNPACKED_BYTES + UNPACKED_RATIO * len(content)
+    with gzip.open(io.BytesIO(content)) as packed:
+        unpacked = packed.read(limit + 1)
+    if len(unpacked) > limit:
+        raise InvalidFile(f"{path}: unpacks to more than {limit:,} bytes, more than text of its size: it is damaged")
+    return unpacked

@@ -1,0 +1,159 @@
+"""Whether the times of a recording can be in seconds: stated frequencies, firing and length that cannot be true."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.recordings.findings import Finding
+from animat.recordings.recording import Recording, Stimuli
+
+NAME = "times-not-in-seconds"
+FAR = 30.0
+"""Intervals are this many times as long, or as short, as stated frequencies say."""
+AGREE = 0.05
+"""How far the frequencies may differ in by how much: a common unit is common to all."""
+APART = 1.5
+"""The highest of the frequencies over the lowest, at least: a steady interval fits all that are nearly alike."""
+LONG_S = 2 * 3600.0
+FEW_HZ, MANY_HZ = 0.02, 200.0
+"""Median rate of the channels that fired, below and above which no recording is."""
+SHORT_S, SHORT_SHARE = 0.5, 0.05
+"""In any recording at least this share of a channel's intervals is shorter: neurons fire in bursts."""
+SHORTEST_IN_SAMPLES, SHORTEST_IN_MICROSECONDS = 2.0, 100.0
+"""The shortest hundredth of a channel's intervals, from which on they are counted in these."""
+SOON_S = 0.1
+ENOUGH_SPIKES, ENOUGH_STIMULI = 1000, 20
+
+
+def time_findings(recording: Recording) -> Iterator[Finding]:
+    """A finding on times that cannot be in seconds (`times-not-in-seconds`), if they cannot.
+
+    They cannot where the intervals between stimuli are the same multiple of what stated frequencies, 1.5 times apart or
+    more, ask for, and it is the multiple of a known unit; where a recording of more than two hours has hardly two
+    spikes of a channel within half a second and a median rate under 0.02 Hz, or no spike within 100 ms after any
+    stimulus; where the median channel fires at more than 200 Hz; or where nearly all stimuli come after the last spike.
+    Another multiple, above 30 or below 1/30, is warned of: trains of 100 pulses, a row each, have intervals 100 times
+    as long.
+
+    Args:
+        recording: with any spikes and stimuli.
+    """
+    stated = _stated(recording.stimuli, recording.sampling_rate_hz)
+    if stated is not None and stated.severity == "refuse":
+        yield stated
+    elif (reason := _fired(recording) or _apart(recording)) is not None:
+        yield Finding(NAME, "refuse", reason)
+    elif stated is not None:
+        yield stated
+
+
+def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
+    """Stated frequencies against real intervals."""
+    interval_s = np.diff(stimuli.time_s)
+    # A pulse may be said to be at the frequency of the interval before it, or of the one after it.
+    for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
+        known = ~np.isnan(frequency_hz) & (interval_s > 0)
+        distinct = np.unique(frequency_hz[known])
+        if len(distinct) < 2 or distinct[-1] < APART * distinct[0]:
+            continue
+        multiples = np.array([np.median(interval_s[known & (frequency_hz == f)] * f) for f in distinct])
+        multiple = float(np.median(multiples))
+        if np.all(np.abs(multiples / multiple - 1) < AGREE) and not 1 / FAR < multiple < FAR:
+            example_s = float(np.median(interval_s[known & (frequency_hz == distinct[0])]))
+            unit = _unit(multiple, sampling_rate_hz)
+            return Finding(
+                NAME,
+                "refuse" if unit else "warning",
+                f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those of {distinct[0]:g} Hz would be "
+                f"{example_s:g} s apart, not {1 / distinct[0]:g} s, and those of others are off by the same factor of "
+                f"{_plain(multiple)}: "
+                + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?"),
+            )
+    return None
+
+
+def _unit(multiple: float, sampling_rate_hz: float) -> str | None:
+    """The unit that times are in, and what to do; None where it is none that is known."""
+    named = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes", 1 / 3600: "hours"}
+    for factor, unit in named.items():
+        if abs(multiple / factor - 1) < AGREE:
+            do = f"divide them by {_plain(factor)}" if factor > 1 else f"multiply them by {_plain(1 / factor)}"
+            return f"{unit}; {do}"
+    if abs(multiple / sampling_rate_hz - 1) < AGREE:
+        return f"samples at {_plain(multiple)} Hz; divide them by that"
+    return None
+
+
+def _plain(number: float) -> str:
+    return f"{number:,.0f}" if number >= FAR else f"{number:.3g}"
+
+
+def _fired(recording: Recording) -> str | None:
+    """How long and how fast the channels fired, if they fired."""
+    times_s, n_spikes = recording.spike_times_s, len(recording.spike_times_s)
+    count = np.bincount(recording.spike_channels, minlength=len(recording.channels))
+    if n_spikes < ENOUGH_SPIKES or recording.duration_s < 1:
+        return None
+    median_hz = float(np.median(count[count > 0])) / recording.duration_s
+    if median_hz > MANY_HZ:
+        return (
+            f"spike times cannot be in seconds: the median channel fires at {median_hz:,.0f} Hz, which no neuron does; "
+            "are they in minutes or hours?"
+        )
+    if recording.duration_s < LONG_S:
+        return None
+    hours = f"the recording would last {recording.duration_s / 3600:,.0f} h"
+    by_channel = np.argsort(recording.spike_channels, kind="stable")
+    same = np.diff(recording.spike_channels[by_channel]) == 0
+    interval_s = np.diff(times_s[by_channel])[same]
+    if len(interval_s) and median_hz < FEW_HZ and np.mean(interval_s < SHORT_S) < SHORT_SHARE:
+        return (
+            f"spike times cannot be in seconds: {hours}, with {median_hz:.2g} Hz on the median channel and hardly ever "
+            f"two spikes of a channel within {SHORT_S:g} s; times are in {_unit_of_spikes(interval_s)}"
+        )
+    stimulus_s = recording.stimuli.time_s
+    if len(stimulus_s) >= ENOUGH_STIMULI and not np.any(_spikes_soon_after(times_s, stimulus_s)):
+        return (
+            f"times cannot be in seconds: {hours} without a spike within {1e3 * SOON_S:g} ms after any of "
+            f"{len(stimulus_s):,} stimuli; are they in milliseconds, or spikes and stimuli in different units?"
+        )
+    return None
+
+
+def _unit_of_spikes(interval: Float64[np.ndarray, " intervals"]) -> str:
+    """The unit that intervals on a channel are in; the shortest last a fifth of a millisecond to a few."""
+    shortest = float(np.quantile(interval, 0.01))
+    if shortest < SHORTEST_IN_SAMPLES:
+        return "milliseconds; divide them by 1,000"
+    return (
+        "samples; divide them by the sampling rate"
+        if shortest < SHORTEST_IN_MICROSECONDS
+        else "microseconds; divide them by 1,000,000"
+    )
+
+
+def _spikes_soon_after(
+    spike_s: Float64[np.ndarray, " spikes"], stimulus_s: Float64[np.ndarray, " stimuli"]
+) -> Float64[np.ndarray, " stimuli"]:
+    return np.searchsorted(spike_s, stimulus_s + SOON_S) - np.searchsorted(spike_s, stimulus_s)
+
+
+def _apart(recording: Recording) -> str | None:
+    """Spikes and stimuli on different clocks."""
+    spike_s, stimulus_s = recording.spike_times_s, recording.stimuli.time_s
+    if len(spike_s) < ENOUGH_SPIKES or len(stimulus_s) < ENOUGH_STIMULI:
+        return None
+    after = float(np.mean(stimulus_s > spike_s[-1]))
+    before = float(np.mean(stimulus_s < spike_s[0]))
+    if max(after, before) < 0.9:
+        return None
+    where = (
+        f"after the last spike, at {spike_s[-1]:g} s" if after > before else f"before the first, at {spike_s[0]:g} s"
+    )
+    return (
+        f"times cannot all be in seconds: {100 * max(after, before):.0f} % of the stimuli come {where}: stimuli and "
+        "spikes have different units or clocks; bring both in seconds of one clock"
+    )

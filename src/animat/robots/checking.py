@@ -1,0 +1,124 @@
+"""Whether a robot keeps to the contract, seen on its shapes and on a few real steps, before anything is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from animat.errors import AnimatError, InvalidArgument, shown
+from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
+
+_STEPS = 3
+
+
+def check_robot(robot: Robot[Any]) -> None:
+    """Reset a robot and step it a few times, and refuse it if something comes of it that no environment can use.
+
+    Args:
+        robot: of any class.
+
+    Raises:
+        InvalidArgument: naming the method or attribute, what was expected and what came.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    name = _named(robot)
+    observations, noise = len(robot.quantities), robot.noise_size
+
+    def episode(key: Any) -> Any:
+        state = _tried(f"{name}.reset", robot.reset, key)
+        seen = _tried(f"{name}.observe", robot.observe, state)
+        _expect_shape(f"{name}.observe", seen, (observations,), "one number for each of `quantities`")
+        told = [(state, seen, jnp.float32(0.0))]
+        # Commands at both ends and in the middle.
+        for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
+            uniforms = jnp.full(noise, 0.5, jnp.float32)
+            step = _tried(f"{name}.advance", robot.advance, uniforms, state, jnp.asarray(u))
+            if not isinstance(step, tuple) or len(step) != 3:
+                raise InvalidArgument(f"{name}.advance: expected (state, reward, whether it ended), got {shown(step)}")
+            after, reward, ended = step
+            _expect_alike(f"{name}.advance", after, state)
+            _expect_shape(f"{name}.advance: reward", reward, (), "a number")
+            _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
+            seen = _tried(f"{name}.observe", robot.observe, after)
+            told.append((after, seen, jnp.asarray(reward, jnp.float32)))
+        return told
+
+    # Under jit: what a step may not do there is seen here, and it is compiled once.
+    for state, seen, reward in jax.device_get(jax.jit(episode)(jax.random.key(0))):
+        for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
+            if not all(np.all(np.isfinite(value)) for value in values):
+                raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
+
+
+def _named(robot: Any) -> str:
+    """What a message calls the robot, once its attributes are what they are said to be."""
+    kind = type(robot).__name__
+    if not isinstance(robot, Robot):
+        raise InvalidArgument(f"robot: expected a robot or the name of one, got {shown(robot)}")
+    for name, least, most in (("noise_size", 0, 10_000), ("episode_limit", 1, LONGEST_EPISODE)):
+        value = getattr(robot, name, None)
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+            raise InvalidArgument(f"{kind}.{name}: expected a whole number from {least} to {most}, got {shown(value)}")
+    if not isinstance(getattr(robot, "name", None), str):
+        raise InvalidArgument(f"{kind}.name: expected a text, got {shown(getattr(robot, 'name', None))}")
+    quantities = robot.quantities
+    if not isinstance(quantities, tuple) or not quantities or not all(isinstance(q, Quantity) for q in quantities):
+        raise InvalidArgument(f"{kind}.quantities: expected a tuple of Quantity, got {shown(quantities)}")
+    for quantity in quantities:
+        if not LEAST_SCALE <= quantity.scale <= LARGEST_SCALE:
+            raise InvalidArgument(
+                f"{kind}.quantities: {quantity.name}: expected a scale from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got "
+                f"{quantity.scale:g}; give it in another unit"
+            )
+    try:
+        hash(robot)
+        json.dumps(dataclasses.asdict(robot))  # type: ignore[call-overload]
+    except (TypeError, ValueError) as error:
+        raise InvalidArgument(f"{kind}: expected a frozen dataclass of plain parameters ({error})") from error
+    return kind
+
+
+def _tried(what: str, call: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return call(*arguments)
+    except AnimatError:
+        raise
+    except Exception as error:
+        # Anything may go wrong in somebody else's robot.
+        said = (str(error).strip().splitlines() or ["no more is known"])[0]
+        raise InvalidArgument(
+            f"{what}: expected it to run under jax.jit, got {type(error).__name__}: {said}"
+        ) from error
+
+
+def _expect_shape(what: str, value: Any, shape: tuple[int, ...], words: str, kind: type = float) -> None:
+    import jax.numpy as jnp
+
+    try:
+        array = jnp.asarray(value)
+    except TypeError as error:
+        raise InvalidArgument(f"{what}: expected {words}, shape {shape}, got {shown(value)}") from error
+    if array.shape != shape:
+        raise InvalidArgument(f"{what}: expected {words}, shape {shape}, got shape {array.shape}")
+    if kind is bool and array.dtype != bool:
+        raise InvalidArgument(f"{what}: expected {words}, got {array.dtype}")
+
+
+def _expect_alike(what: str, after: Any, before: Any) -> None:
+    """A state keeps its form: it is carried through a loop that is compiled once."""
+    import jax
+    import jax.numpy as jnp
+
+    forms = [
+        (jax.tree.structure(state), [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(state)])
+        for state in (before, after)
+    ]
+    if forms[0] != forms[1]:
+        told = [", ".join(f"{dtype}{list(shape)}" for shape, dtype in leaves) for _, leaves in forms]
+        raise InvalidArgument(f"{what}: expected a state as reset gives it ({told[0]}), got another ({told[1]})")

@@ -1,0 +1,68 @@
+"""Compiled programs are kept where they can be; where they cannot, everything works all the same."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+import animat
+from animat.compilation import cache_folder, kept_njit
+
+
+def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def doubled(x: int) -> int:
+        return 2 * x
+
+    kept = kept_njit(error_model="numpy")
+    # As in a package of the system's, for a user without a home.
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    with pytest.raises(RuntimeError, match="no locator available"):
+        numba.njit(cache=True)(doubled)
+    assert kept(doubled)(4) == 8
+
+
+def test_nobody_s_home_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", unknown)
+    with pytest.raises(OSError, match="Not a directory"):
+        cache_folder().mkdir(parents=True)
+
+
+COMPILING = """
+import sys
+from animat.compilation import keep_compilations
+keep_compilations()
+import jax
+print(jax.jit(lambda x: x + 1)(1), jax.config.jax_compilation_cache_dir)
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.recording import Recording
+recording = make_up_recording(1)
+recording.save(sys.argv[1])
+print(Recording.load(sys.argv[1]).equals(recording))
+"""
+
+
+def test_a_home_that_is_a_file_keeps_nothing_and_says_nothing(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.touch()
+    kept = ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME", "MPLCONFIGDIR")
+    without = {name: value for name, value in os.environ.items() if name not in kept}
+    # In plain C, Python itself cannot read where an editable installation lies, if that has an umlaut.
+    language = "C" if sys.prefix.isascii() and animat.__file__.isascii() else "C.UTF-8"
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILING, str(tmp_path / "für mich.nwb")],
+        env=without | {"HOME": str(home), "LC_ALL": language},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "2 None\nTrue\n", "")

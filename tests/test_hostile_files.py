@@ -1,0 +1,80 @@
+"""Files made by hand to hang or crash: protocols, selections, checkpoints. Each is one line; none is waited for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.errors import InvalidFile
+from animat.recordings.protocol import read_protocol
+from animat.recordings.selection import Selection
+from animat.training.group import Group, train_group
+from test_training import SHORT, timeline_of
+
+SELECTION: dict[str, Any] = {
+    "format": "animat electrode selection 1",
+    "array": {"name": "a", "columns": 220, "rows": 120, "pitch_um": 17.5, "channels": 1024, "stimulation_units": 32},
+    "rule": {},
+    "seed": 0,
+    "scanned": 0,
+    "passed": 0,
+    "stimulation": [1, 2],
+    "patterns": [[1, 2]],
+    "recording": [1, 2, 3],
+}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"presentations": ' + "9" * 4000 + "}",
+        '{"presentations": ' + "9" * 5000 + "}",
+        '{"frequencies_hz": [1e-300]}',
+        '{"order": []}',
+        '{"pulses": 1e400}',
+        " " * 2**21,
+    ],
+    ids=["nested", "digits", "more digits", "slow", "a list", "infinite", "long"],
+)
+def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(InvalidFile, match=r"p\.json: ") as raised:
+        read_protocol(tmp_path / "p.json")
+    assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"array": SELECTION["array"] | {"columns": 10**30}}, "array.columns: expected a whole number"),
+        ({"array": SELECTION["array"] | {"pitch_um": "a"}}, "array.pitch_um: expected a distance"),
+        ({"recording": ["1", "2"]}, "expected whole numbers of electrodes"),
+        ({"recording": [1.5]}, "expected whole numbers of electrodes"),
+        ({"recording": [10**30]}, "expected whole numbers of electrodes"),
+        ({"recording": {}}, "expected whole numbers of electrodes"),
+        ({"patterns": [[1], [1, 2]]}, "expected what Selection.to_dict writes"),
+        ({"rule": {"spacing_um": "a"}}, "rule.spacing_um: expected a finite number"),
+        ({"seed": 1.5}, "expected a whole number, got 1.5"),
+    ],
+)
+def test_selections_made_by_hand_are_one_line(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
+    (tmp_path / "s.json").write_text(json.dumps(SELECTION))
+    assert len(Selection.load(tmp_path / "s.json").channels) == 3
+    (tmp_path / "s.json").write_text(json.dumps(SELECTION | changed))
+    with pytest.raises(InvalidFile, match=words):
+        Selection.load(tmp_path / "s.json")
+    (tmp_path / "s.json").write_text("[" * 100_000)
+    with pytest.raises(InvalidFile, match="expected an electrode selection"):
+        Selection.load(tmp_path / "s.json")
+
+
+def test_a_checkpoint_that_unpacks_to_more_than_one_holds_is_not_read(tmp_path: Path) -> None:
+    group = Group(SHORT, (0,), timeline_of(), "f", {})
+    np.savez_compressed(tmp_path / "c.npz", fingerprint=np.array("f"), more=np.zeros(2**24))
+    with pytest.raises(InvalidFile, match=r"c\.npz: expected a checkpoint of at most .* bytes, got 134,"):
+        train_group(group, tmp_path / "c.npz", lambda done, mean_return: None)

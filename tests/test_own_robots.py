@@ -1,0 +1,206 @@
+"""Robots and mappings of one's own: what cannot be trained or loaded again is refused before the first iteration."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.errors import InvalidArgument
+from animat.mapping import Linear, Mapping, Thresholds, check_mapping
+from animat.robots import Cartpole, Navigation, Quantity, Robot
+from animat.robots.checking import check_robot
+from animat.robots.registry import robot_named
+from animat.training.policy import load_policies
+from animat.training.specification import Training
+from animat.training.trainer import train
+from test_training import SMALL, Kept, timeline_of
+
+
+class At(NamedTuple):
+    """Where a slider is."""
+
+    x_m: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Slider(Robot[At]):
+    """Moves by the command; the best is to stay in the middle."""
+
+    gain_m: float = 0.1
+    episode_limit: int = 20
+
+    name: ClassVar[str] = "slider"
+    noise_size: ClassVar[int] = 1
+    paper_iterations: ClassVar[int] = 1000
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        return (Quantity("x", "m", 1.0),)
+
+    def reset(self, key: Any) -> At:
+        return At(0.2 * jax.random.normal(key, (), jnp.float32))
+
+    def advance(self, uniforms: Any, state: At, u: Any) -> tuple[At, Any, Any]:
+        x_m = state.x_m + self.gain_m * u
+        return At(x_m), -jnp.abs(x_m), jnp.abs(x_m) > 1
+
+    def observe(self, state: At) -> Any:
+        return jnp.stack([state.x_m])
+
+
+def slider(**changed: Any) -> Robot[Any]:
+    """A slider with other methods or attributes."""
+    return type("Changed", (Slider,), changed)()  # type: ignore[no-any-return]
+
+
+class Push(Mapping):
+    """One command, whatever is answered."""
+
+    def __init__(self, command: Callable[[Any], Any] = lambda x: 0 * x + 0.5) -> None:
+        self._command = command
+
+    @property
+    def name(self) -> str:
+        return "linear"
+
+    def command(self, x: Any, percentiles: Any) -> Any:
+        return self._command(x)
+
+
+def training(robot: Any, mapping: Any) -> Training:
+    return Training(robot, mapping, policies=1, iterations=480, algorithm=SMALL)
+
+
+def test_names_stand_for_robots_and_mappings() -> None:
+    named = Training("cartpole", "9-thresholds")
+    assert named == Training(Cartpole(), Thresholds(9)) and hash(named) == hash(Training(Cartpole(), Thresholds(9)))
+    assert dataclasses.replace(named, mapping="linear").mapping == Linear()
+    assert pickle.loads(pickle.dumps(named)) == named
+    assert Training(Navigation(), None).mapping is None
+    for arguments, words in (
+        (("cart", None), "robot: expected one of cartpole, navigation, got 'cart'"),
+        (("cartpole", "2-thresholds"), "mapping: expected one of 1-threshold"),
+        ((7, None), "robot: expected a robot or the name of one, got 7"),
+        ((Cartpole, None), "robot: expected a robot or the name of one, got <class"),
+        ((Cartpole(), 1), "mapping: expected a mapping or the name of one, got 1"),
+    ):
+        with pytest.raises(InvalidArgument, match=words):
+            Training(*arguments)  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        Training()  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize(
+    ("robot", "mapping", "words"),
+    [
+        (Slider(), Thresholds(1), r"^robot: .* \(cartpole, navigation\), got one of one's own \(Slider\).*in memory"),
+        (Cartpole(), Push(), r"^mapping: .* got one of one's own \(Push\), .* train in memory: train\("),
+        # The name of another, which would be loaded in its place.
+        (slider(name="cartpole"), Thresholds(1), "got one of one's own"),
+    ],
+)
+def test_what_could_not_be_loaded_again_is_refused_before_the_first_iteration(
+    robot: Any, mapping: Any, words: str, tmp_path: Path
+) -> None:
+    progress = Kept()
+    with pytest.raises(InvalidArgument, match=words) as raised:
+        train(training(robot, mapping), timeline_of(), tmp_path / "out", progress=progress)
+    assert "\n" not in str(raised.value) and not progress.told and not (tmp_path / "out").exists()
+
+
+def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
+    progress = Kept()
+    policies = train(training(Slider(), Push()), timeline_of(), None, progress=progress)
+    assert list(policies) == ["p0"] and progress.told[-1] == (60, 60)
+    for policy in policies.values():
+        assert policy.act(np.zeros(1, np.float32), np.random.default_rng(0)) in range(3)
+        with pytest.raises(InvalidArgument, match="got one of one's own"):
+            policy.save(tmp_path / "p0.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"observe": lambda self, state: jnp.stack([state.x_m] * 2)}, r"observe: .*shape \(1,\), got shape \(2,\)"),
+        ({"observe": lambda self, state: state.x_m}, r"observe: .*shape \(1,\), got shape \(\)"),
+        ({"observe": lambda self, state: jnp.stack([state.x_m / 0])}, "NaN or infinite ones in an observation"),
+        ({"observe": lambda self, state: jnp.stack([state.y])}, "observe: expected it to run .* AttributeError"),
+        ({"reset": lambda self, key: At(jnp.float32(jnp.nan))}, "NaN or infinite ones in a state"),
+        ({"reset": lambda self: At(0.0)}, "reset: expected it to run under jax.jit, got TypeError"),
+        ({"reset": lambda self, key: At(0)}, "advance: expected a state as reset gives it"),
+        ({"advance": lambda self, uniforms, state, u: (state, u)}, r"advance: expected \(state, reward, whether"),
+        ({"advance": lambda self, uniforms, state, u: (At(u[None]), u, u > 2)}, r"float32\[\]\), got another .*\[1\]"),
+        ({"advance": lambda self, uniforms, state, u: (state, jnp.stack([u]), u > 2)}, r"reward: .*got shape \(1,\)"),
+        ({"advance": lambda self, uniforms, state, u: (state, u, u)}, "whether it ended: expected true or false"),
+        ({"advance": lambda self, uniforms, state, u: (state, "a", u > 2)}, "reward: expected a number"),
+        ({"advance": lambda self, uniforms, state, u: (state, jnp.log(u - 1), u > 2)}, "infinite ones in a reward"),
+        ({"advance": lambda self, uniforms, state, u: (state, float(u), u > 2)}, "advance: expected it to run"),
+        ({"noise_size": None}, "noise_size: expected a whole number"),
+        ({"noise_size": -1}, "noise_size: expected a whole number"),
+        ({"episode_limit": 0}, "episode_limit: expected a whole number"),
+        ({"name": None}, "name: expected a text"),
+        ({"quantities": ()}, "quantities: expected a tuple of Quantity"),
+        ({"quantities": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
+        ({"quantities": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
+        ({"quantities": (Quantity("x", "m", np.nan),)}, "x: expected a scale from 1e-12 to 1e.12, got nan"),
+        ({"__hash__": None}, "expected a frozen dataclass"),
+    ],
+)
+def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) -> None:
+    if "episode_limit" in changed:
+        robot: Robot[Any] = Slider(**changed)
+    else:
+        robot = slider(**changed)
+    with pytest.raises(InvalidArgument, match=words) as raised:
+        train(training(robot, "1-threshold"), timeline_of(), None)
+    assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-7, 1e7, 1e12])
+def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
+    # In the unit that the robot is observed in, it moves as far as the scale says.
+    robot = slider(quantities=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale]))
+    for policy in train(training(robot, "1-threshold"), timeline_of(), None).values():
+        assert np.all(np.isfinite(policy.act_greedily(np.array([scale], np.float32))))
+
+
+def test_a_robot_of_another_size_is_trained_and_loaded(tmp_path: Path) -> None:
+    # Its track is of so many metres that the scale is 5e7.
+    robot = robot_named("cartpole", track_length_m=1e8)
+    train(training(robot, "1-threshold"), timeline_of(), tmp_path)
+    assert [policy.robot for policy in load_policies(tmp_path).values()] == [robot]
+
+
+def test_a_method_that_is_missing_is_named() -> None:
+    with pytest.raises(TypeError, match=r"abstract method.*observe"):
+        type("Blind", (Slider,), {"observe": Robot.observe})()
+
+
+def test_robots_that_keep_to_the_contract_pass() -> None:
+    for robot in (Slider(), Cartpole(), Cartpole.as_printed(), Navigation(), Navigation.as_printed()):
+        check_robot(robot)
+    for mapping in (Thresholds(1), Thresholds(9), Linear(), Push()):
+        check_mapping(mapping)
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (lambda x: 0.5, "expected 25 commands from -1 to 1, got 0.5"),
+        (lambda x: x, "expected 25 commands from -1 to 1"),
+        (lambda x: x * np.nan, "expected 25 commands from -1 to 1"),
+        (lambda x: x.command, "expected commands, got AttributeError"),
+    ],
+)
+def test_mappings_that_give_no_commands_are_named(command: Callable[[Any], Any], words: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"^Push.command: {words}"):
+        train(training("cartpole", Push(command)), timeline_of(), None)

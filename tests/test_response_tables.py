@@ -1,0 +1,264 @@
+"""Tables of responses without spikes. Oracles: recordings whose counts they are, hand-written files, a real table."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.errors import AnimatError, InvalidFile
+from animat.neurons.conditions import ByInterval, ByPattern, Conditions
+from animat.neurons.inspection import inspect_recording
+from animat.neurons.responses import extract_responses
+from animat.neurons.table_responses import responses_of_table
+from animat.neurons.windows import spikes_in
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.noticed import noticed
+from animat.recordings.reading import read_recording, read_source, read_sources
+from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
+from animat.report.inspection import inspection_text
+from test_responses import recording as of_spikes
+
+
+def counts_of(recording: Recording, window_ms: tuple[float, float]) -> np.ndarray:
+    """Spikes of each channel in the window of each stimulus, counted one by one."""
+    counts = np.zeros((len(recording.stimuli), len(recording.channels)), np.int64)
+    after_s = recording.stimuli.time_s
+    rows, spikes = spikes_in(recording, after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3)
+    np.add.at(counts, (rows, recording.spike_channels[spikes]), 1)
+    return counts
+
+
+def table_of(path: Path) -> ResponseTable:
+    table = read_source(path)
+    assert isinstance(table, ResponseTable)
+    return table
+
+
+@pytest.mark.parametrize("kind", ["count", "rate_hz"])
+@pytest.mark.parametrize("form", ["npz", "wide", "long"])
+def test_a_table_has_the_responses_of_the_recording_that_it_was_counted_in(
+    form: str, kind: str, tmp_path: Path
+) -> None:
+    window_ms = (3.0, 9.0)
+    recording = make_up_recording(3, patterns=8, channels=24)
+    values = counts_of(recording, window_ms) / (1.0 if kind == "count" else 0.006)
+    stimuli = recording.stimuli
+    if form == "npz":
+        path = tmp_path / "a.npz"
+        named = {"stimulus_time_s": stimuli.time_s, "stimulus_frequency_hz": stimuli.frequency_hz}
+        np.savez(path, **{f"response_{kind}": values}, **named, response_window_ms=window_ms, start_min=20)
+    else:
+        path = tmp_path / "a_responses.csv"
+        lines = []
+        for t, f, row in zip(stimuli.time_s.tolist(), stimuli.frequency_hz.tolist(), values.tolist(), strict=True):
+            if form == "wide":
+                lines.append(",".join(map(repr, [t, f, 3.0, 9.0, 20.0, *row])))
+            else:
+                lines += [f"{t!r},{f!r},3,9,20,{c},{value!r}" for c, value in enumerate(row) if value or c == 5]
+        channels = [f"{kind}_{c}" for c in range(24)] if form == "wide" else ["channel", kind]
+        header = ["time_s", "Frequency (Hz)", "window_start_ms", "window_end_ms", "start_min", *channels]
+        path.write_text("\n".join([",".join(header), *lines]) + "\n")
+    table = table_of(path)
+    ours, theirs = responses_of_table(table), extract_responses(recording, window_ms=window_ms)
+    # The recording ends with its last event, so that its last window may be cut off.
+    n = len(theirs)
+    assert len(ours) - n in (0, 1)
+    np.testing.assert_allclose(ours.rate_hz[:n], theirs.rate_hz, rtol=1e-12)
+    np.testing.assert_array_equal(ours.active_ratio[:n], theirs.active_ratio)
+    np.testing.assert_array_equal(ours.condition[:n], theirs.condition)
+    np.testing.assert_array_equal(ours.last_hz[1:n] == 0, theirs.last_hz[1:] == 0)
+    assert (ours.by, ours.burst_threshold) == (theirs.by, theirs.burst_threshold)
+    assert [c.label for c in ours.conditions] == [c.label for c in theirs.conditions]
+    assert (ours.window_ms, ours.start_min, ours.n_channels) == (window_ms, 20.0, 24)
+    names = {f.name: f.severity for f in ours.findings}
+    assert names["spike-times-unknown"] == "warning"
+    assert not {"dead-window", "response-time", "artefact-spikes", "window-assumed"} & set(names)
+
+
+def test_bursts_of_a_table_are_those_of_its_recording_where_few_ratios_occur() -> None:
+    # 45 responses of 10 channels in 100, and 5 of 30: the ratios are 20 channels apart, not one.
+    stimulus_s = np.arange(1.0, 51.0)
+    active = np.where(np.arange(50) % 10 == 9, 30, 10)
+    spikes = [(t + 0.005, c) for t, n in zip(stimulus_s, active, strict=True) for c in range(n)]
+    recording = of_spikes(spikes, stimulus_s, 100, 60.0)
+    table = ResponseTable(
+        values=counts_of(recording, (2.0, 10.0)).astype(float),
+        kind="count",
+        channels=recording.channels,
+        stimuli=recording.stimuli,
+        has_times=True,
+        window_ms=(2.0, 10.0),
+        start_min=0.0,
+        presentation=None,
+        provenance={},
+    )
+    for responses in (extract_responses(recording), responses_of_table(table)):
+        np.testing.assert_array_equal(responses.is_burst, active == 30)
+
+
+def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_pattern=["a", "b", "a"])
+    table = table_of(tmp_path / "a.npz")
+    assert not table.has_times
+    responses = responses_of_table(table, ByPattern(), (2.0, 12.0))
+    # One spike on two channels in 10 ms is 50 Hz.
+    assert responses.rate_hz.tolist() == [50.0, 0.0, 250.0]
+    assert responses.active_ratio.tolist() == [0.5, 0.0, 1.0]
+    assert responses.time_s is None and not responses.presentations[0].is_rested.any()
+    assert "window-assumed" in {f.name for f in responses.findings}
+    assert "stimulus-times-unknown" in {f.name for f in noticed(table)}
+    text = inspection_text(inspect_recording(table, ByPattern()))
+    assert "2.00 spikes in 2-10 ms per stimulus\n" in text
+    assert "6 spikes on 2 channels, from 0 min" in text
+
+
+def test_only_what_needs_spikes_refuses_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
+    assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1
+    assert "got a table of responses, which animat inspect, train and evaluate read" in capsys.readouterr().err
+    with pytest.raises(InvalidFile, match="this needs the times of spikes"):
+        read_recording(tmp_path / "a.npz")
+    (tmp_path / "b_responses.csv.gz").write_bytes(gzip.compress(b"count_1,start_min\n3,5\n"))
+    assert [source.start_min for source in read_sources(tmp_path)] == [0.0, 5.0]
+
+
+BAD = {
+    "a negative count": ("count_1\n-2\n", "expected counts of 0 or more, got -2 for stimulus 1 on channel 1"),
+    "a part of a spike": (
+        "count_1\n0.5\n",
+        "whole, got 0.5 for stimulus 1 on channel 1; rates in Hz are called rate_hz",
+    ),
+    "counts and rates": ("count_1,rate_hz_2\n1,2\n", "line 1: expected a column count_CHANNEL or rate_hz_.* got both"),
+    "an empty count": ("count_1,count_2\n1,2\n1,\n", "line 3: count_2: expected a finite number, got an empty field"),
+    "half a window": ("count_1,window_end_ms\n1,2\n", "expected window_start_ms and window_end_ms, or neither"),
+    "a window that changes": (
+        "count_1,window_start_ms,window_end_ms\n1,2,9\n1,2,10\n",
+        "line 3: window_end_ms: expected the same in all lines, 9 as in the first, got 10",
+    ),
+    "a window backwards": ("count_1,window_start_ms,window_end_ms\n1,9,2\n", "window: expected 0 <= start < end"),
+    "a pair twice": ("trial,channel,count\n1,a,2\n1,b,2\n1,a,3\n", "line 4: expected one line a stimulus and channel"),
+    "long without trials": ("channel,count\n1,2\n", "expected trial .or stimulus_time_s., channel, and count"),
+    "a trial with two patterns": (
+        "trial,pattern,channel,count\n1,left,a,1\n2,up,a,1\n1,right,b,1\n",
+        "line 4: stimulus_pattern: expected 'left' as in line 2, which is of the same stimulus, got 'right'",
+    ),
+    "a trial with two frequencies": (
+        "trial,frequency_hz,channel,count\n1,5,a,1\n1,,b,1\n",
+        "line 3: stimulus_frequency_hz: expected '5' as in line 2",
+    ),
+    "one channel twice": ("count_1,COUNT_1\n1,2\n", "expected each label once, got '1' twice"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_table_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+    text, message = BAD[case]
+    (tmp_path / "a_responses.csv").write_text(text)
+    with pytest.raises(InvalidFile, match=message) as caught:
+        read_source(tmp_path / "a_responses.csv")
+    assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("head", ["Rate (Hz) {}", "rate_hz_{}", "RATE-HZ-{}", "rate [Hz]_{}", "count_{}", "Count {}"])
+def test_channels_are_called_what_their_headers_say_after_the_kind(head: str, tmp_path: Path) -> None:
+    labels = ["12", "A1", "(3,4)"]
+    header = ";".join(head.format(label) for label in labels)
+    (tmp_path / "a_responses.csv").write_text(f"{header}\n1;2;3\n")
+    assert table_of(tmp_path / "a_responses.csv").channels.label.tolist() == labels
+
+
+def test_lines_of_a_trial_may_write_a_number_in_two_ways(tmp_path: Path) -> None:
+    lines = "trial,frequency_hz,pattern,channel,count\n1,5,,a,1\n1,5.0,,b,2\n2,,,a,3\n2,,,b,4\n"
+    (tmp_path / "a_responses.csv").write_text(lines)
+    table = table_of(tmp_path / "a_responses.csv")
+    np.testing.assert_array_equal(table.stimuli.frequency_hz, [5, np.nan])
+    assert table.values.tolist() == [[1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("a_spikes.csv", "time_s,channel,rate_hz"),
+        ("A_SPIKES.CSV.gz", "time_s,channel,count"),
+        ("a.csv", "spike_time_s,unit,count_in_burst"),
+        ("a.csv", "time_s,Spike Channel,rate_hz_mean"),
+    ],
+)
+def test_spikes_with_columns_of_counts_are_spikes(name: str, header: str, tmp_path: Path) -> None:
+    text = f"{header}\n0.1,7,2\n0.2,8,3\n".encode()
+    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
+    source = read_source(tmp_path / name)
+    assert isinstance(source, Recording)
+    assert source.spike_times_s.tolist() == [0.1, 0.2]
+
+
+def test_a_transposed_table_is_told(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", response_count=np.zeros((3, 5)), stimulus_pattern=np.arange(5))
+    with pytest.raises(InvalidFile, match=r"expected a row for each of 5 stimuli, got \(3, 5\): transpose it"):
+        read_source(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("by", "window_ms", "message"),
+    [
+        (ByInterval((5.0,)), (2.0, 10.0), "expected others than intervals, as the table has no times"),
+        (ByPattern(), (2.0, 12.0), "expected 1 to 9, in which the table's spikes were counted, got 2 to 12"),
+    ],
+)
+def test_a_choice_that_a_table_does_not_offer_is_refused(
+    by: Conditions, window_ms: tuple[float, float], message: str, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]], response_window_ms=[1, 9], stimulus_pattern=[0, 1])
+    with pytest.raises(AnimatError, match=message):
+        responses_of_table(table_of(tmp_path / "a.npz"), by, window_ms)
+
+
+@pytest.fixture
+def rat(real_data: Path, tmp_path: Path) -> list[str]:
+    """A published table as docs/recordings.md brings it in, and the options that it takes."""
+    with np.load(real_data / "rat_cortical_64ch_responses.npz") as data:
+        counts, sources = data["culture0_spikes_per_electrode"], data["culture0_sources"]
+    file = tmp_path / "rat.npz"
+    np.savez_compressed(file, response_count=counts, stimulus_pattern=sources[:, 0] + 2 * sources[:, 1])
+    np.testing.assert_allclose(
+        responses_of_table(table_of(file), ByPattern()).rate_hz, counts.sum(axis=1) / (64 * 0.008), rtol=1e-12
+    )
+    return [str(file), "--conditions", "pattern", "--burst-threshold", "1"]
+
+
+def test_a_real_table_is_inspected(rat: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", *rat, "--out", str(tmp_path / "figures")]) == 0
+    told = capsys.readouterr().out
+    assert "spikes on 64 channels" in told and "no times of spikes" in told
+    assert sorted(f.name for f in (tmp_path / "figures").iterdir()) == ["rat-burst-separation.png", "rat-responses.png"]
+
+
+@pytest.mark.oracle
+def test_a_real_table_is_trained_on_and_evaluated(rat: list[str], tmp_path: Path) -> None:
+    policies = str(tmp_path / "policies")
+    few = ["--policies", "1", "--iterations", "64", "--out", policies]
+    assert main(["train", "cartpole", "--recordings", *rat, *few]) == 0
+    assert main(["evaluate", policies, "--recordings", rat[0], "--episodes", "2"]) == 0
+
+
+def test_rows_without_times_drift_in_their_order(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    pattern = rng.permutation(np.repeat([0, 1], 150))
+    rising = np.linspace(0.5, 1.5, 300)
+    for name, level in (("rising", rising), ("steady", np.ones(300)), ("shuffled", rng.permutation(rising))):
+        counts = rng.poisson((20 + 20 * pattern[:, None]) * level[:, None], (300, 8))
+        np.savez(tmp_path / f"{name}.npz", response_count=counts, stimulus_pattern=pattern)
+        found = {
+            finding.name: finding
+            for finding in responses_of_table(table_of(tmp_path / f"{name}.npz"), ByPattern()).findings
+        }
+        assert ("drift" in found) == (name == "rising")
+        if name == "rising":
+            # From 0.5 to 1.5 of the mean.
+            assert found["drift"].value == pytest.approx(1.0, abs=0.1)
+            assert "in the order of the rows" in found["drift"].sentence

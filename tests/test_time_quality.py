@@ -1,0 +1,160 @@
+"""Times that cannot be in seconds. Oracles: real and virtual cultures, whose own times must pass, in other units."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from animat.cli import main
+from animat.cultures.virtual import VirtualCulture
+from animat.neurons.series import extract_series
+from animat.recordings.made_up import make_up_recording
+from animat.recordings.noticed import noticed
+from animat.recordings.protocol import Order, Protocol
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Recording
+from test_inspection import answering
+from test_responses import recording as of_spikes
+
+REAL = ("organoid_cartpole_maxone.npz", "brainoware_spikes.csv.gz")
+
+
+def in_unit(source: Recording, spikes: float, stimuli: float | None = None) -> Recording:
+    """The recording with times in a unit of which so many make a second."""
+    stimulus_s = source.stimuli.time_s * (spikes if stimuli is None else stimuli)
+    spike_s = source.spike_times_s * spikes
+    events = np.concatenate([spike_s, stimulus_s])
+    return dataclasses.replace(
+        source,
+        spike_times_s=spike_s,
+        stimuli=dataclasses.replace(source.stimuli, time_s=stimulus_s),
+        start_s=float(events.min()),
+        duration_s=float(np.ptp(events)) + 1,
+    )
+
+
+def without_frequencies(source: Recording) -> Recording:
+    unknown = np.full(len(source.stimuli), np.nan)
+    return dataclasses.replace(source, stimuli=dataclasses.replace(source.stimuli, frequency_hz=unknown))
+
+
+def said(source: Recording) -> str | None:
+    return next((f.sentence for f in noticed(source) if f.name == "times-not-in-seconds"), None)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings_are_in_seconds_and_named_in_other_units(name: str, real_data: Path) -> None:
+    source = read_recording(real_data / name)
+    assert said(source) is None
+    assert "times are in milliseconds; divide them by 1,000" in str(said(in_unit(source, 1e3)))
+    assert "times are in samples; divide them by the sampling rate" in str(said(in_unit(source, 20e3)))
+    assert "times are in microseconds; divide them by 1,000,000" in str(said(in_unit(source, 1e6)))
+    assert "times are in milliseconds" in str(said(in_unit(source, 1e3, 1)))
+    assert "spikes and stimuli in different units" in str(said(in_unit(source, 1, 1e3)))
+
+
+@pytest.mark.parametrize(
+    "order", [None, *(pytest.param(order, marks=pytest.mark.oracle) for order in ("mixed", "blocked"))]
+)
+def test_simulated_cultures_are_in_seconds_and_named_in_other_units(order: Order | None) -> None:
+    source = make_up_recording(1)
+    if order is not None:
+        with VirtualCulture(seed=3) as culture:
+            source = culture.record(Protocol(order=order, presentations=20))
+    assert said(source) is None and said(without_frequencies(source)) is None
+    for factor, words in {
+        1e3: "factor of 1,000: times are in milliseconds; divide them by 1,000",
+        20e3: "times are in samples at 20,000 Hz; divide them by that",
+        1 / 60: "times are in minutes; multiply them by 60",
+    }.items():
+        assert words in str(said(in_unit(source, factor)))
+        assert words in str(said(in_unit(source, 1, factor)))
+    assert "times are in milliseconds" in str(said(without_frequencies(in_unit(source, 1e3))))
+
+
+@settings(max_examples=30, deadline=None)
+@given(interval_s=st.floats(0.2, 600), frequencies=st.sampled_from([(5, 20), (5, 10, 20, 40, 80), (1, 100)]))
+def test_trains_named_by_their_frequency_and_given_at_a_steady_interval_are_in_seconds(
+    interval_s: float, frequencies: tuple[float, ...]
+) -> None:
+    # One row a train: the frequency is of the pulses within, and says nothing of the time to the next.
+    stimulus_s = interval_s * np.arange(40)
+    spikes = [(t + 0.005, 0) for t in stimulus_s]
+    frequency_hz = np.resize(frequencies, 40).astype(float)
+    assert said(of_spikes(spikes, stimulus_s, 4, interval_s * 41, frequency_hz=frequency_hz)) is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(frequencies=st.lists(st.floats(1, 100), min_size=2, max_size=6), pulses=st.sampled_from([35, 50, 100, 300]))
+def test_trains_back_to_back_a_row_each_are_never_refused(frequencies: list[float], pulses: int) -> None:
+    # The next train begins where the last one ends: intervals of pulses / f.
+    frequency_hz = np.resize(frequencies, 60)
+    stimulus_s = 1 + np.cumsum([0.0, *(pulses / frequency_hz[:-1])])
+    spikes = [(t + 0.005, 0) for t in stimulus_s]
+    source = of_spikes(spikes, stimulus_s, 4, stimulus_s[-1] + 60, frequency_hz=frequency_hz)
+    assert {f.severity for f in noticed(source) if f.name == "times-not-in-seconds"} <= {"warning"}
+
+
+def test_trains_back_to_back_are_asked_about() -> None:
+    frequency_hz = np.resize([5.0, 10.0, 20.0, 40.0], 60)
+    stimulus_s = 1 + np.cumsum([0.0, *(100 / frequency_hz[:-1])])
+    source = of_spikes([(1.005, 0)], stimulus_s, 4, stimulus_s[-1] + 60, frequency_hz=frequency_hz)
+    assert "factor of 100: are they in another unit, or is each a train of pulses?" in str(said(source))
+
+
+def test_frequencies_that_are_nearly_alike_say_nothing_of_a_steady_interval() -> None:
+    stimulus_s = 10.0 * np.arange(1, 61)
+    frequency_hz = np.resize([10.0, 10.2, 10.4], 60)
+    assert said(of_spikes([(10.005, 0)], stimulus_s, 4, 620.0, frequency_hz=frequency_hz)) is None
+
+
+def test_a_quiet_culture_that_answers_is_in_seconds_however_long_it_is_recorded() -> None:
+    # 40 channels, 12 h, a stimulus a minute that a third of the channels answer with two spikes.
+    rng = np.random.default_rng(0)
+    stimulus_s = 60.0 * np.arange(1, 720)
+    answers = [(t + rng.uniform(0.003, 0.02), c) for t in stimulus_s for c in rng.choice(40, 13) for _ in range(2)]
+    assert said(of_spikes(answers, stimulus_s, 40, 12 * 3600.0)) is None
+
+
+def test_channels_that_fire_faster_than_neurons_can() -> None:
+    rng = np.random.default_rng(0)
+    spikes = [(t, c) for c in range(3) for t in rng.uniform(0, 2, 1000)]
+    assert "the median channel fires at 500 Hz" in str(said(of_spikes(spikes, [1.0], 3, 2.0)))
+
+
+def test_training_on_milliseconds_is_refused_unless_allowed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    in_unit(make_up_recording(1, patterns=20, channels=32), 1e3).save(tmp_path / "a.nwb")
+    train = ["train", "cartpole", "--recordings", str(tmp_path / "a.nwb"), "--policies", "1", "--iterations", "64"]
+    train += ["--out", str(tmp_path / "policies")]
+    assert main(train) == 1
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line and "milliseconds; divide them by 1,000" in line and "--allow times-not-in-seconds" in line
+    assert not (tmp_path / "policies").exists()
+    allowed = ["times-not-in-seconds", "dead-window", "empty-condition"]
+    assert len(extract_series([read_recording(tmp_path / "a.nwb")], allow=allowed)) == 1
+
+
+def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
+    source = answering({5.0: 3.0, 80.0: 6.0})
+    assert not {"more-stimuli-than-spikes", "simultaneous-stimuli"} & {f.name for f in noticed(source)}
+    few, many = source.stimuli.time_s[:20], np.linspace(0.1, source.duration_s, 200)
+    swapped = of_spikes([(t, 0) for t in few], many, 1, source.duration_s)
+    names = {f.name: f for f in noticed(swapped)}
+    assert names["more-stimuli-than-spikes"].severity == "refuse"
+    assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].sentence
+    # One unit, of which 70 % of the stimuli have one spike.
+    sparse = of_spikes([(t + 0.005, 0) for t in many[:140]], many, 1, source.duration_s + 1)
+    assert {f.severity for f in noticed(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
+    twice = np.repeat(source.stimuli.time_s, 2)
+    spikes = list(zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True))
+    names = {f.name: f for f in noticed(of_spikes(spikes, twice, 40, source.duration_s))}
+    assert names["simultaneous-stimuli"].sentence.startswith("120 of 240 stimuli")
+    assert names["simultaneous-stimuli"].severity == "refuse"
+    # Rows that belong to one presentation are read once.
+    one = of_spikes(spikes, twice, 40, source.duration_s, presentation=np.repeat(np.arange(120), 2).tolist())
+    assert "simultaneous-stimuli" not in {f.name for f in noticed(one)}

@@ -1,0 +1,53 @@
+"""Whether policies outperform controls: the rank test counted by hand, and what is said of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+from animat.evaluation.verdict import Beside, Verdict, beside
+
+returns = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=12)
+
+
+@given(ours=returns, theirs=returns)
+def test_pairs_and_p_are_as_counted_by_hand(ours: list[float], theirs: list[float]) -> None:
+    found = beside(ours, theirs)
+    pairs = [(a > b) + (a == b) / 2 for a in ours for b in theirs]
+    assert found.wins == pytest.approx(np.mean(pairs))
+    # The normal approximation with continuity correction and tied ranks, from its textbook formula.
+    n, m, every = len(ours), len(theirs), ours + theirs
+    ties = sum(t**3 - t for t in (every.count(x) for x in set(every)))
+    total = n + m
+    variance = n * m / 12 * ((total + 1) - ties / (total * (total - 1))) if total > 1 else 0.0
+    z = (abs(sum(pairs) - n * m / 2) - 0.5) / np.sqrt(variance) if variance > 0 else 0.0
+    assert found.p == pytest.approx(min(1.0, 2 * norm.sf(z)), abs=1e-12)
+
+
+def test_it_says_which_controls_are_not_outperformed() -> None:
+    rng = np.random.default_rng(0)
+    policies = rng.normal(0, 1, (4, 25))
+    verdict = Verdict.of(policies, {"worse": policies - 9, "like": rng.normal(0, 1, 50), "better": policies + 9})
+    assert verdict.not_outperformed == ("like", "better")
+    said = str(verdict)
+    assert said.startswith("the policies do not outperform like (p = ")
+    # Significantly worse than a control is not better than it.
+    assert "better (p = " in said and "larger in 0 % of the pairs" in said
+    every = str(Verdict.of(policies, {"worse": policies - 9}))
+    assert every.startswith("the policies outperform every control (p < 0.01; ")
+    assert every.endswith("larger in 100 % of the pairs of episodes or more)")
+
+
+def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
+    # Of four and four even the clearest difference has p = 0.03; of six and six it has 0.005.
+    four, six = Verdict.of([9.0] * 4, {"a": [0.0] * 4}), Verdict.of(np.arange(6) + 9.0, {"a": np.arange(6.0)})
+    assert "4 episodes of the policies beside 4 of a control are too few to tell" in str(four)
+    assert str(six).startswith("the policies outperform every control (p < 0.01; ")
+    # What is known of one control is said, though another was broken off.
+    both = Verdict.of(np.arange(20.0), {"broken off": [0.0], "better": np.arange(20) + 90.0})
+    assert str(both).startswith("the policies do not outperform better (p = ")
+    assert str(both).endswith("too few to tell (p < 0.01) whether the policies outperform broken off")
+    assert not Beside(0.03, 1.0, 4, 4).can_tell
