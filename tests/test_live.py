@@ -36,6 +36,7 @@ from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recordings
+from animat.recordings.stimulus import PUBLISHED_PULSE
 from animat.robots import Navigation
 from animat.training.policy import load_policies
 from animat.training.sac import SAC
@@ -176,6 +177,34 @@ def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path)
             culture.stop()
             record_within(account, culture, blocked, 1)
         assert account.pulses == 3 * 80
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_what_others_deliver_meanwhile_is_not_spent(fails: bool) -> None:
+    """The culture counts all deliveries of a session, an account only those of its own recordings."""
+    account = Account(Budget())
+    blocked = Protocol(pulses=2, patterns=8, presentations=40, setup_s=0.1)
+
+    class Other:
+        """Stimulates after each block, as another thread would."""
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            culture.rest(1.0)
+            for _ in range(7):
+                culture.stimulate(culture.stimulation_electrodes[:1], PUBLISHED_PULSE)
+                culture.rest(1.0)
+            if fails and done == 2:
+                culture.stop()
+
+    with FakeCulture() as culture:
+        if fails:
+            with pytest.raises(UnsafeStimulus):
+                record_within(account, culture, blocked, 1, Other())
+        else:
+            record_within(account, culture, blocked, 1, Other())
+        blocks = 2 if fails else 5
+        assert account.pulses == blocks * 80
+        assert culture.delivered == blocks * (80 + 7)
 
 
 def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path) -> None:

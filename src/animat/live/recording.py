@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.progress import Progress
+from animat.errors import AnimatError
+from animat.progress import Progress, Silent
 from animat.recordings.protocol import Protocol
 from animat.recordings.recording import Recording
 
@@ -14,17 +15,32 @@ def record_within(
 ) -> Recording:
     """Record by a protocol if the budget holds all of it.
 
-    Of a recording that fails half way, what was handed to the culture until then is spent.
+    Of a recording that fails half way, what it handed to the culture until then is spent, and nothing that others did.
 
     Raises:
         BudgetSpent: if it does not; nothing is delivered then.
         UnsafeStimulus, InvalidArgument: as `Culture.record` does.
     """
     schedule = culture.schedule(protocol, seed)
-    stimuli = [stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)]
-    account.check(stimuli)
-    before = culture.delivered
+    by_block = [schedule.deliveries(block) for block in schedule.blocks]
+    account.check([stimulus for stimuli in by_block for stimulus in stimuli])
+    blocks = _Blocks(progress or Silent())
     try:
-        return culture.record(protocol, seed, progress)
+        return culture.record(protocol, seed, blocks)
+    except BaseException as error:
+        # Of the block under way only an error of the culture tells that it was refused.
+        blocks.handed_over += not isinstance(error, AnimatError) or error.is_admitted
+        raise
     finally:
-        account.spend(stimuli[: culture.delivered - before])
+        account.spend([stimulus for stimuli in by_block[: blocks.handed_over] for stimulus in stimuli])
+
+
+class _Blocks:
+    """Counts the blocks of this recording alone: the culture's own count has those of every thread."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress, self.handed_over = progress, 0
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        self.handed_over = int(done)
+        self._progress.update(done, total, note)
