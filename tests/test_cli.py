@@ -106,7 +106,7 @@ def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
         return with_intervals(*of, resolution=0.25, resamples=3, seed=seed)
 
     monkeypatch.setattr("animat.evaluation.table.best_return", rough)
-    monkeypatch.setattr("animat.evaluation.table.with_intervals", narrow)
+    monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0", "--episodes", "10"]
     assert main([*command, "--limit", "--json"]) == 0
     said = capsys.readouterr().out

@@ -287,7 +287,7 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
 
 def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rows act on these conditions too; the limit is at the thresholds of all responses, as the rows are."""
-    monkeypatch.setattr("animat.evaluation.table.with_intervals", lambda optima, *_, **__: tuple(optima))
+    monkeypatch.setattr("animat.evaluation.resampling.with_intervals", lambda optima, *_, **__: tuple(optima))
     monkeypatch.setattr("animat.evaluation.table.best_return", partial(best_return, episodes=0))
     responses = answers([60, 60, 60, 60, 3], 2)
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))

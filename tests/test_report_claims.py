@@ -23,7 +23,7 @@ from animat.studies.paper import paper_study
 from animat.studies.places import limits_file, table_file, write_table
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper
-from animat.studies.shown import comparisons_shown, controllability_shown, limits_shown
+from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.specification import Body, Simulators, Source, Study, StudyCondition
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
@@ -71,19 +71,6 @@ def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
 
 def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
-
-
-def test_limits_of_conditions_with_few_responses_are_not_taken_for_promises() -> None:
-    limit = {
-        "robot": "cartpole", "mapping": "1-threshold", "percentiles": "moving", "at_min": 0.0, "best_return": 18.9,
-        "grid_error": 0.1, "monte_carlo": 18.5, "standard_error": 0.5, "without_clock": 18.0,
-        "without_clock_standard_error": 0.5, "nodes": "1 x 2",
-    }  # fmt: skip
-    few = {"severity": "warning", "name": "few-samples", "sentence": "at 0 min: 3 responses to 5 Hz"}
-    other = {"severity": "note", "name": "drift", "sentence": "responses fall"}
-    assert "promise too much" not in limits_shown([limit], [other]).note
-    assert limits_shown([limit], [other, few]).note.endswith("where responses are few: at 0 min: 3 responses to 5 Hz.")
-    assert limits_shown([limit], [few, few, few]).note.endswith("5 Hz (and 2 more like it).")
 
 
 # --- what a limit says ----------------------------------------------------------------------------------------------
@@ -216,7 +203,7 @@ def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
 
 LEARNED: dict[str, Any] = {
     "robot": "cartpole", "condition": "without shadowing", "mapping": "1-threshold", "at_min": 0.0, "mean_return": 96.0,
-    "random": -80.0, "limit_run": 105.0, "normalised_score": 0.88, "score_without_clock": 0.9,
+    "random": -80.0, "limit": 110.0, "limit_run": 105.0, "normalised_score": 0.88, "score_without_clock": 0.9,
 }  # fmt: skip
 
 
@@ -237,6 +224,9 @@ def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
     body = Body("cartpole")
     assert known_of(LEARNED | {"normalised_score": 0.98}, body) == "reached"
     assert known_of(LEARNED | {"normalised_score": None}, body).startswith("nothing to learn")
+    assert known_of(LEARNED | {"limit": None, "normalised_score": None}, body).startswith(
+        "no limit: conditions with few"
+    )
     assert known_of(LEARNED, body).endswith("short by 0.09, which neither the clock nor the grid explains")
     assert "short by the clock" in known_of(LEARNED | {"score_without_clock": 0.99}, body)
     assert "its controller was seen to get" in known_of(LEARNED | {"limit_run": 100.0}, body)
@@ -254,17 +244,19 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
     head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
     write_table(table_file(tmp_path, "controllability"), head, shares)
     limits = [
-        (m, "moving", at, value) for m, value in (("9-thresholds", 99.0), ("1-threshold", 42.0)) for at in (0.0, 10.0)
+        (m, "moving", at, value, None if at else "0 Hz (3)")
+        for m, value in (("9-thresholds", 99.0), ("1-threshold", 42.0))
+        for at in (0.0, 10.0)
     ]
-    write_table(
-        limits_file(tmp_path, "cartpole", "over-time"), ("mapping", "percentiles", "at_min", "best_return"), limits
-    )
+    head = ("mapping", "percentiles", "at_min", "best_return", "left_out")
+    write_table(limits_file(tmp_path, "cartpole", "over-time"), head, limits)
     table = controllability_shown(study, tmp_path)
     assert table.head[-3:] == ("difference, data", "difference, simulator", "limit, cartpole")
     assert table.marked == (1,)
     assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"
     # Over all conditions, also those that there is no column for.
     assert table.rows[1][-3:] == pytest.approx((0.77, 0.6, 42.0))
+    assert table.rows[0][-1] is None, "a limit of some conditions is none of all"
     assert len(table.head) == 1 + 12 + 3
     assert "1 more conditions are in the file" in table.note
 

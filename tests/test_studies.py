@@ -479,6 +479,15 @@ def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -
     assert {"random", "silent", "shuffled", "made by hand", "constant 80 Hz"} <= names
 
 
+def test_limits_have_intervals_where_conditions_are_evaluated_through_thresholds(finished: Path) -> None:
+    for row in rows(finished / "tables/limits.csv"):
+        assert row["left_out"] == ""
+        evaluated = row["mapping"] != "none" and (row["mapping"] == "1-threshold" or float(row["at_min"]) == 140)
+        assert bool(row["low_95"]) == bool(row["high_95"]) == evaluated
+        if evaluated:
+            assert float(row["low_95"]) <= float(row["best_return"]) <= float(row["high_95"])
+
+
 def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
     trained, before = (
         Policy.load(finished / f"policies/navigation/{slug}/p0.safetensors")

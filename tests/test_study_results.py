@@ -12,21 +12,25 @@ import pytest
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.statistics import holm
 from animat.mapping import Thresholds
 from animat.neurons.series import extract_series
+from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.reading import read_recordings
 from animat.robots import Navigation
 from animat.studies.draws import draw_seed
 from animat.studies.evaluating import HEAD, Evaluate
 from animat.studies.limits import HEAD as LIMIT_HEAD
+from animat.studies.limits import Limit
 from animat.studies.places import controls_file, episodes_file, limits_file, read_table, table_file, write_table
 from animat.studies.recording import Record
+from animat.studies.shown import limits_shown
 from animat.studies.simulating import Fit
 from animat.studies.specification import Body, Compared, Source, Study, StudyCondition
-from animat.studies.tabulating import Tabulate
+from animat.studies.tabulating import References, Tabulate
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
 
@@ -68,7 +72,7 @@ def compared_returns(folder: Path, *comparisons: Compared) -> list[dict[str, Any
         random = [("random", 0.0, "", 0, -80.0, 10, 1)]
         write_table(controls_file(folder, body, LIKE), ("control", *HEAD), random)
         limit = {"mapping": "none", "percentiles": "moving", "at_min": 0.0, "best_return": 20.0, "grid_error": 0.1}
-        limit |= {"monte_carlo": 20.0, "standard_error": 0.1, "without_clock": 20.0}
+        limit |= {"monte_carlo": 20.0, "standard_error": 0.1, "without_clock": 20.0, "left_out": None}
         write_table(limits_file(folder, body.name), LIMIT_HEAD, [[limit.get(name, 0.0) for name in LIMIT_HEAD]])
     Tabulate().run(study, folder, told)
     return read_table(table_file(folder, "comparisons"))
@@ -136,6 +140,81 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
         # So that the test can fail.
         assert not np.allclose(returns, expected["other", at_min])
         assert not np.allclose(returns, expected["turned", at_min])
+
+
+# --- the best possible returns --------------------------------------------------------------------------------------
+
+FEW = Study(
+    culture=Source(kind="made-up", sessions=2, interval_min=140, presentations=40, channels=32),
+    robots=(Body("navigation", parameters={"episode_limit": 60}),),
+    conditions=(StudyCondition("1 threshold", trained=False), StudyCondition("without neurons", mapping="none")),
+    comparisons=(Compared("c", "without neurons", "1 threshold", at_min=0.0, episodes=2),),
+    limit_resolution=0.25,
+    limit_episodes=20,
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("few")
+    Record(folder).run(FEW, folder, told)
+    Fit().run(FEW, folder, told)
+    return folder
+
+
+def limits_of(folder: Path, name: str = "limits") -> list[dict[str, Any]]:
+    (file,) = Limit(FEW.robots[0], over_time=name == "over-time").run(FEW, folder, told)
+    assert file == limits_file(folder, "navigation", name)
+    return read_table(file)
+
+
+def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    series = extract_series(read_recordings(recorded / "recordings"))
+    n = [[len(responses.rates_of(i)) for i in range(5)] for responses in series]
+    # As many as the fewest at 0 min has, and one more: at 140 min all have as many.
+    enough = min(n[0]) + 1
+    assert min(n[1]) >= enough > min(n[0])
+    monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", enough)
+    few = [i for i in range(5) if n[0][i] < enough]
+    at_first, at_last, without = limits_of(recorded)
+    assert at_first["left_out"] == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
+    assert at_last["left_out"] is None is without["left_out"]
+    for row in (at_first, at_last):
+        assert row["low_95"] <= row["best_return"] <= row["high_95"]
+    assert without["low_95"] is without["high_95"] is None
+    # Of the others, at the thresholds of all.
+    kept = series[0].only([i for i in range(5) if i not in few])
+    simulator = replace(fit_histogram(kept), percentiles=fit_histogram(series[0]).percentiles)
+    environment = Animat(Navigation(episode_limit=60), Thresholds(1), 5 - len(few))
+    assert at_first["best_return"] == best_return(environment, simulator, resolution=0.25, episodes=0).value
+
+    for condition in FEW.conditions:
+        random = [("random", at_min, "", 0, -80.0, 10, 1) for at_min in (0.0, 140.0)]
+        write_table(controls_file(recorded, FEW.robots[0], condition), ("control", *HEAD), random)
+    known, condition = References(FEW, recorded, FEW.robots[0]), FEW.conditions[0]
+    assert known.limit(condition, 0.0) is None is known.score(condition, 0.0, 5.0)
+    assert known.limit(condition, 140.0) is not None is not known.score(condition, 140.0, 5.0)
+    rough = limits_of(recorded, "over-time")
+    assert [row["left_out"] for row in rough] == [at_first["left_out"], None]
+    assert {row["low_95"] for row in rough} == {None}
+    note = limits_shown([{"robot": "navigation", **row} for row in (at_first, at_last, without)])
+    assert "1 of 3 limits leave out conditions with fewer than 30 responses" in note.note
+    assert note.rows[0][-1] == at_first["left_out"]
+
+
+def test_where_no_condition_has_enough_responses_a_study_has_no_limit(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", 41)
+    at_first, at_last, without = limits_of(recorded)
+    for row in (at_first, at_last):
+        assert row["left_out"].count(" Hz (") == 5
+        assert {row[name] for name in LIMIT_HEAD[3:-1]} == {None}
+    assert without["best_return"] > 0
+    shown = limits_shown([{"robot": "navigation", **row} for row in (at_first, without)])
+    assert shown.rows[0][shown.head.index("limit ± grid")] is None and 0 not in shown.marked
 
 
 # --- a real recording -----------------------------------------------------------------------------------------------

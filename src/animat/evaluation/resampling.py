@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -14,15 +14,74 @@ from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.optimum import Optimum, rough_values
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.neurons.conditions import Condition
+from animat.neurons.kinds import fit_simulator
 from animat.neurons.quality import FEW_SAMPLES
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 
 RESAMPLES = 39
 """The fewest whose smallest and largest are their 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
-ROUGH = 0.5
-"""Steps along each axis of the grid that redrawn responses are solved on, as a part of the usual ones."""
+ROUGH, ROUGH_SMOOTH = 0.5, 0.2
+"""Steps along each axis of the grid that redrawn responses are solved on, as a part of the usual ones: the latter where
+a command acts smoothly and never decides whether an episode ends, where the quantiles are those of 0.5 within 0.1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """What counts for the best possible return at a recording: the conditions with enough responses, alone.
+
+    Attributes:
+        environment: that chooses from these conditions.
+        simulator: of these responses.
+        responses: to these conditions.
+        left_out: the other conditions, with the number of their responses.
+        fit: makes a simulator of redrawn responses.
+    """
+
+    environment: Animat[Any]
+    simulator: NeuronSimulator
+    responses: Responses
+    left_out: tuple[str, ...]
+    fit: Callable[[Responses], NeuronSimulator]
+
+    @classmethod
+    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_held: bool) -> Self:
+        """Of a recording of a timeline.
+
+        Args:
+            environment: with all of its conditions.
+            timeline: with its responses.
+            minute: of the recording.
+            are_held: whether the mapping's percentiles are those of the first recording.
+
+        Raises:
+            UnusableData: where no condition has enough.
+        """
+        responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
+        simulator = (timeline.with_first_percentiles() if are_held else timeline).at(minute)
+        # The mapping's thresholds are those of all responses, also where some of them are left out.
+        percentiles, kind = simulator.percentiles, timeline.fitted["kind"]
+        fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
+
+        def fit(these: Responses, kind: str) -> NeuronSimulator:
+            made = fit_simulator(these, kind=kind, **(fitted if kind == "histogram" else {}))
+            return replace(made, percentiles=percentiles) if are_held or left_out else made  # type: ignore[type-var]
+
+        if left_out:
+            environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)
+        # What is remembered changes the optimum, and little how well it is known: that is found without, in a sixth of
+        # the time.
+        spread = "histogram" if simulator.has_memory else kind
+        return cls(environment, simulator, responses, left_out, lambda these: fit(these, spread))
+
+    def known(self, optimum: Optimum, *, resolution: float, seed: int) -> Optimum:
+        """The optimum in this environment with its interval, and with what was left out."""
+        known = with_intervals(
+            [optimum], [self.environment], self.responses, self.fit, resolution=resolution, seed=seed
+        )
+        return replace(known[0], left_out=self.left_out)
 
 
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
@@ -34,14 +93,22 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     Raises:
         UnusableData: where no condition has as many.
     """
-    n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
-    few = too_few(responses.conditions, n)
+    n, few = _counts(responses), few_of(responses)
     if len(few) == len(n):
         raise UnusableData(
             f"expected {FEW_SAMPLES} non-burst responses or more to some condition, got {max(n, default=0)} at most: "
             "record more of them"
         )
     return responses.only([i for i, count in enumerate(n) if count >= FEW_SAMPLES]) if few else responses, few
+
+
+def few_of(responses: Responses) -> tuple[str, ...]:
+    """The conditions with fewer than 30 non-burst responses, each with their number."""
+    return too_few(responses.conditions, _counts(responses))
+
+
+def _counts(responses: Responses) -> list[int]:
+    return [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
 
 
 def too_few(conditions: Sequence[Condition], n: Sequence[int]) -> tuple[str, ...]:
@@ -86,7 +153,7 @@ def with_intervals(
         return tuple(optima)
     rng = np.random.default_rng(seed)
     simulators = [fit(each) for each in (responses, *(responses.redrawn(rng) for _ in range(resamples)))]
-    grid = _rough(grid_for(environments[0].robot), min(ROUGH, resolution))
+    grid = _rough(grid_for(environments[0].robot), resolution)
     rates_hz = [responses.rates_of(i) for i in range(len(responses.conditions))]
     differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE
     known = []
@@ -109,4 +176,5 @@ def _rough(grid: Grid, resolution: float) -> Grid:
     """Fewer steps, three commands in place of five, and no noise of the robot: what differs is the responses."""
     smooth = None if grid.smooth_commands is None else min(grid.smooth_commands, 3)
     noise = None if grid.noise_in_command is None else 0.0
+    resolution = min(ROUGH if smooth is None else ROUGH_SMOOTH, resolution)
     return replace(grid.scaled(resolution, periodic=True), smooth_commands=smooth, noise_in_command=noise)

@@ -15,12 +15,10 @@ from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import with_enough_samples, with_intervals
+from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import normalised_score
 from animat.evaluation.verdict import Verdict
-from animat.neurons.kinds import fit_simulator
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
@@ -304,26 +302,9 @@ def _limit(
         return best_return(environment, simulator, resolution=resolution, seed=seed)
     if not timeline.responses:
         return best_return(environment, simulator, resolution=resolution, seed=seed)
-    responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
-    # The mapping's thresholds are those of all responses, also where some of them are left out.
-    percentiles = simulator.percentiles
-    fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
-
-    def fit(responses: Responses, kind: str) -> NeuronSimulator:
-        made = fit_simulator(responses, kind=kind, **(fitted if kind == "histogram" else {}))
-        return replace(made, percentiles=percentiles) if are_held or left_out else made  # type: ignore[type-var]
-
-    kind = timeline.fitted["kind"]
-    if left_out:
-        environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)
-    best = best_return(environment, simulator, resolution=resolution, seed=seed)
-    # What is remembered changes the optimum, and little how well it is known: that is found without, in a sixth of the
-    # time.
-    spread = "histogram" if simulator.has_memory else kind
-    redrawn = with_intervals(
-        [best], [environment], responses, lambda these: fit(these, spread), resolution=resolution, seed=seed
-    )
-    return replace(redrawn[0], left_out=left_out)
+    case = Counted.of(environment, timeline, minute, are_held=are_held)
+    best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed)
+    return case.known(best, resolution=resolution, seed=seed)
 
 
 def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:

@@ -75,6 +75,8 @@ def as_good_as_the_limit_allows(study: Study, rows: list[dict[str, Any]]) -> Tab
 def known_of(row: dict[str, Any], body: Body) -> str:
     """What is known of a score: that it is reached, or what stands between it and the limit."""
     score, without_clock = row["normalised_score"], row["score_without_clock"]
+    if row["limit"] is None:
+        return "no limit: conditions with few responses are left out of it"
     if score is None:
         return "nothing to learn: the limit is not above random actions"
     if score >= AIM:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
+from animat.animat import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
+from animat.evaluation.resampling import Counted, few_of
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
 from animat.studies.jobs import Report, Task
-from animat.studies.places import limits_file, write_table
+from animat.studies.places import limits_file, read_table, write_table
+from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
 
 HEAD = (
@@ -17,15 +20,20 @@ HEAD = (
     "percentiles",
     "at_min",
     "best_return",
+    "low_95",
+    "high_95",
     "grid_error",
     "monte_carlo",
     "standard_error",
     "without_clock",
     "without_clock_standard_error",
     "nodes",
+    "left_out",
 )
 ROUGH = 0.5
 """Steps of the grid along each axis where every recording has its limit, as a part of those elsewhere."""
+COARSER = 0.8
+"""Steps of the grid of redrawn responses along each axis, at most, as a part of the limit's."""
 
 
 def kinds_of(study: Study) -> list[StudyCondition]:
@@ -42,14 +50,19 @@ def rough_kinds(study: Study) -> list[StudyCondition]:
     return [kind for kind in kinds_of(study) if kind.through_neurons and kind.mapping != "linear"]
 
 
+def limits_of_all(folder: Path, robot: str, what: str = "limits") -> list[dict[str, Any]]:
+    """The limits of all conditions; what policies could do with fewer is none of theirs."""
+    return [row for row in read_table(limits_file(folder, robot, what)) if row["left_out"] is None]
+
+
 @final
 @dataclass(frozen=True)
 class Limit(Task):
-    """The best possible return on a robot for every mapping of the study.
+    """The best possible return on a robot for every mapping of the study, of conditions with enough responses.
 
     Attributes:
-        over_time: at every recording, on a rough grid and without running the controller; if not, at the minutes that
-            anything is evaluated at.
+        over_time: at every recording, on a rough grid, without the controller's return and without an interval; if not,
+            at the minutes that anything is evaluated at.
     """
 
     grows_with = ("limit_resolution", "limit_episodes")
@@ -66,16 +79,29 @@ class Limit(Task):
             kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
             resolution, episodes = min(ROUGH, resolution), 0
         asked = [(kind, at) for kind in kinds for at in (minutes if kind.through_neurons else [last])]
-        cases: list[Case] = []
-        for kind, at in asked:
-            setting = setting_of(study, self.body, kind, timeline)
-            cases.append((setting.environment, setting.simulator(at)))
+        cases: dict[int, Case] = {}
+        counted: dict[int, Counted] = {}
+        left_out: dict[int, tuple[str, ...]] = {}
+        if timeline is not None:
+            series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
+            timeline = replace(timeline, responses=tuple(series))
+        for i, (kind, at) in enumerate(asked):
+            environment = setting_of(study, self.body, kind, timeline).environment
+            if timeline is None or not isinstance(environment, Animat):
+                cases[i] = environment, None
+                continue
+            responses = timeline.responses[timeline.row_at(at)]
+            left_out[i] = few_of(responses)
+            if len(left_out[i]) < len(responses.conditions):
+                of = Counted.of(environment, timeline, at, are_held=kind.percentiles == "first")
+                counted[i], cases[i] = of, (of.environment, of.simulator)
         # Cases side by side all have as many actions as the one with the most, and as many commands as all together: a
         # continuous one has many, and over time there are many cases.
         alike: dict[object, list[int]] = {}
-        for i, (environment, _) in enumerate(cases):
+        for i, (environment, _) in cases.items():
             alike.setdefault(asked[i][0] if self.over_time else environment.n_actions is None, []).append(i)
-        told = _Told(report, len(cases))
+        known = {} if self.over_time else {i: counted[i] for i in counted if asked[i] in _compared(study, first, last)}
+        told = _Told(report, len(cases) + len(known))
         found: dict[int, Optimum] = {}
         for same in alike.values():
             best = best_returns(
@@ -83,14 +109,38 @@ class Limit(Task):
             )
             found |= dict(zip(same, best, strict=True))
             told.before += len(same)
-        rows = []
-        for i, (kind, at) in enumerate(asked):
-            best_of = found[i].to_dict()
-            best_of["best_return"] = best_of["value"]
-            rows.append((kind.mapping, kind.percentiles, at, *(best_of[name] for name in HEAD[3:])))
+        for i, of in known.items():
+            found[i] = of.known(found[i], resolution=COARSER * resolution, seed=study.seed)
+            told.update(1, len(known), "how well it is known")
+            told.before += 1
+        rows = [
+            (kind.mapping, kind.percentiles, at, *_cells(found.get(i)), "; ".join(left_out.get(i, ())) or None)
+            for i, (kind, at) in enumerate(asked)
+        ]
         return [
             write_table(limits_file(folder, self.body.name, "over-time" if self.over_time else "limits"), HEAD, rows)
         ]
+
+
+def _compared(study: Study, first: float, last: float) -> list[tuple[StudyCondition, float]]:
+    """Threshold mappings at the minutes that conditions of theirs are evaluated at: whose limits have an interval."""
+    return [
+        (kind, at)
+        for kind in rough_kinds(study)
+        for condition in study.conditions
+        if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles)
+        for at in study.minutes_of(condition, first, last)
+    ]
+
+
+def _cells(optimum: Optimum | None) -> tuple[float | int | None, ...]:
+    """Of the head, from the best return to the nodes; nothing where no condition has enough responses."""
+    if optimum is None:
+        return (None,) * len(HEAD[3:-1])
+    told, interval = optimum.to_dict(), optimum.interval
+    told["best_return"] = told["value"]
+    told["low_95"], told["high_95"] = (None, None) if interval is None else (interval.low, interval.high)
+    return tuple(told[name] for name in HEAD[3:-1])
 
 
 class _Told:

@@ -38,12 +38,11 @@ from animat.studies.figure_tables import (
     write_psth,
 )
 from animat.studies.jobs import Report, Task
-from animat.studies.limits import kinds_of
+from animat.studies.limits import kinds_of, limits_of_all
 from animat.studies.places import (
     RECORDINGS,
     controls_file,
     episodes_file,
-    limits_file,
     read_table,
     table_file,
 )
@@ -195,7 +194,7 @@ def _over_time(study: Study, folder: Path, body: Body) -> dict[tuple[str, str, f
         return {}
     limits = {
         (row["mapping"], row["percentiles"], row["at_min"]): row["best_return"]
-        for row in read_table(limits_file(folder, body.name, "over-time"))
+        for row in limits_of_all(folder, body.name, "over-time")
     }
     found: dict[tuple[str, str, float], tuple[float, float | None]] = {}
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):

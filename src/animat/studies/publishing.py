@@ -114,7 +114,7 @@ def _scores(study: Study, folder: Path) -> Section:
     learned = learned_of(study, rows)
     tables = [
         scores_shown(rows),
-        limits_shown(read_table(table_file(folder, "limits")), read_table(table_file(folder, "findings"))),
+        limits_shown(read_table(table_file(folder, "limits"))),
     ]
     paragraphs = [
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."

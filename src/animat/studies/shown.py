@@ -9,10 +9,11 @@ from typing import Any, TypeAlias
 
 from animat.evaluation.optimum import bracket_findings
 from animat.neurons.fidelity import LARGEST_LOSS
+from animat.neurons.quality import FEW_SAMPLES
 from animat.report.html import Table, cell, with_error
 from animat.studies.heuristic import NOT
-from animat.studies.limits import rough_kinds
-from animat.studies.places import limits_file, read_table, table_file
+from animat.studies.limits import limits_of_all, rough_kinds
+from animat.studies.places import read_table, table_file
 from animat.studies.specification import Study
 from animat.studies.tabulating import FIRST, LEVEL, SECOND, named_mapping
 
@@ -107,30 +108,35 @@ def scores_shown(rows: list[dict[str, Any]]) -> Table:
     )
 
 
-def limits_shown(limits: list[dict[str, Any]], findings: list[dict[str, Any]]) -> Table:
-    """The best possible returns as brackets; where conditions have few responses, that is said."""
-    few = [row["sentence"] for row in findings if row["name"] == "few-samples"]
-    promised = f" These limits promise too much where responses are few: {few[0]}" if few else ""
-    promised += f" (and {len(few) - 1} more like it)." if len(few) > 1 else "." if few else ""
+def limits_shown(limits: list[dict[str, Any]]) -> Table:
+    """The best possible returns as brackets, with their intervals; what was left out of them is said."""
+    columns: Columns = [
+        ("robot", "robot"),
+        ("mapping", lambda row: named_mapping(row["mapping"], row["percentiles"])),
+        ("at (min)", "at_min"),
+        ("limit ± grid", _pair("best_return", "grid_error")),
+        ("95 % interval", lambda row: None if row["low_95"] is None else _ends(row["low_95"], row["high_95"])),
+        ("its controller, run", _pair("monte_carlo", "standard_error")),
+        ("without clock", _pair("without_clock", "without_clock_standard_error")),
+        ("nodes", "nodes"),
+    ]
+    without = [row for row in limits if row["left_out"] is not None]
+    left_out = ""
+    if without:
+        columns.append(("left out (responses)", "left_out"))
+        left_out = (
+            f" {len(without)} of {len(limits)} limits leave out conditions with fewer than {FEW_SAMPLES} responses, "
+            "which would promise too much: no score is against these, as policies act on all conditions."
+        )
     return Table(
         "Best possible returns",
-        *_columns(
-            limits,
-            [
-                ("robot", "robot"),
-                ("mapping", lambda row: named_mapping(row["mapping"], row["percentiles"])),
-                ("at (min)", "at_min"),
-                ("limit ± grid", _pair("best_return", "grid_error")),
-                ("its controller, run", _pair("monte_carlo", "standard_error")),
-                ("without clock", _pair("without_clock", "without_clock_standard_error")),
-                ("nodes", "nodes"),
-            ],
-        ),
-        note="± grid: how far the value moved from a grid with 3/4 of the steps. Run: the mean return of the "
-        "controller that takes the best actions, on the robot itself, ± its standard error: a return that can be "
+        *_columns(limits, columns),
+        note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses tell "
+        "the value, redrawn 39 times; for threshold mappings, where a condition is evaluated. Run: the mean return of "
+        "the controller that takes the best actions, on the robot itself, ± its standard error: a return that can be "
         "had. The best possible return lies between the two; scores keep to the value, the upper end. Highlighted: "
         "they part by more than 3 standard errors and the grid's error. Without clock: the same controller if it "
-        "does not know the time left, as policies do not. On a rough grid at every recording: limits/." + promised,
+        "does not know the time left, as policies do not. On a rough grid at every recording: limits/." + left_out,
         beside="tables/limits.csv",
         marked=tuple(i for i, row in enumerate(limits) if _parted(row)),
     )
@@ -147,7 +153,7 @@ def controllability_shown(study: Study, folder: Path) -> Table:
     limits = {
         body.name: {
             row["at_min"]: row["best_return"]
-            for row in read_table(limits_file(folder, body.name, "over-time"))
+            for row in limits_of_all(folder, body.name, "over-time")
             if (row["mapping"], row["percentiles"]) == (kinds[0].mapping, kinds[0].percentiles)
         }
         for body in study.robots
@@ -253,7 +259,11 @@ def _pair(value: str, error: str) -> Callable[[dict[str, Any]], str | None]:
 
 
 def _interval(value: str, low: str, high: str) -> Callable[[dict[str, Any]], str]:
-    return lambda row: f"{cell(row[value])} [{cell(row[low])}, {cell(row[high])}]".replace(" ", "\u00a0")
+    return lambda row: f"{cell(row[value])}\u00a0{_ends(row[low], row[high])}"
+
+
+def _ends(low: float, high: float) -> str:
+    return f"[{cell(low)}, {cell(high)}]".replace(" ", "\u00a0")
 
 
 def _printed(row: dict[str, Any]) -> str | None:
@@ -267,4 +277,6 @@ def _outcome(row: dict[str, Any]) -> str:
 
 
 def _parted(row: dict[str, Any]) -> bool:
+    if row["best_return"] is None:
+        return False
     return bool(bracket_findings(row["best_return"], row["grid_error"], row["monte_carlo"], row["standard_error"]))

@@ -17,7 +17,8 @@ from animat.evaluation.statistics import Comparison, compare, holm, interquartil
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.heuristic import HEAD, rows_beside_heuristic
 from animat.studies.jobs import Report, Task
-from animat.studies.limits import kinds_of
+from animat.studies.limits import HEAD as LIMITS
+from animat.studies.limits import kinds_of, limits_of_all
 from animat.studies.paper import PRINTED
 from animat.studies.places import (
     controls_file,
@@ -127,8 +128,7 @@ class Tabulate(Task):
         table("heuristic", HEAD, [row for body in study.robots for row in rows_beside_heuristic(study, folder, body)])
         table("learning-curves", CURVES, _curves(study, folder))
         limits = [(body.name, row) for body in study.robots for row in read_table(limits_file(folder, body.name))]
-        if limits:
-            table("limits", ("robot", *limits[0][1]), ((robot, *row.values()) for robot, row in limits))
+        table("limits", ("robot", *LIMITS), ((robot, *row.values()) for robot, row in limits))
         if timeline is not None:
             rows = (
                 (at_min, label, in_data, in_simulator)
@@ -140,6 +140,8 @@ class Tabulate(Task):
             table("controllability", ("at_min", "condition", "above_median_in_data", "above_median_in_simulator"), rows)
         noticed = [] if timeline is None else list(timeline.findings)
         for robot, row in limits:
+            if row["best_return"] is None:
+                continue
             of = (row[name] for name in ("best_return", "grid_error", "monte_carlo", "standard_error"))
             where = f"{robot}, {named_mapping(row['mapping'], row['percentiles'])}, at {row['at_min']:g} min"
             noticed += [replace(told, sentence=f"{where}: {told.sentence}") for told in bracket_findings(*of)]
@@ -152,8 +154,7 @@ class References:
 
     def __init__(self, study: Study, folder: Path, body: Body) -> None:
         self._limits: dict[tuple[str, str, float], dict[str, Any]] = {
-            (row["mapping"], row["percentiles"], row["at_min"]): row
-            for row in read_table(limits_file(folder, body.name))
+            (row["mapping"], row["percentiles"], row["at_min"]): row for row in limits_of_all(folder, body.name)
         }
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
@@ -169,7 +170,10 @@ class References:
         return self._of(self._random, condition, at_min)  # type: ignore[no-any-return]
 
     def limit(self, condition: StudyCondition, at_min: float) -> dict[str, Any] | None:
-        """The best possible return and how well it is known; None for a control, which can do nothing."""
+        """The best possible return and how well it is known.
+
+        None for a control, which can do nothing, and where conditions with few responses were left out of it.
+        """
         if condition.delivery == "shuffled":
             return None
         return self._of(self._limits, condition, at_min)  # type: ignore[no-any-return]
