@@ -71,6 +71,31 @@ def test_what_training_reports_is_what_the_deployed_policies_get(
     assert f"1 policy in {tmp_path}; mean return on the simulator at 10 min: {reported['returns']['p0']:.1f}" in printed  # type: ignore[index]
 
 
+def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_finished_one_is_told(
+    recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = ["train", "cartpole", "--recordings", str(recordings), *QUICK, "--out", str(policies)]
+    files = {file: file.read_bytes() for file in policies.iterdir()}
+    assert main(again) == 0
+    printed = capsys.readouterr().out
+    assert f"this training was finished before: its policies are in {policies}" in printed
+    assert f"2 policies in {policies}; mean return" in printed
+    assert {file: file.read_bytes() for file in policies.iterdir()} == files
+
+    def never(*_: object) -> None:
+        raise AssertionError("the recordings were read")
+
+    monkeypatch.setattr("animat.cli_train.Train.timeline", never)
+    for option, difference in (
+        (["--seed", "9"], "training.seed: 1 there, 9 now"),
+        (["--shadowing", "off"], "training.shadowing: True there, False now"),
+        (["--mapping", "1-threshold"], "training.mapping: '9-thresholds' there, '1-threshold' now"),
+    ):
+        assert main([*again, *option]) == 1
+        assert f"got one of another ({difference})" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in policies.iterdir()} == files
+
+
 def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
     record = ["record", "--culture", "made-up", "--sessions", "2", "--out", str(series)]

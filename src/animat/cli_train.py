@@ -81,6 +81,9 @@ class Train(Fitting):
             delivery=self.delivery,
             commands=(-1.0, 1.0) if mapping == "none" and self.robot == "cartpole" else None,
         )
+        from animat.training.trainer import expect_folder_for, is_finished, train
+
+        expect_folder_for(training, self.out)
         for caveat in robot.caveats():
             print(f"warning: {caveat}", file=sys.stderr)
         fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
@@ -92,8 +95,7 @@ class Train(Fitting):
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
                 "(to go on in spite of it: --allow one-condition)"
             )
-        from animat.training.trainer import train
-
+        was_finished = is_finished(training, self.out)
         if timeline is not None:
             print(_control(timeline))
         with Bar("training") as progress:
@@ -105,6 +107,8 @@ class Train(Fitting):
                 progress=progress,
                 sources=[str(path) for path in self.recordings],
             )
+        if was_finished:
+            print(f"this training was finished before: its policies are in {self.out}, as they were")
         from animat.evaluation.table import evaluate
 
         first = next(iter(trained.values()))

@@ -149,6 +149,26 @@ def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
     }
 
 
+def expect_folder_for(training: Training, folder: Path) -> None:
+    """Refuse a folder of another training by its settings, which are known before any recording is read.
+
+    Raises:
+        Mismatch, InvalidFile: as `train` does.
+    """
+    if (found := _description_in(folder)) is not None:
+        as_long_as_recordings = training.duration_min is None and training.mapping is not None
+        unknown = ("simulators", "sources", "fingerprint", *(("duration_min",) if as_long_as_recordings else ()))
+        if difference := _first_difference(found, describe(training, None), unknown):
+            raise _of_another(folder, difference)
+
+
+def is_finished(training: Training, folder: Path) -> bool:
+    """Whether a training's folder has all of its policies."""
+    return (folder / MANIFEST).exists() and all(
+        (folder / f"p{i}.safetensors").exists() for i in range(training.policies)
+    )
+
+
 def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     """Whether the training is already in the folder; not if it is free for it.
 
@@ -156,28 +176,40 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
         Mismatch: if it is another training's, or holds policies that no description tells of.
         InvalidFile: if its description cannot be read, or it is a file.
     """
+    found = _description_in(folder)
+    if found is not None and found["fingerprint"] != manifest["fingerprint"]:
+        raise _of_another(folder, _first_difference(found, manifest, _NOT_TOLD) or "other responses")
+    return found is not None
+
+
+def _description_in(folder: Path) -> dict[str, Any] | None:
+    """What a folder says it holds; None if it is free."""
     path = folder / MANIFEST
     if path.exists():
         try:
-            found = json.loads(path.read_text())
-            fingerprint = found["fingerprint"]
+            found: dict[str, Any] = json.loads(path.read_text())
+            _ = found["fingerprint"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
-        if fingerprint != manifest["fingerprint"]:
-            # What follows from the robot, such as the usual iterations, is not what differs.
-            there, now = (each.get("training", {}).get("robot", {}).get("name") for each in (found, manifest))
-            difference = first_difference(there, now, "training.robot.name")
-            difference = difference or first_difference(found, manifest, ignoring=_NOT_TOLD) or "other responses"
-            raise Mismatch(
-                f"{folder}: expected a folder of this training, got one of another ({difference}); "
-                "give another folder, or remove this one"
-            )
-        return True
+        return found
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
-    return False
+    return None
+
+
+def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
+    # What follows from the robot, such as the usual iterations, is not what differs.
+    there, now = (each.get("training", {}).get("robot", {}).get("name") for each in (found, manifest))
+    return first_difference(there, now, "training.robot.name") or first_difference(found, manifest, ignoring=ignoring)
+
+
+def _of_another(folder: Path, difference: str) -> Mismatch:
+    return Mismatch(
+        f"{folder}: expected a folder of this training, got one of another ({difference}); "
+        "give another folder, or remove this one"
+    )
 
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
