@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern
+from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern, Condition
 from animat.neurons.inspection import inspect_recording
 from animat.neurons.psth import post_stimulus_histogram
-from animat.neurons.responses import extract_responses
+from animat.neurons.quality import _difference
+from animat.neurons.responses import Responses, extract_responses
 from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -154,6 +155,28 @@ def test_conditions_that_do_not_differ_are_said_to_give_no_control() -> None:
     other = answering({5: 10.0, 10: 30.0}, n=400, n_channels=60)
     assert "P(x >= P50) is 0.0" in sentence(other, "difference", burst_threshold=1)
     assert "one-condition" in names(extract_responses(same, All()))
+
+
+@pytest.mark.parametrize(("above", "name"), [(46, "no-difference"), (42, "little-difference"), (38, "difference")])
+def test_how_far_conditions_can_steer_is_said(above: int, name: str) -> None:
+    """`above` and 100 - `above` of 100 responses above the median of all: the choice moves the mean command by both."""
+    rates_hz = [20.0] * above + [10.0] * (100 - above) + [20.0] * (100 - above) + [10.0] * above
+    responses = Responses(
+        condition=np.repeat([0, 1], 100),
+        rate_hz=np.array(rates_hz),
+        active_ratio=np.zeros(200),
+        is_burst=np.zeros(200, bool),
+        conditions=(Condition("5 Hz", 5.0, "Hz"), Condition("10 Hz", 10.0, "Hz")),
+        window_ms=(2.0, 10.0),
+        n_channels=10,
+        threshold=1.0,
+        separability=0.5,
+    )
+    (found,) = _difference(responses)
+    assert (found.name, found.severity) == (name, "note" if name == "difference" else "warning")
+    assert f"0.{above} for 5 Hz, 0.{100 - above} for 10 Hz" in found.sentence
+    assert f"from {above / 50 - 1:+.2f} to {1 - above / 50:+.2f}" in found.sentence
+    assert ("a robot can hardly be steered" in found.sentence) == (name == "little-difference")
 
 
 def test_burst_separation_that_separates_nothing_is_said_so() -> None:

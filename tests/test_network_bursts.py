@@ -51,7 +51,7 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     assert figure.axes[0].get_xlim() == (0.0, 300.0)
     assert figure.axes[0].collections[0].get_offsets().shape[0] == len(source.spike_times_s)
     source.save(tmp_path / "a.nwb")
-    assert main(["inspect", str(tmp_path / "a.nwb"), "--out", str(tmp_path / "figures"), "--json"]) == 0
+    assert main(["inspect", str(tmp_path / "a.nwb"), "--out", str(tmp_path / "figures"), "--json"]) == 1
     told = capsys.readouterr().out
     assert "figures of the series" not in told
     assert '"network_bursts": {"bursts": 3' in told

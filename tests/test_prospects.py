@@ -70,7 +70,7 @@ def test_inspect_tells_the_limit(
 def test_where_there_is_no_limit_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make_up_recording(1, patterns=5, channels=16).save(tmp_path / "a.nwb")
     command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--limit", "navigation", "--json"]
-    assert main(command) == 0
+    assert main(command) == 1
     said = capsys.readouterr().out
     assert "navigation: no best possible return: " in said
     assert json.loads(said.splitlines()[-1])["recordings"][0]["limits"] is None

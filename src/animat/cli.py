@@ -113,8 +113,8 @@ def _run(given: list[str]) -> int:
         return 1
     if command.json:
         print(json.dumps(_as_json(results)))
-    # Of several files, some of which could not be read, as was said on the way.
-    return 1 if results.get("unreadable") else 0
+    # Of several files, some of which could not be read or used, as was said on the way.
+    return 1 if results.get("unreadable") or results.get("unusable") else 0
 
 
 def _parse(

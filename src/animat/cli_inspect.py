@@ -104,7 +104,8 @@ class Inspect(Responding):
                 print(f"figures: {', '.join(figures)}\n")
                 inspected[-1]["figures"] = figures
                 series.append((source.start_min, file, inspection.responses))
-        told: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable}
+        unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
+        told: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
         if self.out is not None and series:
             progress.update(total - 1, total, "figures of the series")
             first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)

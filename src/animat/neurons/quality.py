@@ -26,6 +26,8 @@ FEW_SAMPLES = 30
 MANY_BURSTS = 0.25
 SMALL_DIFFERENCE = 0.1
 """Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
+LITTLE_DIFFERENCE = 0.2
+"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200 (docs/evaluation)."""
 
 _WINDOW_PARTS = 8
 
@@ -314,6 +316,14 @@ def _difference(responses: Responses) -> Iterator[Finding]:
             "warning",
             f"the conditions hardly differ: P(x >= P50) is {listed}; {reach}, the rest is chance, so no policy can "
             "steer a robot much better than at random: stimulate in ways that differ more",
+            spread,
+        )
+    elif spread < LITTLE_DIFFERENCE:
+        yield Finding(
+            "little-difference",
+            "warning",
+            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
+            "a robot can hardly be steered: --limit cartpole tells how far; stimulate in ways that differ more",
             spread,
         )
     else:
