@@ -244,7 +244,7 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
 
 def test_contenders_take_turns_in_random_order() -> None:
     rng = np.random.default_rng(1)
-    turns = interleaved(4, 50, rng)
+    turns = interleaved([50] * 4, rng)
     rounds = np.array(turns).reshape(50, 4)
     assert all(set(row.tolist()) == {0, 1, 2, 3} for row in rounds)
     # Each stands in each place about as often as in any other: 12.5 times of 50, standard deviation 3.1.

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -166,6 +167,7 @@ class Run(Stimulating):
                 seed=self.seed,
                 account=account,
                 progress=progress,
+                tell=partial(print, file=sys.stderr),
                 noticed=noticed,
                 pulse=pulse,
                 patterns=patterns,
