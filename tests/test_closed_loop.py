@@ -251,6 +251,14 @@ def test_contenders_take_turns_in_random_order() -> None:
     assert all(4 <= np.sum(rounds[:, place] == who) <= 24 for place in range(4) for who in range(4))
 
 
+def test_contenders_with_fewer_episodes_are_spread_over_the_session() -> None:
+    turns = np.array(interleaved([40, 5], np.random.default_rng(2)))
+    assert np.bincount(turns).tolist() == [40, 5]
+    before = np.cumsum(turns == 0)[turns == 1]
+    # One in each fifth of the session, which eight episodes of the other are in.
+    assert all(8 * fifth <= n <= 8 * fifth + 8 for fifth, n in enumerate(before.tolist()))
+
+
 def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_condition(tmp_path: Path) -> None:
     contenders = [Contender("no", "", OneCondition(0), "silent"), Contender("any", "", OneCondition(4), "shuffled")]
     with FakeCulture() as culture:

@@ -159,7 +159,7 @@ def run_policies(
     if limit is not None and progress is not None:
         progress.update(0, 1, "best possible return")
     best = None if limit is None else limit()
-    of_each = _episodes(len(policies), len(contenders) - len(policies), episodes)
+    of_each = planned_episodes(len(policies), len(contenders) - len(policies), episodes)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent")
         for n, each in zip(of_each, contenders, strict=True)
@@ -193,8 +193,13 @@ def run_policies(
     )
 
 
-def _episodes(policies: int, controls: int, episodes: int) -> list[int]:
-    """Of each policy, then of each control."""
+def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
+    """Of each policy, then of each control.
+
+    Args:
+        policies, controls: how many there are.
+        episodes: of each policy, and at most of each control.
+    """
     of_a_control = max(FEWEST_OF_A_CONTROL, math.ceil(policies * episodes / controls))
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
