@@ -244,11 +244,19 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
 
 def test_contenders_take_turns_in_random_order() -> None:
     rng = np.random.default_rng(1)
-    turns = interleaved(4, 50, rng)
+    turns = interleaved([50] * 4, rng)
     rounds = np.array(turns).reshape(50, 4)
     assert all(set(row.tolist()) == {0, 1, 2, 3} for row in rounds)
     # Each stands in each place about as often as in any other: 12.5 times of 50, standard deviation 3.1.
     assert all(4 <= np.sum(rounds[:, place] == who) <= 24 for place in range(4) for who in range(4))
+
+
+def test_contenders_with_fewer_episodes_are_spread_over_the_session() -> None:
+    turns = np.array(interleaved([40, 5], np.random.default_rng(2)))
+    assert np.bincount(turns).tolist() == [40, 5]
+    before = np.cumsum(turns == 0)[turns == 1]
+    # One in each fifth of the session, which eight episodes of the other are in.
+    assert all(8 * fifth <= n <= 8 * fifth + 8 for fifth, n in enumerate(before.tolist()))
 
 
 def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_condition(tmp_path: Path) -> None:

@@ -91,11 +91,12 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
     policy = policy_of(timeline)
     simulator = timeline.at(0.0)
     environment = Animat(policy.robot, policy.mapping, 3)
-    many = roll_out(environment, simulator, networks_of([policy]), 1, episodes=2_000, seed=0).returns[0]
+    rolled = roll_out(environment, simulator, networks_of([policy]), 1, episodes=2_000, seed=0)
+    many = rolled.returns[0]
 
     step = jax.jit(environment.step)
     rng = np.random.default_rng(0)
-    returns = []
+    returns, presented, passed = [], np.zeros(3), np.zeros(3)
     for episode in range(100):
         state, total, key = environment.reset(jax.random.key(0)), 0.0, jax.random.key(1000 + episode)
         while True:
@@ -103,11 +104,18 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
             action = policy.act(np.asarray(environment.observe(state)), rng)
             outcome = step(use, state, jnp.int32(action), simulator)
             state, total = outcome.state, total + float(outcome.reward)
+            presented[int(outcome.delivered)] += 1
+            passed[int(outcome.delivered)] += float(outcome.rate_hz) >= float(simulator.percentiles[5])
             if outcome.terminated or outcome.truncated:
                 break
         returns.append(total)
     error = np.hypot(many.std() / np.sqrt(len(many)), np.std(returns, ddof=1) / np.sqrt(len(returns)))
     assert abs(many.mean() - np.mean(returns)) < 4 * error
+    assert rolled.presented.sum() == rolled.lengths.sum()
+    share, often = passed / presented, presented > 30
+    error_of_share = np.sqrt(share * (1 - share) / presented + 1e-4)
+    assert np.all(np.abs(rolled.passed[0] / rolled.presented[0] - share)[often] < 4 * error_of_share[often])
+    assert np.count_nonzero(often) >= 2
 
 
 def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -122,6 +124,7 @@ class Live(Stimulating):
                 kind=self.simulator,
                 account=account,
                 progress=progress,
+                tell=partial(print, file=sys.stderr),
                 **settings,
             )
             # It is told even where the culture cannot be closed then.

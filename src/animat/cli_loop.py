@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -82,7 +83,7 @@ class Run(Stimulating):
     state: Path | None = None
     """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
     episodes: int = 5
-    """Of each policy and control, interleaved in random order"""
+    """Of each policy; of each control as many at most, and together no more than of policies, but 5 each"""
     controls: Literal["all", "random"] = "all"
     """all: random, constant, silent, shuffled and made by hand; random: only that one"""
     pulses: int | None = None
@@ -166,6 +167,7 @@ class Run(Stimulating):
                 seed=self.seed,
                 account=account,
                 progress=progress,
+                tell=partial(print, file=sys.stderr),
                 noticed=noticed,
                 pulse=pulse,
                 patterns=patterns,

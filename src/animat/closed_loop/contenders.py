@@ -156,9 +156,16 @@ def controls(
     return found
 
 
-def interleaved(contenders: int, episodes: int, rng: np.random.Generator) -> list[int]:
-    """Whose turn each episode is: round after round of all contenders, each round in random order.
+def interleaved(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
+    """Whose turn each episode is, in random order and spread evenly: whatever drifts in the culture hits all alike.
 
-    So whatever drifts in the culture hits all of them alike.
+    The session is cut into as many equal parts as a contender has episodes, and one of them is in each part. Where all
+    have as many, round follows round of all of them.
+
+    Args:
+        episodes: of each contender.
+        rng: of the places within the parts.
     """
-    return [int(who) for _ in range(episodes) for who in rng.permutation(contenders)]
+    places = [(part + rng.random()) / n for n in episodes for part in range(n)]
+    whose = np.repeat(np.arange(len(episodes)), episodes)
+    return [int(who) for who in whose[np.argsort(places, kind="stable")]]

@@ -54,7 +54,7 @@ def run_session(
     contenders: Sequence[Contender],
     folder: str | os.PathLike[str],
     *,
-    episodes: int = 5,
+    episodes: int | Sequence[int] = 5,
     seed: int = 1,
     account: Account | None = None,
     clock: Clock | None = None,
@@ -74,7 +74,7 @@ def run_session(
         loop: the settings.
         contenders: who acts.
         folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line a tick.
-        episodes: of each contender.
+        episodes: of each contender, or of each its own number.
         seed: decides every random draw, but what the culture does.
         account: of a stimulation budget; None: without end.
         clock: the machine's; None: its monotonic one.
@@ -84,10 +84,11 @@ def run_session(
         InvalidArgument: for a culture that is closed or stopped, no contenders, or a session in the folder already.
         InvalidFile: if the log cannot be begun.
     """
-    _check(culture, loop, contenders, episodes, seed)
+    planned = [episodes] * len(contenders) if isinstance(episodes, int) else list(episodes)
+    _check(culture, loop, contenders, planned, seed)
     expect_no_session(folder)
     account, progress = account or Account(), progress or Silent()
-    turns = interleaved(len(contenders), episodes, np.random.default_rng([seed, 20]))
+    turns = interleaved(planned, np.random.default_rng([seed, 20]))
     driver = Driver(culture, loop, contenders, turns, account, clock or WallClock(), seed)
     file = Path(folder) / LOG_FILE
     # As whoever reads the log has it.
@@ -320,13 +321,18 @@ def check_episodes(name: str, episodes: int) -> None:
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(episodes)}")
 
 
-def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episodes: int, seed: int) -> None:
+def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episodes: Sequence[int], seed: int) -> None:
     if not culture.is_open or culture.is_stopped:
         state = "stopped" if culture.is_open else "closed"
         raise InvalidArgument(f"culture: expected an open one that may stimulate, got one that is {state}")
     if not contenders or len({contender.name for contender in contenders}) < len(contenders):
         raise InvalidArgument("contenders: expected at least one, each name once")
-    check_episodes("episodes", episodes)
+    if len(episodes) != len(contenders):
+        raise InvalidArgument(
+            f"episodes: expected one number, or one for each of {len(contenders)} contenders, got {len(episodes)}"
+        )
+    for each in episodes:
+        check_episodes("episodes", each)
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if loop.patterns is not None and loop.patterns > len(culture.patterns):

@@ -17,6 +17,7 @@ from animat.animat import Environment
 from animat.brief import briefly
 from animat.compilation import FAST_TO_COMPILE
 from animat.errors import InvalidArgument, shown
+from animat.mapping import N_PERCENTILES
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.training.policy import Policy
@@ -108,6 +109,9 @@ class Episodes:
         returns: sum of rewards of each episode, in the task's own units, shape (actors, episodes).
         lengths: iterations of each, shape (actors, episodes).
         terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
+        presented: how often the neurons got each condition, in all episodes together, shape (actors, conditions); no
+            conditions without neurons.
+        passed: how often the response was P50 or more, the same shape.
     """
 
     __repr__ = briefly
@@ -115,6 +119,8 @@ class Episodes:
     returns: Float64[np.ndarray, "actors episodes"]
     lengths: Int64[np.ndarray, "actors episodes"]
     terminated: Bool[np.ndarray, "actors episodes"]
+    presented: Int64[np.ndarray, "actors conditions"]
+    passed: Int64[np.ndarray, "actors conditions"]
 
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
@@ -180,8 +186,9 @@ def roll_out(
     if not 0 <= seed < 2**32:
         raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
     keys = jax.random.split(jax.random.key(seed), n_actors)
-    returns, lengths, terminated = _roll_out(environment, episodes, simulator, actors, keys)
-    return Episodes(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), np.asarray(terminated))
+    returns, *counted, terminated = _roll_out(environment, episodes, simulator, actors, keys)
+    lengths, presented, passed = (np.asarray(each, np.int64) for each in counted)
+    return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed)
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=FAST_TO_COMPILE)
@@ -191,10 +198,12 @@ def _roll_out(
     simulator: NeuronSimulator | None,
     actors: Actor,
     keys: Key[Array, " actors"],
-) -> tuple[Array, Array, Array]:
-    def one_actor(actor: Actor, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
+    n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
+
+    def one_actor(actor: Actor, key: PRNGKeyArray) -> tuple[Array, Array, Array, Array, Array]:
         def iteration(carry: tuple[Any, ...], key: PRNGKeyArray) -> tuple[tuple[Any, ...], None]:
-            state, going, returns, lengths, terminated = carry
+            state, going, returns, lengths, presented, passed, terminated = carry
             uniforms = jax.random.uniform(key, (episodes, environment.noise_size + 1))
             observation = jax.vmap(environment.observe)(state) / environment.scales
             action = actor.act(environment, observation, uniforms[:, 0])
@@ -203,8 +212,13 @@ def _roll_out(
             returns = returns + jnp.where(going, outcome.reward, 0.0)
             terminated = terminated | (going & outcome.terminated)
             lengths = lengths + going
+            if simulator is not None:
+                delivered = going[:, None] & (outcome.delivered[:, None] == jnp.arange(n_conditions))
+                passes = outcome.rate_hz >= simulator.percentiles[N_PERCENTILES // 2]
+                presented = presented + delivered.sum(axis=0)
+                passed = passed + (delivered & passes[:, None]).sum(axis=0)
             going = going & ~(outcome.terminated | outcome.truncated)
-            return (outcome.state, going, returns, lengths, terminated), None
+            return (outcome.state, going, returns, lengths, presented, passed, terminated), None
 
         start, key = jax.random.split(key)
         carry = (
@@ -212,10 +226,12 @@ def _roll_out(
             jnp.ones(episodes, bool),
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),
+            jnp.zeros(n_conditions, jnp.int32),
+            jnp.zeros(n_conditions, jnp.int32),
             jnp.zeros(episodes, bool),
         )
         keys = jax.random.split(key, environment.robot.episode_limit)
-        _, _, returns, lengths, terminated = jax.lax.scan(iteration, carry, keys)[0]
-        return returns, lengths, terminated
+        _, _, returns, lengths, presented, passed, terminated = jax.lax.scan(iteration, carry, keys)[0]
+        return returns, lengths, presented, passed, terminated
 
     return jax.vmap(one_actor)(actors, keys)

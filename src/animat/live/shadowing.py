@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -88,6 +88,7 @@ def live(
     kind: Kind | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
+    tell: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> Lived:
     """Record a culture again and again while policies train on its newest simulators, then run them on it.
@@ -112,6 +113,7 @@ def live(
         kind: of simulator; None: what suits the protocol (`fit_timeline`).
         account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
         progress: told as the culture's time goes by, and in the closed loop.
+        tell: as for `run_policies`.
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
@@ -140,6 +142,7 @@ def live(
                 seed=training.seed,
                 account=run.account,
                 progress=progress,
+                tell=tell,
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
                 **settings,

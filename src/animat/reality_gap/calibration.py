@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from animat.neurons.conditions import Condition
 from animat.neurons.kinds import Kind, fit_simulator
+from animat.neurons.median_drift import MedianDrift, median_drift
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
@@ -32,6 +33,8 @@ class Calibration:
         redrawn: simulators of bootstrap samples of its responses: what so many could as well have been.
         responses_hz: non-burst responses of each condition, in the order of time.
         burst_threshold: ratio of active channels above which its responses were bursts.
+        burst_share: of its responses.
+        drift: of the recordings up to it; None where one recording tells none.
         start_min: of the recording on the culture's clock.
         conditions, window_ms, presentation: of the recording.
         findings: what was noticed.
@@ -42,6 +45,8 @@ class Calibration:
     redrawn: tuple[NeuronSimulator, ...]
     responses_hz: tuple[Float64[np.ndarray, " responses"], ...]
     burst_threshold: float
+    burst_share: float
+    drift: MedianDrift | None
     start_min: float
     conditions: tuple[Condition, ...]
     window_ms: tuple[float, float]
@@ -94,6 +99,8 @@ class Calibration:
             redrawn=tuple(fit_simulator(responses.redrawn(rng), memory=memory, **fit) for _ in range(REDRAWN)),
             responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
+            burst_share=float(responses.is_burst.mean()),
+            drift=median_drift([each for each in timeline.responses if each.start_min <= start_min]),
             start_min=start_min,
             conditions=timeline.conditions,
             window_ms=timeline.window_ms,

@@ -12,10 +12,11 @@ from jaxtyping import Float64
 
 from animat.animat import Animat
 from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, InTurn, OneCondition
-from animat.evaluation.rollouts import Actor, Constant, Uniform, networks_of, roll_out
+from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.passes import Passes
 
 PREDICTED_EPISODES = 1000
 """Of each policy and control on the simulator."""
@@ -30,10 +31,33 @@ class Predicted(NamedTuple):
         returns: of its episodes on the simulator of the recording, shape (episodes,).
         anew: its mean return on each simulator of the recording's responses drawn anew, shape (redrawn,): it spreads
             as the recording's responses and, a little, as 200 episodes do.
+        passes: in all its episodes on the simulator of the recording, shape (conditions,).
+        passes_anew: on each simulator of redrawn responses, shape (redrawn, conditions).
     """
 
     returns: Float64[np.ndarray, " episodes"]
     anew: Float64[np.ndarray, " redrawn"]
+    passes: Passes
+    passes_anew: Passes
+
+    @property
+    def presented(self) -> Float64[np.ndarray, " conditions"]:
+        """How often each condition is presented in an episode, on average."""
+        return np.asarray(self.passes.presented / len(self.returns))
+
+
+def together(predicted: Sequence[Predicted]) -> Predicted:
+    """Several policies as one contender."""
+    return Predicted(
+        np.concatenate([each.returns for each in predicted]),
+        np.mean([each.anew for each in predicted], axis=0),
+        _stacked([each.passes for each in predicted]).summed(0),
+        _stacked([each.passes_anew for each in predicted]).summed(0),
+    )
+
+
+def _stacked(passes: Sequence[Passes]) -> Passes:
+    return Passes(*(np.array(counts) for counts in zip(*passes, strict=True)))
 
 
 def predict(
@@ -68,21 +92,26 @@ def predict(
         in_ = replace(environment, delivery="shuffled") if delivery == "shuffled" else environment
         actor, many = _actor([contender.controller for contender in group], rule, greedy=greedy)
 
-        def returns(simulator: NeuronSimulator, episodes: int, seed: int) -> Float64[np.ndarray, "actors episodes"]:
+        def rolled(simulator: NeuronSimulator, episodes: int, seed: int) -> Episodes:
             on = silenced(simulator) if delivery == "silent" else simulator  # noqa: B023
-            return roll_out(in_, on, actor, many, episodes=episodes, seed=seed).returns  # noqa: B023
+            return roll_out(in_, on, actor, many, episodes=episodes, seed=seed)  # noqa: B023
 
-        predicted = returns(calibration.simulator, PREDICTED_EPISODES, seed)
+        predicted = rolled(calibration.simulator, PREDICTED_EPISODES, seed)
         # Seeds of their own: the spread is then also that of the episodes, and no interval is surer than they are.
-        anew = np.array(
-            [
-                returns(simulator, ANEW_EPISODES, (seed + 1 + i) % 2**32).mean(axis=1)
-                for i, simulator in enumerate(calibration.redrawn)
-            ]
-        )
+        redrawn = [
+            rolled(simulator, ANEW_EPISODES, (seed + 1 + i) % 2**32) for i, simulator in enumerate(calibration.redrawn)
+        ]
+        anew = np.array([each.returns.mean(axis=1) for each in redrawn])
+        passes = Passes(predicted.presented, predicted.passed)
+        passes_anew = _stacked([Passes(each.presented, each.passed) for each in redrawn])
         for row, contender in enumerate(group):
             of = [row] if len(group) > 1 else list(range(many))
-            found[contender.name] = Predicted(predicted[of].ravel(), anew[:, of].mean(axis=1))
+            found[contender.name] = Predicted(
+                predicted.returns[of].ravel(),
+                anew[:, of].mean(axis=1),
+                Passes(*(counts[of] for counts in passes)).summed(0),
+                Passes(*(counts[:, of] for counts in passes_anew)).summed(1),
+            )
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -25,13 +26,18 @@ from animat.evaluation.resampling import too_few
 from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
 from animat.evaluation.verdict import beside
 from animat.progress import Progress
+from animat.reality_gap.answered import answered
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.predicting import Predicted, predict
+from animat.reality_gap.outlook import outlook
+from animat.reality_gap.predicting import Predicted, predict, together
+from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding
 from animat.robots.steering import STEERED
 from animat.training.policy import Policy
 
+FEWEST_OF_A_CONTROL = 5
+"""Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
 LIMIT_RESOLUTION = 0.6
 """Of the grid of the best possible return: fast and rough, 0.5 of the cartpole's 200."""
 
@@ -50,20 +56,23 @@ def run_policies(
     pulses: int | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
+    tell: Callable[[str], None] | None = None,
     noticed: Sequence[Finding] = (),
     **settings: Any,
 ) -> RealityGap:
     """Run policies, and the controls of the study between them, in closed loop, and compare with the prediction.
 
-    Episodes of all of them are interleaved in random order on the one culture, so that drift hits all alike. Under the
-    silent and the shuffled control the policies take turns, episode after episode.
+    Episodes of all of them are interleaved in random order on the one culture, so that drift hits all alike. The
+    controls have no more episodes together than the policies, but for `FEWEST_OF_A_CONTROL` of each: what a culture is
+    given for controls makes it another one for the policies. Under the silent and the shuffled control the policies
+    take turns, episode after episode.
 
     Args:
         policies: by name, of one robot, mapping and set of conditions.
         culture: open.
         calibration: percentiles, burst threshold and prediction.
         folder: for the session.
-        episodes: of each policy and control.
+        episodes: of each policy, and at most of each control.
         with_controls: all of them; if not, only the random one.
         greedy: whether policies take the most probable action, or draw as in training.
         follow: whether the mapping's percentiles follow the culture (`animat.closed_loop.following`) from where the
@@ -72,6 +81,7 @@ def run_policies(
         pulses: of a presentation; None: as in the policies' recordings.
         account: of a stimulation budget.
         progress: told after each episode.
+        tell: is given one line before the session, on how long it will and can be.
         noticed: findings to be told beside those made here.
         settings: other attributes of `Loop`.
 
@@ -149,10 +159,24 @@ def run_policies(
     if limit is not None and progress is not None:
         progress.update(0, 1, "best possible return")
     best = None if limit is None else limit()
+    of_each = planned_episodes(len(policies), len(contenders) - len(policies), episodes)
+    plan = [
+        (n, predicted[each.name].presented, each.delivery != "silent")
+        for n, each in zip(of_each, contenders, strict=True)
+    ]
+    ahead = outlook(loop, calibration, plan, account, culture.now_s / 60)
+    if tell is not None:
+        tell(str(ahead))
     session = run_session(
-        culture, loop, contenders, folder, episodes=episodes, seed=seed, account=account, progress=progress
+        culture, loop, contenders, folder, episodes=of_each, seed=seed, account=account, progress=progress
     )
     rows = _rows(contenders, tuple(policies), predicted, session)
+    found: tuple[Finding, ...] = ()
+    if sign := rows[0].gap_sign:
+        evidence = Evidence(
+            answered(session, loop, tuple(policies)), calibration, together([predicted[p] for p in policies]), sign
+        )
+        found = reasons(evidence)
     return RealityGap(
         loop.robot.name,
         loop.mapping.name,
@@ -163,8 +187,21 @@ def run_policies(
         session,
         account,
         (*noticed, *findings, *calibration.findings),
-        calibration.simulator.has_memory,
+        sum(map(len, calibration.responses_hz)),
+        ahead,
+        found,
     )
+
+
+def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
+    """Of each policy, then of each control.
+
+    Args:
+        policies, controls: how many there are.
+        episodes: of each policy, and at most of each control.
+    """
+    of_a_control = max(FEWEST_OF_A_CONTROL, math.ceil(policies * episodes / controls))
+    return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
 def _meanwhile(compute: Callable[[], float]) -> Callable[[], float]:
@@ -221,11 +258,12 @@ def _rows(
         acted = [episode.acted for episode in episodes]
         actions = max(1, sum(each.actions for each in acted))
         presentations = max(1, sum(each.presentations for each in acted))
+        of_them = together([predicted[each] for each in of])
         return Row(
             name=name,
             meaning=meaning,
-            predicted=np.concatenate([predicted[each].returns for each in of]),
-            predicted_anew=np.mean([predicted[each].anew for each in of], axis=0),
+            predicted=of_them.returns,
+            predicted_anew=of_them.anew,
             lived=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
             pulses_per_action=sum(each.pulses for each in acted) / actions,
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,

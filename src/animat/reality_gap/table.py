@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,8 +14,12 @@ from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.evaluation.verdict import Beside, Verdict
+from animat.reality_gap.outlook import Outlook
+from animat.reality_gap.reasons import CHECKS
 from animat.recordings.findings import Finding
 
+LARGE_SHARE = 0.1
+"""Of the range from random to the best possible return: a gap that is worth a word though it may be none."""
 _RESAMPLES = 10_000
 
 
@@ -65,6 +69,14 @@ class Row:
         lived = _resampled_means(self.lived, rng)
         return _between(value, lived - rng.choice(self.predicted_anew, len(lived)))
 
+    @property
+    def gap_sign(self) -> Literal[-1, 0, 1]:
+        """-1 where less was lived than predicted, 1 where more, 0 where that cannot be told."""
+        if not len(self.lived):
+            return 0
+        gap = self.gap
+        return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
+
     def to_dict(self) -> dict[str, Any]:
         """The line as plain data."""
         lived = bool(len(self.lived))
@@ -100,7 +112,9 @@ class RealityGap:
         session: as it was lived.
         account: of the stimulation.
         findings: where loop, recording and policy differ, and what was noticed.
-        has_memory: whether the simulator that predicted remembers.
+        responses: that the recording has, without bursts.
+        outlook: how long the session would be and could be, as it was known beforehand.
+        reasons: why the policies lived another return than predicted, as far as the session's data show it.
     """
 
     robot: str
@@ -112,7 +126,9 @@ class RealityGap:
     session: Session
     account: Account
     findings: tuple[Finding, ...]
-    has_memory: bool = False
+    responses: int
+    outlook: Outlook
+    reasons: tuple[Finding, ...]
 
     @property
     def beside_controls(self) -> Verdict | None:
@@ -134,11 +150,22 @@ class RealityGap:
         if beside is None:
             who = "no control" if len(policies.lived) else "no episode of a policy"
             return f"{who} was lived to its end: nothing can be said of the policies beside the controls"
-        said = str(beside)
-        if policies.gap.high < 0:
-            said += "; they live less than predicted: a culture tires, which no simulator does"
-            said += "" if self.has_memory else ", and remembers, which only one with memory does"
-        return said
+        return str(beside) + self._on_the_gap()
+
+    def _on_the_gap(self) -> str:
+        """What may have made the policies' gap."""
+        row, share = self.rows[0], self.gap_share
+        if not row.gap_sign:
+            if share is None or abs(share) < LARGE_SHARE or len(row.lived) < 2:
+                return ""
+            return (
+                f"; that they lived {_more_or_less(row.gap.value)} than predicted is within what the recording's "
+                f"{self.responses} responses and {len(row.lived)} episodes can tell"
+            )
+        said = f"; they lived {_more_or_less(row.gap.value)} than predicted"
+        if self.reasons:
+            return f"{said}: {'; '.join(reason.sentence for reason in self.reasons)}"
+        return f"{said}, and nothing in the session's data explains it (looked for: {', '.join(CHECKS)})"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -152,10 +179,13 @@ class RealityGap:
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
             "verdict": self.verdict(),
+            "reasons": [_plain(reason) for reason in self.reasons],
+            "planned_min": self.outlook.planned_min,
+            "outlook": str(self.outlook),
             "session": self.session.to_dict(),
             "folder": str(self.session.folder),
             "budget": self.account.to_dict(),
-            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
+            "findings": [_plain(finding) for finding in self.findings],
         }
 
     def to_text(self) -> str:
@@ -198,6 +228,14 @@ class RealityGap:
         if self.session.left_out:
             lines.append(f"  left out: {in_words(self.session.left_out)}")
         return "\n".join(lines)
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    return {"name": finding.name, "severity": finding.severity, "sentence": finding.sentence}
+
+
+def _more_or_less(gap: float) -> str:
+    return f"{abs(gap):.1f} {'more' if gap > 0 else 'less'}"
 
 
 def _between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:

@@ -1,0 +1,103 @@
+"""What the culture answered the policies in a session: the responses that moved their robots."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.session import Session
+from animat.mapping import N_PERCENTILES
+from animat.neurons.responses import SILENCE_S, Presented, Responses
+from animat.reality_gap.passes import Passes
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """Responses in the episodes of policies that came to their end, without what led in.
+
+    Attributes:
+        responses: in the order of time, on the session's clock, with all that the culture was presented between them.
+        episode: which of `returns` each one belongs to, shape (responses,).
+        late_s: by how much its pulses came late, shape (responses,).
+        moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
+        passed: whether it was P50 or more, as P50 was held or had followed by then, shape (responses,).
+        returns: of the episodes, in the order of time, shape (episodes,).
+    """
+
+    responses: Responses
+    episode: Int64[np.ndarray, " responses"]
+    late_s: Float64[np.ndarray, " responses"]
+    moved: Bool[np.ndarray, " responses"]
+    passed: Bool[np.ndarray, " responses"]
+    returns: Float64[np.ndarray, " episodes"]
+
+    @property
+    def passes(self) -> Passes:
+        """Of the responses that moved the robot in each episode, shape (episodes, conditions)."""
+        counts = np.zeros((2, len(self.returns), len(self.responses.conditions)), np.int64)
+        np.add.at(counts[0], (self.episode, self.responses.condition), self.moved)
+        np.add.at(counts[1], (self.episode, self.responses.condition), self.moved & self.passed)
+        return Passes(*counts)
+
+    @property
+    def span_min(self) -> float:
+        """From the first response to the last."""
+        time_s = self.responses.time_s
+        return 0.0 if time_s is None or not len(time_s) else float(time_s[-1] - time_s[0]) / 60
+
+
+def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answered:
+    """Read what policies were answered from a session's log.
+
+    Args:
+        session: that ended.
+        loop: its settings.
+        policies: their names among the contenders.
+    """
+    whole = [each for each in session.episodes if each.contender in policies and each.is_whole]
+    place = {each.number: row for row, each in enumerate(whole)}
+    p50_hz = float(loop.percentiles[N_PERCENTILES // 2])
+    presented: list[tuple[int, float, bool, float, float]] = []
+    acted: list[tuple[int, int, float, float, bool, bool]] = []
+    for words in session.log.records.words():
+        if words["kind"] == "percentiles":
+            p50_hz = words["percentiles_hz"][N_PERCENTILES // 2]
+        tick = words.get("tick")
+        if not tick or not tick["pulse_time_s"]:
+            continue
+        if tick["iteration"] >= 0 and tick["episode"] in place:
+            moved, passed = tick["handled"] == "used", tick["rate_hz"] >= p50_hz
+            acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved, passed))
+        presented.append(
+            (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])
+        )
+    condition, rate_hz, is_burst, first_s, read_s = _columns(presented, 5)
+    episode, at, late_s, active_ratio, moved, passed = _columns(acted, 6)
+    at = at.astype(np.int64)
+    before_s = np.concatenate([[-np.inf], read_s[:-1]])
+    every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), first_s - before_s > SILENCE_S)
+    responses = Responses(
+        condition=every.condition[at],
+        rate_hz=every.rate_hz[at],
+        active_ratio=active_ratio,
+        is_burst=every.is_burst[at],
+        conditions=loop.conditions,
+        window_ms=loop.window_ms,
+        n_channels=len(session.log.header["channels"]["label"]),
+        threshold=loop.burst_threshold,
+        separability=float("nan"),
+        presentation=loop.presentation,
+        time_s=read_s[at],
+        presented=every,
+        place=at,
+    )
+    returns = np.array([each.total for each in whole], np.float64)
+    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), passed.astype(bool), returns)
+
+
+def _columns(rows: Sequence[tuple[float, ...]], n: int) -> Float64[np.ndarray, "columns rows"]:
+    return np.array(rows, np.float64).reshape(-1, n).T

@@ -1,0 +1,85 @@
+"""How long a session will be, and how long it can be: told before the first pulse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.closed_loop.loop import Loop
+from animat.cultures.budget import Account
+from animat.neurons.drift_quality import LARGE
+from animat.reality_gap.calibration import Calibration
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is known of a session's length beforehand; minutes are from its start.
+
+    Attributes:
+        planned_min: all episodes, as they are on the simulator.
+        drifted_min: until the recordings' drift has changed P50 by a quarter since the last of them, and how long it
+            takes at least; None where they tell no drift.
+        budget_min: until the budget of pulses is spent; infinite without one.
+    """
+
+    planned_min: float
+    drifted_min: tuple[float, float] | None
+    budget_min: float
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the plan goes beyond the drift or the budget."""
+        drifted_min = np.inf if self.drifted_min is None else self.drifted_min[0]
+        return self.planned_min > min(drifted_min, self.budget_min)
+
+    def __str__(self) -> str:
+        if self.drifted_min is None:
+            drift = "how the culture drifts takes two recordings to tell"
+        else:
+            likely, least = (max(0.0, each) for each in self.drifted_min)
+            drift = (
+                f"by the recordings' drift the median response has changed by {100 * LARGE:.0f} % in "
+                f"{_words(likely)} ({_words(least)} at least), beyond which following thresholds may not help"
+            )
+        said = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
+        if np.isfinite(self.budget_min):
+            said += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
+        return said + ("; the plan is longer: ask for fewer --episodes" if self.is_long else "")
+
+
+def _words(minutes: float) -> str:
+    return f"{minutes:.0f} min" if minutes < 600 else "more than 10 h"
+
+
+def outlook(
+    loop: Loop,
+    calibration: Calibration,
+    episodes: Sequence[tuple[int, Float64[np.ndarray, " conditions"], bool]],
+    account: Account,
+    now_min: float,
+) -> Outlook:
+    """How long a session will be and can be.
+
+    Args:
+        loop: its settings.
+        calibration: whose recordings' drift is gone on with.
+        episodes: of each contender how many, how often each condition is presented in one of them, and whether the
+            culture gets pulses then.
+        account: of the budget.
+        now_min: on the culture's clock.
+    """
+    interval_s = loop.pulses / np.array([condition.value for condition in loop.conditions])
+    total_s = pulses = 0.0
+    for n, acted, is_stimulated in episodes:
+        presented = acted + (loop.lead_in or 0) * is_stimulated
+        total_s += n * (loop.pause_s + float(presented @ interval_s))
+        pulses += n * is_stimulated * loop.pulses * float(presented.sum())
+    of, drift, since_min = account.budget.pulses, calibration.drift, calibration.start_min - now_min
+    return Outlook(
+        total_s / 60,
+        None if drift is None else tuple(since_min + each for each in drift.minutes_to(LARGE)),  # type: ignore[arg-type]
+        np.inf if of is None or pulses == 0 else total_s / 60 * (of - account.pulses) / pulses,
+    )

@@ -1,0 +1,211 @@
+"""Why policies live another return than was predicted: what the session's own data show, each with its number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from animat.neurons.conditions import Condition
+from animat.neurons.memory_quality import memory_findings
+from animat.neurons.quality import FEW_SAMPLES
+from animat.reality_gap.answered import Answered
+from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.predicting import Predicted
+from animat.recordings.findings import Finding
+
+LEVEL = 0.01
+"""How often each check that tests something names a reason that is none, at most."""
+FEWEST_EPISODES = 8
+"""Of the policies, that a trend or a share is told from; of a condition in a trend's episode, `_FEWEST`."""
+_FEWEST = 3
+LEAST_LATE = 0.05
+"""Of the interval between pulses, on average over a condition's presentations."""
+LEAST_BURSTS, _FEWEST_BURSTS = 0.05, 5
+LEAST_TREND = 0.1
+"""Change over the session, of a condition's mean response."""
+LEAST_SHARE = 0.05
+"""Difference in P(x >= P50)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is known of policies that lived another return than was predicted.
+
+    Attributes:
+        answered: what the culture answered them.
+        calibration: the recording that predicted.
+        predicted: of all policies together.
+        gap: the sign of their gap: -1 where they lived less.
+    """
+
+    answered: Answered
+    calibration: Calibration
+    predicted: Predicted
+    gap: Literal[-1, 1]
+
+
+def reasons(evidence: Evidence) -> tuple[Finding, ...]:
+    """What may have made the gap, as far as the data show it; none where they show nothing."""
+    return tuple(found for check in CHECKS.values() if (found := check(evidence)) is not None)
+
+
+def presentation(evidence: Evidence) -> Finding | None:
+    """The loop presented otherwise than the recording that predicted."""
+    recorded, presented = evidence.calibration.presentation, evidence.answered.responses.presentation
+    if recorded == presented:
+        return None
+    return _reason("presentation", f"the recording was presented {recorded or 'as is not known'}, the loop {presented}")
+
+
+def few_samples(evidence: Evidence) -> Finding | None:
+    """A condition has fewer responses in the recording than redrawing them tells the truth of."""
+    n = [len(each) for each in evidence.calibration.responses_hz]
+    if min(n) >= FEW_SAMPLES:
+        return None
+    few = [f"{n[i]} of {condition.label}" for i, condition in enumerate(_conditions(evidence)) if n[i] < FEW_SAMPLES]
+    return _reason("few-samples", f"the recording has few responses: {', '.join(few)}", min(n))
+
+
+def lateness(evidence: Evidence) -> Finding | None:
+    """Pulses came so late that a condition was another frequency."""
+    answers, told, most = evidence.answered, [], 0.0
+    for i, condition in enumerate(_conditions(evidence)):
+        late_s = answers.late_s[answers.responses.condition == i]
+        if not len(late_s) or (part := float(late_s.mean()) * condition.value) < LEAST_LATE:
+            continue
+        most = max(most, part)
+        share, late_ms = float(np.mean(late_s > 0)), 1000 * float(late_s[late_s > 0].mean())
+        told.append(
+            f"{condition.label} in {100 * share:.0f} % of its presentations, by {late_ms:.2g} ms of its "
+            f"{1000 / condition.value:.3g} on average"
+        )
+    return _reason("lateness", f"pulses came late: {', '.join(told)}", most) if told else None
+
+
+def bursts(evidence: Evidence) -> Finding | None:
+    """Many responses were bursts, which no simulator has."""
+    is_burst = evidence.answered.responses.is_burst
+    count, n = int(is_burst.sum()), len(is_burst)
+    if count < max(_FEWEST_BURSTS, LEAST_BURSTS * n):
+        return None
+    sentence = (
+        f"{100 * count / n:.0f} % of {n} responses were bursts ({100 * evidence.calibration.burst_share:.0f} % in the "
+        "recording), which the prediction leaves out"
+    )
+    return _reason("bursts", sentence, count / n)
+
+
+def trend(evidence: Evidence) -> Finding | None:
+    """Responses change over the session, and the returns with them.
+
+    For each condition least squares of the episodes' mean responses against their times; for the returns Kendall's
+    rank correlation with time, in the direction of the gap.
+    """
+    from scipy.stats import kendalltau, linregress
+
+    answers = evidence.answered
+    responses, time_s, episodes = answers.responses, answers.responses.time_s, len(answers.returns)
+    if time_s is None or episodes < FEWEST_EPISODES:
+        return None
+    with_time = kendalltau(np.arange(episodes), answers.returns, alternative="less" if evidence.gap < 0 else "greater")
+    if not with_time.pvalue < LEVEL:
+        return None
+    tested = []
+    for i, condition in enumerate(_conditions(evidence)):
+        chosen = (responses.condition == i) & ~responses.is_burst
+        n = np.bincount(answers.episode[chosen], minlength=episodes)
+        kept = n >= _FEWEST
+        if np.count_nonzero(kept) >= FEWEST_EPISODES:
+            x, t = (
+                np.bincount(answers.episode[chosen], each[chosen], episodes)[kept] / n[kept]
+                for each in (responses.rate_hz, time_s / 60)
+            )
+            tested.append((condition.label, linregress(t, x), float(np.ptp(t)) / max(float(x.mean()), 1e-9)))
+    told, most = [], 0.0
+    for label, fit, scale in tested:
+        change, error = fit.slope * scale, fit.stderr * scale
+        if fit.pvalue < LEVEL / len(tested) and abs(change) >= LEAST_TREND:
+            most = max(most, change, key=abs)
+            told.append(
+                f"to {label} {'rise' if change > 0 else 'fall'} by {100 * abs(change):.0f} % +- {100 * error:.0f}"
+            )
+    if not told:
+        return None
+    sentence = (
+        f"the culture changed over the session's {answers.span_min:.0f} min: responses {', '.join(told)} (of their "
+        f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
+    )
+    return _reason("trend", sentence, most)
+
+
+def memory(evidence: Evidence) -> Finding | None:
+    """What the culture answered depends on its answer before, and the simulator that predicted does not know it."""
+    if evidence.calibration.simulator.has_memory:
+        return None
+    found = next(memory_findings(evidence.answered.responses), None)
+    return None if found is None else _reason("memory", found.sentence, found.value)
+
+
+def answers(evidence: Evidence) -> Finding | None:
+    """Responses to a condition pass P50 more or less often than those of the simulator did under the same policies.
+
+    t = (p - q) / sqrt(s^2 + r^2), with episodes - 1 degrees of freedom; p: of the session, s its error from what
+    differs between episodes; q: on the simulator, r its error from simulators of responses drawn anew. Neither error is
+    taken to be smaller than that of as many independent responses (Agresti and Coull 1998).
+    """
+    from scipy.stats import t as student
+
+    lived, predicted = evidence.answered.passes, evidence.predicted
+    episodes, recorded_hz = len(lived.passed), evidence.calibration.responses_hz
+    if episodes < FEWEST_EPISODES:
+        return None
+    tested = np.flatnonzero((lived.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
+    told, most = [], 0.0
+    for i in tested.tolist():
+        n, passed = lived.presented[:, i], lived.passed[:, i]
+        share, expected = float(passed.sum() / n.sum()), float(predicted.passes.share[i])
+        between = episodes / (episodes - 1) * float(np.sum((passed - share * n) ** 2)) / float(n.sum()) ** 2
+        error = max(between, _variance(share, int(n.sum()))) ** 0.5
+        anew = float(np.nanvar(predicted.passes_anew.share[:, i]))
+        expected_error = max(anew, _variance(expected, len(recorded_hz[i]))) ** 0.5
+        difference = share - expected
+        p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
+        if p < LEVEL / len(tested) and abs(difference) >= LEAST_SHARE:
+            most = max(most, difference, key=abs)
+            of_condition = evidence.answered.responses.condition == i
+            told.append(
+                f"{_conditions(evidence)[i].label} in {share:.2f} +- {error:.2f} ({expected:.2f} +- "
+                f"{expected_error:.2f}; mean {evidence.answered.responses.rate_hz[of_condition].mean():.3g} Hz, "
+                f"{recorded_hz[i].mean():.3g} in the recording)"
+            )
+    if not told:
+        return None
+    return _reason("answers", f"responses pass P50 otherwise than predicted: {', '.join(told)}", most)
+
+
+CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
+    "another presentation": presentation,
+    "few responses": few_samples,
+    "late pulses": lateness,
+    "bursts": bursts,
+    "a trend over the session": trend,
+    "memory": memory,
+    "how often responses pass P50": answers,
+}
+"""What is looked for, in words."""
+
+
+def _variance(share: float, n: int) -> float:
+    near = (share * n + 2) / (n + 4)
+    return near * (1 - near) / (n + 4)
+
+
+def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
+    return evidence.answered.responses.conditions
+
+
+def _reason(name: str, sentence: str, value: float | None = None) -> Finding:
+    return Finding(name, "note", sentence, value)

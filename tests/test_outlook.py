@@ -1,0 +1,92 @@
+"""How long a session will be and can be, told beforehand: sums by hand and closed forms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.closed_loop.loop import Loop
+from animat.cultures.budget import Account, Budget
+from animat.mapping import Thresholds
+from animat.neurons.conditions import Condition
+from animat.neurons.median_drift import MedianDrift, median_drift
+from animat.neurons.responses import Responses
+from animat.reality_gap.outlook import Outlook, outlook
+from animat.robots import Navigation
+
+CONDITIONS = (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))
+
+
+def responses(start_min: float, rate_hz: np.ndarray) -> Responses:
+    n = len(rate_hz)
+    none = np.zeros(n, bool)
+    return Responses(
+        np.arange(n) % 2, rate_hz, 0.0 * none, none, CONDITIONS, (2.0, 10.0), 16, 1.0, 0.0, start_min=start_min
+    )
+
+
+def test_a_steady_fall_is_told_exactly() -> None:
+    """P50 = 10 exp(-0.01 t), of recordings whose responses are all the same: no error."""
+    series = [responses(t, np.full(40, 10.0 * math.exp(-0.01 * t))) for t in (0.0, 10.0, 25.0)]
+    found = median_drift(series)
+    assert found is not None
+    assert found.per_min == pytest.approx(-0.01)
+    assert found.error == 0
+    assert found.minutes_to(0.25) == pytest.approx((-100 * math.log(0.75),) * 2)
+    # The newest three count.
+    assert median_drift([responses(-10.0, np.full(40, 99.0)), *series]) == pytest.approx(found)
+    assert median_drift(series[:1]) is None
+    assert median_drift([series[0], responses(10.0, np.zeros(40))]) is None
+
+
+def test_the_error_of_a_drift_is_that_of_medians() -> None:
+    """A median of n normal responses has an error of sqrt(pi / 2 n) standard deviations."""
+    rng = np.random.default_rng(1)
+    found = [median_drift([responses(t, rng.normal(10.0, 2.0, 400)) for t in (0.0, 10.0)]) for _ in range(60)]
+    expected = math.sqrt(2 * math.pi / 2 / 400) * 0.2 / 10.0
+    rates, errors = np.array([(each.per_min, each.error) for each in found if each is not None]).T
+    assert errors.mean() == pytest.approx(expected, rel=0.15)
+    assert rates.std() == pytest.approx(expected, rel=0.35)
+
+
+def test_the_minutes_to_a_change_are_fewer_the_less_is_known() -> None:
+    likely, least = MedianDrift(-0.01, 0.005).minutes_to(0.25)
+    assert (likely, least) == pytest.approx((-100 * math.log(0.75), -50 * math.log(0.75)))
+    assert MedianDrift(0.01, 0.0).minutes_to(0.25)[0] == pytest.approx(100 * math.log(1.25))
+    assert MedianDrift(0.0, 0.0).minutes_to(0.25) == (math.inf, math.inf)
+
+
+def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
+    loop = Loop(Navigation(), Thresholds(1), CONDITIONS, np.arange(11.0), pulses=1, pause_s=3.0, lead_in=2)  # type: ignore[arg-type]
+    calibration: Any = SimpleNamespace(drift=MedianDrift(-0.01, 0.005), start_min=10.0)
+    plan = [(4, np.array([10.0, 80.0]), True), (2, np.array([10.0, 80.0]), False)]
+    account = Account(Budget(pulses=188))
+    account.pulses = 94
+    found = outlook(loop, calibration, plan, account, 15.0)
+    # Stimulated episodes have 94 pulses, and lead in by two of each; in silence nothing does.
+    total_s = 4 * (3 + 12 / 5 + 82 / 80) + 2 * (3 + 10 / 5 + 80 / 80)
+    assert found.planned_min == pytest.approx(total_s / 60)
+    assert found.drifted_min == pytest.approx((-100 * math.log(0.75) - 5, -50 * math.log(0.75) - 5))
+    assert found.budget_min == pytest.approx(total_s / 60 / 4)
+    assert found.is_long
+    assert not replace(found, budget_min=math.inf).is_long
+
+
+def test_one_line_tells_it() -> None:
+    line = str(Outlook(26.2, (24.0, 11.0), math.inf))
+    assert line == (
+        "the session is planned for about 26 min of the culture's time; by the recordings' drift the median response "
+        "has changed by 25 % in 24 min (11 min at least), beyond which following thresholds may not help; the plan is "
+        "longer: ask for fewer --episodes"
+    )
+    assert str(Outlook(26.2, (-5.0, -9.0), 30.0)).endswith("the plan is longer: ask for fewer --episodes")
+    assert "in more than 10 h (40 min at least)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
+    assert str(Outlook(6.0, None, 7.0)) == (
+        "the session is planned for about 6 min of the culture's time; how the culture drifts takes two recordings to "
+        "tell; the budget of pulses lasts for about 7 min"
+    )

@@ -1,0 +1,189 @@
+"""Why a return differs from its prediction: each reason is named where made-up sessions have it, and else rarely."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from animat.neurons.conditions import Condition
+from animat.neurons.responses import Presented, Responses
+from animat.reality_gap.answered import Answered
+from animat.reality_gap.passes import Passes
+from animat.reality_gap.predicting import Predicted
+from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
+from animat.recordings.protocol import Presentation
+
+CONDITIONS = (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))
+MEANS_HZ = np.array([10.0, 14.0])
+RECORDED, EPISODES, ACTIONS = 200, 20, 40
+EVERY = np.arange(EPISODES * ACTIONS)
+
+
+def session(seed: int, *, gap: int = -1, **changed: Any) -> Evidence:
+    """A made-up one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
+    one condition more or less; what is told of it is changed by functions of the arrays."""
+    rng = np.random.default_rng(seed)
+    recorded = rng.normal(MEANS_HZ[:, None], 4.0, (2, RECORDED))
+
+    def passed(responses: np.ndarray) -> np.ndarray:
+        median = np.median(responses, axis=(-2, -1), keepdims=True)
+        return np.asarray(np.count_nonzero(responses >= median, axis=-1))
+
+    drawn = rng.integers(0, RECORDED, (100, 2, RECORDED))
+    anew = passed(np.take_along_axis(np.broadcast_to(recorded, drawn.shape), drawn, axis=-1))
+    everywhere = np.full(2, RECORDED)
+    predicted = Predicted(
+        np.zeros(1), np.zeros(1), Passes(everywhere, passed(recorded)), Passes(everywhere + 0 * anew, anew)
+    )
+    calibration: Any = SimpleNamespace(
+        responses_hz=tuple(recorded),
+        presentation=Presentation("mixed", 1),
+        burst_share=0.02,
+        simulator=SimpleNamespace(has_memory=False),
+    )
+    calibration.__dict__.update(changed.pop("calibration", {}))
+    episode = np.repeat(np.arange(EPISODES), ACTIONS)
+    prefers = rng.uniform(0.2, 0.8, EPISODES)
+    condition = (rng.random(len(EVERY)) < prefers[episode]).astype(np.int64)
+    rate_hz = rng.normal(MEANS_HZ[condition], 4.0)
+    is_burst = rng.random(len(EVERY)) < 0.02
+    late_s = np.where(rng.random(len(EVERY)) < 0.02, 0.0002, 0.0)
+    returns = rng.normal(0.0, 30.0, EPISODES)
+    told = {"rate_hz": rate_hz, "is_burst": is_burst, "late_s": late_s, "returns": returns}
+    told |= {name: change(condition, rate_hz) for name, change in changed.items()}
+    time_s = EVERY * 1.0
+    responses = Responses(
+        condition,
+        told["rate_hz"],
+        np.zeros(len(EVERY)),
+        told["is_burst"],
+        CONDITIONS,
+        (2.0, 10.0),
+        16,
+        0.9,
+        float("nan"),
+        presentation=Presentation("mixed", 1),
+        time_s=time_s,
+        presented=Presented(condition, told["rate_hz"], told["is_burst"], np.zeros(len(EVERY), bool)),
+        place=EVERY,
+    )
+    above = told["rate_hz"] >= np.median(recorded)
+    answered = Answered(responses, episode, told["late_s"], np.ones(len(EVERY), bool), above, told["returns"])
+    return Evidence(answered, calibration, predicted, gap)  # type: ignore[arg-type]
+
+
+def falling(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
+    """By a quarter of 80 Hz' mean over the session."""
+    return rate_hz - 0.25 * 14.0 * (condition == 1) * (EVERY / len(EVERY) - 0.5)
+
+
+def worse(*_: np.ndarray) -> np.ndarray:
+    return 100.0 - 5.0 * np.arange(EPISODES) + np.random.default_rng(5).normal(0.0, 20.0, EPISODES)
+
+
+def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
+    """An answer is larger after a large one."""
+    return rate_hz + 1.5 * np.sign(np.concatenate([[0.0], rate_hz[:-1] - 12.0]))
+
+
+CASES: dict[str, tuple[dict[str, Any], str]] = {
+    "presentation": (
+        {"calibration": {"presentation": Presentation("blocked", 1)}},
+        "the recording was presented blocked, 1 pulse a presentation, the loop mixed, 1 pulse a presentation",
+    ),
+    "few-samples": (
+        {"calibration": {"responses_hz": (np.ones(7), np.full(200, 14.0))}},
+        "the recording has few responses: 7 of 5 Hz",
+    ),
+    "lateness": (
+        {"late_s": lambda condition, _: np.where(condition == 1, 0.0026, 0.0)},
+        "pulses came late: 80 Hz in 100 % of its presentations, by 2.6 ms of its 12.5 on average",
+    ),
+    "bursts": (
+        {"is_burst": lambda *_: EVERY % 10 == 0},
+        "10 % of 800 responses were bursts (2 % in the recording), which the prediction leaves out",
+    ),
+    "trend": ({"rate_hz": falling, "returns": worse}, "13 min: responses to 80 Hz fall by "),
+    "memory": ({"rate_hz": remembering}, "the culture remembers: after a response that passes the median"),
+    "answers": (
+        {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
+        "responses pass P50 otherwise than predicted: 80 Hz in 0.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_reason_is_named_with_its_number_where_the_session_has_it(name: str) -> None:
+    changed, words = CASES[name]
+    assert len(CASES) == len(CHECKS)
+    others = []
+    for seed in range(20):
+        named = {found.name: found.sentence for found in reasons(session(seed, **changed))}
+        assert words in named.pop(name)
+        # What is changed may show in the share that passes P50 too.
+        others += [other for other in named if other != "answers"]
+    assert len(others) <= binom.isf(1e-4, 20, len(CHECKS) * LEVEL)
+
+
+def test_where_there_is_no_reason_hardly_one_is_named() -> None:
+    sessions = 400
+    named = [found.name for seed in range(sessions) for found in reasons(session(seed))]
+    # Each check at its level at most: of these sessions, more than this in one of ten thousand tests.
+    most = binom.isf(1e-4, sessions, LEVEL)
+    assert {name: named.count(name) for name in set(named) if named.count(name) > most} == {}
+    # The tests do test: a level of 0 would name nothing whatever it is.
+    assert not {"presentation", "few-samples", "lateness", "bursts"} & set(named)
+
+
+def test_what_differs_between_episodes_is_no_reason() -> None:
+    """Each episode's responses are larger or smaller as a whole: that is no trend, and no other share in all."""
+
+    def uneven(seed: int) -> Any:
+        offsets = np.random.default_rng([seed, 1]).normal(0.0, 2.0, EPISODES)
+        return lambda _, rate_hz: rate_hz + np.repeat(offsets, ACTIONS)
+
+    sessions = 200
+    named = [f.name for seed in range(sessions) for f in reasons(session(seed, rate_hz=uneven(seed)))]
+    most = binom.isf(1e-4, sessions, LEVEL)
+    assert all(named.count(name) <= most for name in ("trend", "answers"))
+
+
+def test_a_trend_is_a_reason_only_where_the_returns_have_it_too() -> None:
+    for seed in range(20):
+        assert "trend" not in {
+            found.name for found in reasons(session(seed, rate_hz=falling, returns=lambda *_: -worse()))
+        }
+        found = {
+            each.name: each for each in reasons(session(seed, gap=1, rate_hz=falling, returns=lambda *_: -worse()))
+        }
+        # Of an expected fall by 25 %; the standard error is that of some 20 episodes.
+        assert found["trend"].value == pytest.approx(-0.25, abs=0.15)
+
+
+def test_a_simulator_that_remembers_is_not_told_that_it_does_not() -> None:
+    knows = {"simulator": SimpleNamespace(has_memory=True)}
+    assert "memory" not in {f.name for f in reasons(session(1, rate_hz=remembering, calibration=knows))}
+
+
+def test_of_few_episodes_no_trend_and_no_share_is_told() -> None:
+    evidence = session(1, **CASES["answers"][0])
+    answered = evidence.answered
+    kept = answered.episode < 7
+    few = replace(
+        answered,
+        responses=replace(
+            answered.responses,
+            **{
+                name: getattr(answered.responses, name)[kept]
+                for name in ("condition", "rate_hz", "active_ratio", "is_burst", "time_s", "place")
+            },
+        ),
+        **{name: getattr(answered, name)[kept] for name in ("episode", "late_s", "moved", "passed")},
+        returns=answered.returns[:7],
+    )
+    assert reasons(replace(evidence, answered=few)) == ()
