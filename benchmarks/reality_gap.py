@@ -3,12 +3,16 @@
     python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation]
         [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
         [--controls] [--out gap/]
+    python benchmarks/reality_gap.py --backends virtual cl1 maxone --channels 1024 256 128 60 16
 
 For each virtual culture and way - the commands without options, as in the README; the paper's blocks with one pulse,
 mixed with one, mixed with five, and mixed with one, recorded five times as long and simulated with its memory, through
 one threshold and through nine - the culture is
 recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same culture from where the last
 recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
+
+With `--backends` each culture is opened once, recorded once as in `memory9`, and run: the virtual culture with so many
+channels, the CL1 through its SDK's simulator and the MaxOne through the tests' stand-in, both over the same tissue.
 """
 
 from __future__ import annotations
@@ -16,10 +20,11 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import backends
 from animat.cli import main as animat
 
 COLUMNS = (
@@ -100,9 +105,21 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, help="default: the paper's")
     parser.add_argument("--controls", action="store_true", help="all controls, not the random one only")
     parser.add_argument("--out", type=Path, default=Path("gap"))
+    parser.add_argument("--backends", nargs="+", choices=["virtual", "cl1", "maxone"], default=[])
+    parser.add_argument("--channels", type=int, nargs="+", default=[1024], help="of the virtual culture")
     options = parser.parse_args()
 
     lines: list[str] = []
+    if options.backends:
+        asked = [
+            (backend, n) for backend in options.backends for n in (options.channels if backend == "virtual" else [0])
+        ]
+        for seed, (backend, channels), robot in itertools.product(options.seeds, asked, options.robots):
+            lines.append(f"| {backend} {channels or ''} {live_once(backend, channels, seed, robot, options)}")
+            print(lines[-1], flush=True)
+        print(f"\n| backend | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
+        print("\n".join(lines))
+        return
     for seed, (name, way) in itertools.product(options.seeds, ((name, WAYS[name]) for name in options.ways)):
         of_recording = recording_options(way)
         recordings = str(options.out / f"culture{seed}" / ("-".join(of_recording[3::2]) or name))
@@ -122,6 +139,44 @@ def main() -> None:
                 print(lines[-1], flush=True)
     print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
     print("\n".join(lines))
+
+
+def live_once(backend: str, channels: int, seed: int, robot: str, options: argparse.Namespace) -> str:
+    """A line of the table: a culture that is opened once is recorded, and driven by policies trained on that."""
+    from animat.cultures.kinds import pulse_for
+    from animat.neurons.series import extract_series
+    from animat.reality_gap import Calibration, run_policies
+    from animat.recordings.protocol import CLOSED_LOOP
+    from animat.training.policy import load_policies
+
+    way = WAYS["memory9"]
+    folder = options.out / f"culture{seed}" / f"{backend}{channels or ''}" / robot
+    table = folder / "once.json"
+    if not table.exists():
+        with backends.opened(backend, channels, seed) as culture:
+            pulse = pulse_for(backend)
+            protocol = replace(CLOSED_LOOP, patterns=min(100, len(culture.patterns)), pulse=pulse)
+            recording = culture.record(protocol, seed=seed)
+            recordings = folder / f"recordings{int(culture.now_s)}"
+            recordings.mkdir(parents=True, exist_ok=True)
+            recording.save(recordings / "recording.nwb")
+            given = training_options(way, robot, options.policies, options.iterations)
+            out = str(free(folder / "policies"))
+            expect(["train", robot, "--recordings", str(recordings), *given, "--out", out])
+            policies = load_policies(out)
+            calibration = Calibration.of_series(extract_series([recording]), next(iter(policies.values())))
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                free(folder / "session"),
+                episodes=options.episodes,
+                with_controls=options.controls,
+                pulse=pulse,
+                patterns=protocol.patterns,
+            )
+        table.write_text(json.dumps(gap.to_dict()) + "\n")
+    return told(seed, way, "follow", json.loads(table.read_text()))
 
 
 def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:

@@ -16,6 +16,7 @@ import pytest
 from animat.cultures.base import Culture
 from animat.cultures.cl1 import CL1_LIMITS, CL1_PULSE, SITES, CL1Culture
 from animat.cultures.contract import CultureContract
+from animat.cultures.same_culture import other_culture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import said
 from animat.recordings.protocol import Protocol
@@ -54,6 +55,20 @@ def test_a_channel_that_cannot_stimulate_is_refused_by_name(channel: int, what: 
     with CL1Culture() as culture, pytest.raises(UnsafeStimulus, match=f"got electrode {channel}") as refused:
         culture.deliver([Stimulus(0.0, (1, channel), CL1_PULSE)], 0.1)
     assert refused.value.limit == "sites"
+
+
+def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with CL1Culture() as culture:
+        culture.rest(60.0)
+        recording = culture.record(Protocol(pulse=CL1_PULSE, presentations=2, patterns=2, setup_s=0.1), seed=1)
+        assert other_culture(recording, recording.start_min, culture) is None
+    install(monkeypatch)
+    with CL1Culture() as culture:
+        culture.rest(62.0)
+        found = other_culture(recording, recording.start_min, culture)
+    assert recording.duration_s > 5
+    assert found is not None and found.name == "other-culture"
+    assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.sentence
 
 
 def pulse(*numbers: float) -> Pulse:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from animat.cultures import cl1_source
 from animat.cultures.cl1 import NO_STIMULATION
 from animat.cultures.cl1_source import BEFORE, REAL_TIME_NEURONS, SAMPLES, SimulatedCL1
 from animat.errors import InvalidArgument
@@ -101,6 +103,36 @@ def test_late_stimuli_act_at_once_and_clash_with_nothing() -> None:
     culture.stimulate([event(1003, 9)])
     culture.read(1000, 500)
     culture.read(1500, 2)
+
+
+def test_timing_it_leaves_it_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    timed, fresh = (SimulatedCL1(2, neurons=100) for _ in range(2))
+    passed = iter([10.0, 10.03])
+    monkeypatch.setattr(cl1_source.time, "perf_counter", lambda: next(passed))
+    assert timed.share_of_real_time() == pytest.approx(0.3)
+    frames, spikes = timed.read(0, 1000)
+    expected, as_expected = fresh.read(0, 1000)
+    np.testing.assert_array_equal(frames, expected)
+    assert [spike[:2] for spike in spikes] == [spike[:2] for spike in as_expected]
+    with pytest.raises(InvalidArgument, match="got one that was read to frame 1000"):
+        timed.share_of_real_time()
+
+
+@pytest.mark.parametrize(
+    ("neurons", "share", "words"),
+    [
+        (100, 0.69, None),
+        (100, 0.71, r"of 100 neurons in real time: .* takes 0.71 s here"),
+        (201, 0.1, r"of 201 neurons in real time: .*; 200 neurons leave 30 % .* to spare"),
+    ],
+)
+def test_a_culture_too_large_for_real_time_says_so(
+    neurons: int, share: float, words: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    culture = SimulatedCL1(2, neurons=neurons)
+    monkeypatch.setattr(culture, "share_of_real_time", lambda: share)
+    told = culture.too_large()
+    assert told is None if words is None else told is not None and re.search(words, told)
 
 
 @pytest.mark.parametrize("bad", [{"pitch_um": 0.0}, {"reach_um": -1.0}, {"charge_nc": float("nan")}])

@@ -6,6 +6,9 @@ use_simulated_culture(seed=1)          # before `cl.open()`; the SDK's simulator
 
 from __future__ import annotations
 
+import os
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
@@ -23,8 +26,12 @@ from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION
 FACTORY = "animat.cultures.cl1_source:simulated_culture"
 UV_PER_UNIT = 0.195
 BLOCK_FRAMES = 1024
-REAL_TIME_NEURONS = 300
-"""As many kept up with an application that stimulates on every spike, 1,000 ticks a second, on a machine left to it."""
+REAL_TIME_NEURONS = 200
+"""With as many, an application that stimulates on every spike at 1,000 ticks a second leaves 30 % of two cores free."""
+REAL_TIME_SHARE = 0.7
+"""Of real time, what computing may take."""
+TRIED_FRAMES, FRAMES_AT_ONCE = 2_500, 5
+"""How much is tried at opening, and in what pieces: as the SDK reads in real time."""
 SAMPLES = 75
 BEFORE = 25
 """Samples of a spike that the SDK shows, and how many of them lie before its time."""
@@ -58,10 +65,10 @@ class SimulatedCL1:
     Args:
         seed: which culture.
         neurons: of the tissue; with fewer than 1,200, each has fewer partners in proportion. More than the default may
-            be too many for real time: the application then falls behind the SDK's buffer.
+            be too many for real time, which opening says: the application then falls behind the SDK's buffer.
         pitch_um: between electrodes, in the middle of the tissue. Assumed: the SDK does not say.
         reach_um: of an electrode; assumed, and wider than a CMOS array's, as its electrodes are larger.
-        charge_nc: that makes a pulse of strength 1; assumed: the SDK's usual 160 us at 2 uA.
+        charge_nc: that makes a pulse of strength 1; assumed: what a bare current of 1 uA has in the SDK (160 us).
         noise_uv: root mean square of the noise.
 
     Raises:
@@ -75,7 +82,7 @@ class SimulatedCL1:
         neurons: int = REAL_TIME_NEURONS,
         pitch_um: float = 200.0,
         reach_um: float = 100.0,
-        charge_nc: float = 0.32,
+        charge_nc: float = 0.16,
         noise_uv: float = 2.4,
     ) -> None:
         for name, value in (("pitch_um", pitch_um), ("reach_um", reach_um), ("charge_nc", charge_nc)):
@@ -111,7 +118,7 @@ class SimulatedCL1:
         self._next = 0
         self._pulses: list[Pulse] = []
         self._held: list[tuple[int, int, int]] = []
-        self._tail = np.zeros((SAMPLES, CHANNELS), np.float32)
+        self._sounding: list[tuple[int, int, int]] = []
         self._block: tuple[int, Int16[np.ndarray, "frames channels"]] | None = None
 
     def stimulate(self, events: Sequence[StimulusEvent]) -> None:
@@ -143,17 +150,48 @@ class SimulatedCL1:
         # What was skipped was not looked at.
         due = [spike for spike in self._held if from_frame <= spike[0] < to_frame]
         self._held = [spike for spike in self._held if spike[0] >= to_frame]
+        sounding = [*(self._sounding if from_frame == self._next else ()), *due]
         frames = self._noise(from_frame, frame_count)
-        signal = np.zeros((frame_count + SAMPLES, CHANNELS), np.float32)
-        if from_frame == self._next:
-            signal[: len(self._tail)] += self._tail
-        for frame, channel, neuron in due:
-            first = frame - from_frame
-            signal[first : first + SAMPLES - BEFORE, channel] += self._shapes[neuron, BEFORE:] / np.float32(UV_PER_UNIT)
-        self._tail = signal[frame_count:].copy()
+        if sounding:
+            signal = frames.astype(np.float32)
+            for frame, channel, neuron in sounding:
+                shape = self._shapes[neuron, BEFORE:] / np.float32(UV_PER_UNIT)
+                here = shape[max(0, from_frame - frame) : to_frame - frame]
+                first = max(0, frame - from_frame)
+                signal[first : first + len(here), channel] += here
+            frames = np.clip(np.rint(signal), -32768, 32767).astype(np.int16)
+        self._sounding = [spike for spike in sounding if spike[0] + SAMPLES - BEFORE > to_frame]
         self._next = to_frame
-        frames = np.clip(np.rint(frames + signal[:frame_count]), -32768, 32767).astype(np.int16)
         return frames, [(frame, channel, self._shapes[neuron]) for frame, channel, neuron in due]
+
+    def share_of_real_time(self) -> float:
+        """What computing takes of real time, timed on a tenth of a second in pieces as the SDK reads them.
+
+        Afterwards the culture is where it was. Stimuli come on top, and what the application computes in its process.
+
+        Raises:
+            InvalidArgument: for a culture that was read.
+        """
+        if self._next:
+            raise InvalidArgument(f"expected a culture that was not read, got one that was read to frame {self._next}")
+        before, begun_s = self._tissue.snapshot(), time.perf_counter()
+        for frame in range(0, TRIED_FRAMES, FRAMES_AT_ONCE):
+            self.read(frame, FRAMES_AT_ONCE)
+        took_s = time.perf_counter() - begun_s
+        self._tissue.restore(before)
+        self._next, self._held, self._sounding = 0, [], []
+        return took_s / (TRIED_FRAMES / FRAMES_PER_S)
+
+    def too_large(self) -> str | None:
+        """What there is to say of a culture that real time may not carry; None of one that it does."""
+        neurons, share = len(self._sees), self.share_of_real_time()
+        if neurons <= REAL_TIME_NEURONS and share <= REAL_TIME_SHARE:
+            return None
+        return (
+            f"warning: a simulated culture of {neurons} neurons in real time: computing a second of it takes "
+            f"{share:.2f} s here, stimuli and the application not counted; {REAL_TIME_NEURONS} neurons leave 30 % of "
+            "two idle cores to spare: take fewer, or CL_SDK_ACCELERATED_TIME=1"
+        )
 
     def _advance(self, to_frame: int) -> None:
         """Step the tissue to the end of the step that the frames end within."""
@@ -177,7 +215,7 @@ class SimulatedCL1:
         ) & self._is_electrode
         return [np.flatnonzero(row).tolist() for row in near]
 
-    def _noise(self, from_frame: int, count: int) -> Float32[np.ndarray, "frames channels"]:
+    def _noise(self, from_frame: int, count: int) -> Int16[np.ndarray, "frames channels"]:
         """Noise of these frames, drawn block by block so that it does not depend on how it is read."""
         pieces, frame = [], from_frame
         while frame < from_frame + count:
@@ -190,7 +228,7 @@ class SimulatedCL1:
             taken = min(BLOCK_FRAMES - first, from_frame + count - frame)
             pieces.append(self._block[1][first : first + taken])
             frame += taken
-        return np.concatenate(pieces).astype(np.float32)
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
 
 def _waveform() -> Float64[np.ndarray, " samples"]:
@@ -222,6 +260,9 @@ def simulated_culture(**settings: Any) -> Any:
 
         def open(self) -> None:
             self._culture = SimulatedCL1(**settings)
+            is_real_time = os.environ.get("CL_SDK_ACCELERATED_TIME") != "1"
+            if is_real_time and (told := self._culture.too_large()) is not None:
+                print(told, file=sys.stderr, flush=True)
 
         def close(self) -> None:
             self._culture = None

@@ -1,4 +1,4 @@
-"""Whether a virtual culture is the one that recordings are of, and not before them on its clock."""
+"""Whether a culture is the one that recordings are of, and not before them on its clock, as far as it tells."""
 
 from __future__ import annotations
 
@@ -9,19 +9,27 @@ from animat.recordings.recording import Recording
 
 
 def other_culture(recording: Recording, start_min: float, culture: Culture) -> Finding | None:
-    """What there is to say of a virtual culture that is not the one recorded; None if it is, or is no virtual one.
+    """What there is to say of a culture that is not the one recorded; None if it is, or tells nothing of it.
 
     Percentiles are those of one culture at one time. A culture whose clock is before its recording did not live through
-    it: it was begun anew, or from a state before.
+    it: it was begun anew, or from a state before. Of a CL1 the clock alone tells: the SDK's simulator begins anew
+    whenever it is opened, and a simulated culture with it. Other devices' clocks tell nothing.
 
     Args:
         recording: of the culture.
         start_min: when the recording that percentiles are taken from began, on the culture's clock.
         culture: open.
     """
+    now_min, told = culture.now_s / 60, recording.provenance
+    if culture.name == "cl1" and now_min < start_min + recording.duration_s / 60:
+        sentence = (
+            f"the CL1's clock is at {now_min:.1f} min, before the end of the recording at {start_min:.1f} min that "
+            "percentiles are of: the device was started anew, as the SDK's simulator is whenever it is opened, and a "
+            "simulated culture then is anew too: another time has other percentiles"
+        )
+        return Finding("other-culture", "warning", sentence, start_min - now_min)
     if not isinstance(culture, VirtualCulture):
         return None
-    now_min, told = culture.now_s / 60, recording.provenance
     differ = [name for name, words in culture.settings.items() if told.get(name) != words]
     if differ:
         of = f"virtual culture {told.get('seed')}"
