@@ -158,3 +158,19 @@ def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
     # Rows that belong to one presentation are read once.
     one = of_spikes(spikes, twice, 40, source.duration_s, presentation=np.repeat(np.arange(120), 2).tolist())
     assert "simultaneous-stimuli" not in {f.name for f in noticed(one)}
+
+
+def contradicted(stated_hz: np.ndarray) -> str | None:
+    source = make_up_recording(1, start_min=0.0, patterns=25, channels=16)
+    stimuli = dataclasses.replace(source.stimuli, frequency_hz=stated_hz[: len(source.stimuli)])
+    found = noticed(dataclasses.replace(source, stimuli=stimuli))
+    return next((f.sentence for f in found if f.name == "other-frequencies"), None)
+
+
+def test_frequencies_of_other_stimuli_are_warned_of() -> None:
+    true_hz = make_up_recording(1, start_min=0.0, patterns=25, channels=16).stimuli.frequency_hz
+    assert contradicted(true_hz) is None
+    swapped = np.select([true_hz == 5, true_hz == 80], [80.0, 5.0], true_hz)
+    assert "said to come at 5 Hz are 0.0125 s apart (median), not 0.2 s" in str(contradicted(swapped))
+    # Pauses between stimuli are none of a frequency's business.
+    assert contradicted(np.full(len(true_hz), 80.0)) is None

@@ -11,6 +11,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording, Stimuli
 
 NAME = "times-not-in-seconds"
+CONTRADICTED = "other-frequencies"
 FAR = 30.0
 """Intervals are this many times as long, or as short, as stated frequencies say."""
 AGREE = 0.05
@@ -29,14 +30,15 @@ ENOUGH_SPIKES, ENOUGH_STIMULI = 1000, 20
 
 
 def time_findings(recording: Recording) -> Iterator[Finding]:
-    """A finding on times that cannot be in seconds (`times-not-in-seconds`), if they cannot.
+    """A finding on times that cannot be in seconds (`times-not-in-seconds`), or belie stated frequencies.
 
     They cannot where the intervals between stimuli are the same multiple of what stated frequencies, 1.5 times apart or
     more, ask for, and it is the multiple of a known unit; where a recording of more than two hours has hardly two
     spikes of a channel within half a second and a median rate under 0.02 Hz, or no spike within 100 ms after any
     stimulus; where the median channel fires at more than 200 Hz; or where nearly all stimuli come after the last spike.
     Another multiple, above 30 or below 1/30, is warned of: trains of 100 pulses, a row each, have intervals 100 times
-    as long.
+    as long. Where no factor is common to all and stimuli come sooner than stated, in two thirds of the time or less,
+    the frequencies are warned of (`other-frequencies`); later ones may have pauses between them.
 
     Args:
         recording: with any spikes and stimuli.
@@ -48,6 +50,8 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
         yield Finding(NAME, "refuse", reason)
     elif stated is not None:
         yield stated
+    elif (contradicted := _contradicted(recording.stimuli)) is not None:
+        yield contradicted
 
 
 def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
@@ -73,6 +77,28 @@ def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
                 + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?"),
             )
     return None
+
+
+def _contradicted(stimuli: Stimuli) -> Finding | None:
+    """Stimuli that come sooner than their stated frequency lets them."""
+    interval_s, sooner = np.diff(stimuli.time_s), []
+    # A pulse may be said to be at the frequency of the interval before it, or of the one after it.
+    for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
+        known = ~np.isnan(frequency_hz) & (interval_s > 0)
+        of = {f: (interval_s * f)[known & (frequency_hz == f)] for f in np.unique(frequency_hz[known])}
+        medians = [(float(np.median(m)), float(f)) for f, m in of.items() if len(m) >= ENOUGH_STIMULI]
+        sooner.append(min(medians, default=(1.0, 0.0)))
+    least, frequency_hz = max(sooner)
+    if least > 1 / APART:
+        return None
+    return Finding(
+        CONTRADICTED,
+        "warning",
+        f"stimuli that are said to come at {frequency_hz:g} Hz are {least / frequency_hz:.3g} s apart (median), not "
+        f"{1 / frequency_hz:.3g} s: correct the frequencies, or sort the stimuli by their times (--conditions "
+        "interval:5,10)",
+        least,
+    )
 
 
 def _unit(multiple: float, sampling_rate_hz: float) -> str | None:
