@@ -32,7 +32,17 @@ MAY_IMPORT = {
     "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
     "cultures": {"recordings"},
     "closed_loop": {"cultures", "evaluation", "neurons", "mapping", "robots", "recordings"},
-    "reality_gap": {"closed_loop", "cultures", "evaluation", "training", "animat", "neurons", "robots", "recordings"},
+    "reality_gap": {
+        "closed_loop",
+        "cultures",
+        "evaluation",
+        "training",
+        "animat",
+        "mapping",
+        "neurons",
+        "robots",
+        "recordings",
+    },
     "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
     "studies": {
