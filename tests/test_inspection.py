@@ -212,7 +212,7 @@ def test_organoid(real_data: Path) -> None:
     text = inspection_text(inspection)
     assert "2,775 stimuli" in text
     assert "20.26 spikes in 2-10 ms per stimulus" in text
-    assert inspection.verdict == "usable with warnings"
+    assert inspection.verdict == "usable with care"
     found = {f.name: f for f in inspection.findings}
     # One hump of ratios: Otsu would drop more than half of the responses.
     assert inspection.n_bursts == 0
