@@ -88,14 +88,14 @@ def _contradicted(stimuli: Stimuli) -> Finding | None:
         of = {f: (interval_s * f)[known & (frequency_hz == f)] for f in np.unique(frequency_hz[known])}
         medians = [(float(np.median(m)), float(f)) for f, m in of.items() if len(m) >= ENOUGH_STIMULI]
         sooner.append(min(medians, default=(1.0, 0.0)))
-    least, frequency_hz = max(sooner)
+    least, stated_hz = max(sooner)
     if least > 1 / APART:
         return None
     return Finding(
         CONTRADICTED,
         "warning",
-        f"stimuli that are said to come at {frequency_hz:g} Hz are {least / frequency_hz:.3g} s apart (median), not "
-        f"{1 / frequency_hz:.3g} s: correct the frequencies, or sort the stimuli by their times (--conditions "
+        f"stimuli that are said to come at {stated_hz:g} Hz are {least / stated_hz:.3g} s apart (median), not "
+        f"{1 / stated_hz:.3g} s: correct the frequencies, or sort the stimuli by their times (--conditions "
         "interval:5,10)",
         least,
     )
