@@ -346,14 +346,14 @@ def kicked(tissue: Tissue, neuron: int) -> bool:
 
 
 def test_the_conduction_of_a_stimulated_axon_follows_its_load() -> None:
-    # Against Euler steps of 0.1 s of d(load)/dt = -load / T and d(missing)/dt = (load - missing) / T'.
-    p = dataclasses.replace(SILENT, load_gain=0.2, load_min=3.0, conduction_min=8.0)
+    # Against Euler steps of 0.1 s of d(load)/dt = -load / T and d(missing)/dt = (loss load - missing) / T'.
+    p = dataclasses.replace(SILENT, load_gain=0.2, load_min=3.0, conduction_loss=0.9, conduction_min=8.0)
     tissue, load, missing = Tissue(1, p), 0.0, 0.0
     came, expected = 0, 0.0
     for _ in range(300):
         later(tissue, 20.0)
         for _ in range(200):
-            load, missing = load - 0.1 * load / 180, missing + 0.1 * (load - missing) / 480
+            load, missing = load - 0.1 * load / 180, missing + 0.1 * (0.9 * load - missing) / 480
         expected += 1 - missing
         if kicked(tissue, 0):
             came += 1

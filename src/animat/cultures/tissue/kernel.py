@@ -60,6 +60,7 @@ class Constants(NamedTuple):
     scaling_recovery_s: float
     load_gain: float
     load_s: float
+    conduction_loss: float
     conduction_s: float
     n_excitatory: int
 
@@ -236,7 +237,7 @@ def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: i
     """Whether neuron i's stimulated axon brings its spike to the soma: what is missing follows the load, slowly."""
     since_s = (step - state.last_driven[i]) * constants.step_s
     load_kept, missing_kept = math.exp(-since_s / constants.load_s), math.exp(-since_s / constants.conduction_s)
-    follows = constants.load_s / (constants.load_s - constants.conduction_s)
+    follows = constants.conduction_loss * constants.load_s / (constants.load_s - constants.conduction_s)
     missing = state.missing[i] * missing_kept + follows * state.load[i] * (load_kept - missing_kept)
     if uniform(mixed(wiring.axon_key[i], step)) < missing:
         return False

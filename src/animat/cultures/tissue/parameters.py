@@ -161,8 +161,10 @@ class TissueParameters:
     """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
     load_min: float = 30.0
     """[C] Time constant with which the load leaves."""
+    conduction_loss: float = 0.85
+    """[C] Share of such spikes that an axon at full load fails to bring in the long run."""
     conduction_min: float = 90.0
-    """[C] Time constant with which the share of them that fail follows the load (Grubb & Burrone 2010: hours)."""
+    """[C] Time constant with which conduction follows the load (axon initial segments: Grubb & Burrone 2010, hours)."""
     drift_share: float = 0.03
     drift_min: float = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""

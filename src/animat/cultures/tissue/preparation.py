@@ -59,6 +59,7 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
         scaling_recovery_s=parameters.scaling_min * 60,
         load_gain=parameters.load_gain,
         load_s=parameters.load_min * 60,
+        conduction_loss=parameters.conduction_loss,
         conduction_s=parameters.conduction_min * 60,
         n_excitatory=parameters.n_excitatory,
     )
