@@ -25,7 +25,7 @@ install_import_hook(
     "beartype.beartype",
 )
 
-from animat.compilation import keep_compilations  # noqa: E402
+from animat.compilation import keep_compilations, user_cache  # noqa: E402
 from animat.cultures import holding  # noqa: E402
 
 # The same random examples each time; others with --hypothesis-profile=default.
@@ -34,9 +34,11 @@ settings.load_profile("the same")
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compilations_kept() -> None:
-    """Compile each program once a machine, not once a run of the tests."""
+def caches() -> Iterator[None]:
+    """Compile each program once a machine, not once a run of the tests; libraries that want a cache have one."""
     keep_compilations()
+    with user_cache():
+        yield
 
 
 _NUMBERS = itertools.count()
