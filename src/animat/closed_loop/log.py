@@ -33,7 +33,7 @@ MAGIC = b"ANIMATL1"
 _RECORD = b"REC1"
 _HEAD = struct.Struct("<4sIII")
 _BUFFER_BYTES = 2**18
-_BLOCK_BYTES = 2**22
+_BLOCK_BYTES = 2**23
 """Of the log, that spikes are read from in one go."""
 _NO_TIMES, _NO_CHANNELS = np.empty(0, np.float64), np.empty(0, np.int64)
 
