@@ -16,7 +16,7 @@ from scipy.stats import binom
 from animat.animat import Animat
 from animat.cli import main
 from animat.errors import UnusableData
-from animat.evaluation.grid import grid_for
+from animat.robots.grid import grid_for
 from animat.evaluation.optimum import Optimum, best_return, rough_values
 from animat.evaluation.prospects import prospects
 from animat.evaluation.resampling import _rough, with_intervals

@@ -29,6 +29,7 @@ def check_robot(robot: Robot[Any]) -> None:
 
     name = _named(robot)
     observations, noise = len(robot.quantities), robot.noise_size
+    heuristic = getattr(robot, "heuristic", None)
 
     def episode(key: Any) -> Any:
         state = _tried(f"{name}.reset", robot.reset, key)
@@ -47,6 +48,8 @@ def check_robot(robot: Robot[Any]) -> None:
             _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
             seen = _tried(f"{name}.observe", robot.observe, after)
             told.append((after, seen, jnp.asarray(reward, jnp.float32)))
+            if heuristic is not None:
+                _expect_shape(f"{name}.heuristic", _tried(f"{name}.heuristic", heuristic, seen), (), "a command")
         return told
 
     # Under jit: what a step may not do there is seen here, and it is compiled once.
