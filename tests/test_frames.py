@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.robots.drawing import ACCENT, BODY, GOAL_FILL, INK, PAPER, TRAIL, Canvas, draw_robot
 from animat.robots import Cartpole, Navigation
+from animat.robots.drawing import ACCENT, BODY, GOAL_FILL, INK, PAPER, TRAIL, Canvas, draw_robot
 
 
 def places(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:

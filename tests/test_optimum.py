@@ -15,7 +15,6 @@ import pytest
 from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import commands_of
-from animat.robots.grid import Axis, Grid, grid_for
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import cubic
@@ -24,6 +23,7 @@ from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import EmpiricalSimulator
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
+from animat.robots.grid import Axis, Grid, grid_for
 from animat.robots.navigation import Navigation, NavigationState
 
 SIMULATOR = made_up_simulator()

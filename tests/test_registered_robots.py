@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import re
 import subprocess
@@ -19,6 +20,7 @@ import pytest
 
 from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
+from animat.evaluation.table import evaluate
 from animat.recordings.made_up import write_made_up_series
 from animat.robots import ROBOTS, Cartpole, Navigation, Robot, register_robot, registry, robot_named, robot_to_dict
 from animat.robots.capabilities import WITHOUT, lacking
@@ -78,7 +80,7 @@ def written(folder: Path, *changes: tuple[str, str]) -> str:
     return f"my_changed{number}:Rover"
 
 
-def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path, capsys: Any) -> None:
+def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path) -> None:
     # Six policies are two groups, each in a worker of its own.
     training = Training(ROVER, "1-threshold", policies=6, iterations=480, algorithm=SMALL)
     trained = train(training, timeline_of(), package / "policies", workers=2)
@@ -95,9 +97,14 @@ def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path,
     # No file makes anything be imported.
     assert "my_package" not in sys.modules
     robot_named(ROVER)
-    assert list(load_policies(package / "policies")) == list(trained)
+    loaded = load_policies(package / "policies")
+    evaluation = evaluate(loaded, timeline_of(), episodes=5, limit_resolution=1.0)
+    assert evaluation.robot == "rover" and evaluation.names == tuple(trained)
+    assert "rover has no method `value_grid`" in (evaluation.no_limit or "")
+    assert "no rule made by hand among the controls: rover has no method `heuristic`" in evaluation.to_text()
 
 
+@pytest.mark.oracle
 def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: Any) -> None:
     write_made_up_series(0, "recordings", sessions=1)
     few = ["--recordings", "recordings", "--policies", "1", "--iterations", "256", "--workers", "1"]
@@ -120,6 +127,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     assert "no best possible return: robot: rover has no method `value_grid`" in said
 
 
+@pytest.mark.oracle
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
@@ -139,6 +147,7 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
     assert not list((package / "study" / "figures").glob("rover-frames*"))
 
 
+@pytest.mark.oracle
 def test_what_is_registered_in_a_script_is_found_by_its_workers(package: Path) -> None:
     """A script's own robot, which is `__main__`'s; what it prints is not taken for what a worker tells."""
     script = """
@@ -158,7 +167,7 @@ if __name__ == "__main__":
     training = animat.Training(Mine(), "1-threshold", policies=1, iterations=240, algorithm=SMALL)
     print(animat.train(training, timeline_of(), "out")["p0"].robot)
 """
-    environment = {"PYTHONPATH": ":".join([str(Path(__file__).parent), *sys.path])}
+    environment = {**os.environ, "PYTHONPATH": ":".join([str(Path(__file__).parent), *sys.path])}
     (package / "my_script.py").write_text(script)
     ran = subprocess.run([sys.executable, "my_script.py"], capture_output=True, text=True, env=environment)
     assert ran.stdout.splitlines() == ["imported", "Mine(gain_m=0.1, episode_limit=20)"], ran.stderr

@@ -53,7 +53,12 @@ def check_robot(robot: Robot[Any]) -> None:
         return told
 
     # Under jit: what a step may not do there is seen here, and it is compiled once.
-    for state, seen, reward in jax.device_get(jax.jit(episode)(jax.random.key(0))):
+    try:
+        told = jax.device_get(jax.jit(episode)(jax.random.key(0)))
+    except InvalidArgument as error:
+        # JAX has put a note of its own to it.
+        raise InvalidArgument(str(error)) from error.__cause__
+    for state, seen, reward in told:
         for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
             if not all(np.all(np.isfinite(value)) for value in values):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
