@@ -176,8 +176,8 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     told = json.loads(json.dumps(gap.to_dict()))
     assert (told["limit"], told["gap_share"]) == (None, None)
     (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-limit"]
-    assert sentence == "no best possible return, as these conditions have too few responses: 80 Hz (3)"
-    assert "best possible return" not in gap.to_text()
+    assert sentence == "no best possible return: these conditions have too few responses: 80 Hz (3)"
+    assert sentence in gap.to_text() and "best possible return on this" not in gap.to_text()
 
 
 def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may_come_from(
