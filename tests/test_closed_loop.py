@@ -40,7 +40,6 @@ from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
 from animat.robots import Cartpole, Navigation, Robot
-from animat.robots.steering import steering
 from cultures import small_culture
 from fake_culture import CHANNELS, FakeCulture
 
@@ -466,7 +465,7 @@ def test_a_session_needs_an_open_culture_contenders_and_a_folder_of_its_own(tmp_
 
 
 def test_the_hand_made_rule_steers_the_right_way() -> None:
-    rule = HandMadeRule(Cartpole(), up=4, down=0)
+    rule = HandMadeRule(Cartpole(), (-0.4, -0.1, 0.0, 0.1, 0.4))
     rng = np.random.default_rng(1)
     assert rule.act(np.array([0.0, 0.0, 0.1, 0.0]), rng) == 4
     assert rule.act(np.array([0.0, 0.0, 0.05, -1.0]), rng) == 0
@@ -476,8 +475,8 @@ def test_the_hand_made_rule_steers_the_right_way() -> None:
     places = rng.uniform([-1, -1, -np.pi], [1, 1, np.pi], (500, 3))
     to_goal = np.arctan2(navigation.goal_y_m - places[:, 1], navigation.goal_x_m - places[:, 0]) - places[:, 2]
     turn_rad = (to_goal + np.pi) % (2 * np.pi) - np.pi
-    np.testing.assert_array_equal(np.sign(steering(navigation, places)), np.sign(turn_rad))
-    names = [c.name for c in controls(Cartpole(), ["a", "b"], strongest=1, weakest=0, policies={"p0": rule})]
+    np.testing.assert_array_equal([navigation.heuristic(place) for place in places], np.sign(turn_rad))
+    names = [c.name for c in controls(Cartpole(), ["a", "b"], means=(-0.2, 0.2), policies={"p0": rule})]
     assert names == ["random", "constant a", "constant b", "silent", "shuffled", "made by hand"]
 
 
@@ -489,7 +488,7 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
         body = Body(robot, np.random.default_rng(1))
         observation, total = body.reset(0), 0.0
         for _ in range(robot.episode_limit):
-            moved = body.step(sign * (1.0 if steering(robot, observation) > 0 else -1.0))
+            moved = body.step(sign * robot.heuristic(observation))
             observation, total = moved.observation, total + moved.reward
             if moved.terminated:
                 break

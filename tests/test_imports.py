@@ -43,7 +43,7 @@ MAY_IMPORT = {
         "robots",
         "recordings",
     },
-    "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "recordings"},
+    "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "robots", "recordings"},
     "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
     "studies": {
         "recordings",
@@ -56,7 +56,7 @@ MAY_IMPORT = {
         "evaluation",
         "report",
     },
-    "gym": {"animat", "neurons", "mapping", "robots", "recordings", "report"},
+    "gym": {"animat", "neurons", "mapping", "robots", "recordings"},
 }
 """Each room, and the rooms before it in the story that it may look into; `cli` and the public names look into all."""
 

@@ -15,7 +15,6 @@ import pytest
 from animat.animat import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import commands_of
-from animat.evaluation.grid import Axis, Grid, grid_for
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import cubic
@@ -24,6 +23,7 @@ from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import EmpiricalSimulator
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
+from animat.robots.grid import Axis, Grid, grid_for
 from animat.robots.navigation import Navigation, NavigationState
 
 SIMULATOR = made_up_simulator()
@@ -311,7 +311,7 @@ def test_refusals_say_what_to_do() -> None:
         best_returns([(environment, SIMULATOR), (Animat(Cartpole(), Thresholds(1), 5), SIMULATOR)])
     with pytest.raises(InvalidArgument, match="simulator"):
         best_return(environment, None)
-    with pytest.raises(InvalidArgument, match="hand in a Grid"):
+    with pytest.raises(InvalidArgument, match="has no method `value_grid`"):
         best_return(Animat(Stairs(), Thresholds(1), 2), coins(3, 6))
     with pytest.raises(InvalidArgument, match="angle_limit_rad"):
         grid_for(Cartpole.as_printed())

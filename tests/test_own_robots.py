@@ -1,4 +1,7 @@
-"""Robots and mappings of one's own: what cannot be trained or loaded again is refused before the first iteration."""
+"""Robots and mappings of one's own: what cannot be trained or loaded again is refused before the first iteration.
+
+How a robot is registered, and what is done with it then, is in `test_registered_robots.py`.
+"""
 
 from __future__ import annotations
 
@@ -101,10 +104,10 @@ def test_names_stand_for_robots_and_mappings() -> None:
 @pytest.mark.parametrize(
     ("robot", "mapping", "words"),
     [
-        (Slider(), Thresholds(1), r"^robot: .* \(cartpole, navigation\), got one of one's own \(Slider\).*in memory"),
+        (Slider(), Thresholds(1), "^robot: expected one that is registered.* got Slider, .*register_robot.*in memory"),
         (Cartpole(), Push(), r"^mapping: .* got one of one's own \(Push\), .* train in memory: train\("),
         # The name of another, which would be loaded in its place.
-        (slider(name="cartpole"), Thresholds(1), "got one of one's own"),
+        (slider(name="cartpole"), Thresholds(1), "^robot: expected one that is registered.* got Changed"),
     ],
 )
 def test_what_could_not_be_loaded_again_is_refused_before_the_first_iteration(
@@ -122,7 +125,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
     assert list(policies) == ["p0"] and progress.told[-1] == (60, 60)
     for policy in policies.values():
         assert policy.act(np.zeros(1, np.float32), np.random.default_rng(0)) in range(3)
-        with pytest.raises(InvalidArgument, match="got one of one's own"):
+        with pytest.raises(InvalidArgument, match="expected one that is registered"):
             policy.save(tmp_path / "p0.safetensors")
     assert not list(tmp_path.iterdir())
 
@@ -144,6 +147,8 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"advance": lambda self, uniforms, state, u: (state, "a", u > 2)}, "reward: expected a number"),
         ({"advance": lambda self, uniforms, state, u: (state, jnp.log(u - 1), u > 2)}, "infinite ones in a reward"),
         ({"advance": lambda self, uniforms, state, u: (state, float(u), u > 2)}, "advance: expected it to run"),
+        ({"heuristic": lambda self, seen: seen}, r"heuristic: expected a command, shape \(\), got shape \(1,\)"),
+        ({"heuristic": lambda self, seen: seen.x}, "heuristic: expected it to run .* AttributeError"),
         ({"noise_size": None}, "noise_size: expected a whole number"),
         ({"noise_size": -1}, "noise_size: expected a whole number"),
         ({"episode_limit": 0}, "episode_limit: expected a whole number"),

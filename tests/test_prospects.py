@@ -16,7 +16,6 @@ from scipy.stats import binom
 from animat.animat import Animat
 from animat.cli import main
 from animat.errors import UnusableData
-from animat.evaluation.grid import grid_for
 from animat.evaluation.optimum import Optimum, best_return, rough_values
 from animat.evaluation.prospects import prospects
 from animat.evaluation.resampling import _rough, with_intervals
@@ -28,6 +27,7 @@ from animat.neurons.simulator import fit_histogram
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
 from animat.robots import Cartpole
+from animat.robots.grid import grid_for
 
 ROBOT = Cartpole(episode_limit=60)
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from animat.recordings.reading import read_recording, read_recordings
     from animat.recordings.recording import Channels, Recording, Stimuli
     from animat.recordings.selection import Selection
-    from animat.robots import Cartpole, Navigation, Robot, robot_named
+    from animat.robots import Cartpole, Navigation, Quantity, Robot, register_robot, robot_named
     from animat.studies.paper import paper_study
     from animat.studies.run import run_study
     from animat.studies.specification import Study
@@ -74,7 +74,7 @@ _WHERE = {
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
     "mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
-    "robots": ("Robot", "Cartpole", "Navigation", "robot_named"),
+    "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
     "training.sac": ("SAC",),
     "training.specification": ("Training",),
@@ -137,8 +137,10 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "Linear",
     "mapping_named",
     "Robot",
+    "Quantity",
     "Cartpole",
     "Navigation",
+    "register_robot",
     "robot_named",
     "Animat",
     "WithoutNeurons",

@@ -89,6 +89,9 @@ def _run(given: list[str]) -> int:
     except InvalidArgument as error:
         print(f"animat: {error}", file=sys.stderr)
         return 2
+    if "" not in sys.path:
+        # As for `python -m animat`: robots of one's own may lie in the working folder.
+        sys.path.append("")
     try:
         with heard_everywhere():
             results = command.run()

@@ -33,8 +33,9 @@ class Inspect(Responding):
     """Which of several things in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     part: str | None = None
     """Which of several recordings in a MaxWell file, such as well000/rec0000"""
-    limit: Literal["cartpole", "navigation"] | None = None
-    """Also compute the best return that any controller could get with this robot, before any training"""
+    limit: str | None = None
+    """Also compute the best return that any controller could get with this robot, such as cartpole, before any
+    training"""
     out: Path | None = None
     """Folder for figures; default: none are drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
@@ -50,9 +51,12 @@ class Inspect(Responding):
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings
         from animat.report.inspection import figure_stem
+        from animat.robots.registry import robot_named
 
         if self.out is not None:
             expect_writable(self.out)
+        if self.limit is not None:
+            robot_named(self.limit)
         by = None if self.conditions is None else conditions_named(self.conditions)
         window_ms = self.window_ms or DEFAULT_WINDOW_MS
         check_window(window_ms)
@@ -150,7 +154,7 @@ def _limits(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
     keep_compilations()
     try:
         found = prospects(responses, robot_named(robot))
-    except UnusableData as error:
+    except (InvalidArgument, UnusableData) as error:
         print(f"{robot}: no best possible return: {error}\n")
         return None
     for prospect in found:

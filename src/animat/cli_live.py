@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 class Live(Stimulating):
     """Parameter shadowing on one culture while it lives: record, train, refresh, then run in closed loop."""
 
-    robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
-    """The robot to drive"""
+    robot: Positional[str] = "cartpole"
+    """The robot to drive: cartpole, navigation, or one of your own, such as my_package.robots:Rover"""
     mapping: Literal["1-threshold", "9-thresholds", "linear"] = "9-thresholds"
     """From responses to motor commands"""
     policies: int = 4

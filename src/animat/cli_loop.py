@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli_responses import fit_as, say_findings
+from animat.cli_responses import fit_as, policies_for, say_findings
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 from animat.writing import alone_in
 
@@ -76,6 +76,8 @@ class Run(Stimulating):
 
     policies: Positional[Path] = Path("policies")
     """A policy file or a folder of them"""
+    robot: str | None = None
+    """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
     recordings: tuple[Path, ...] = ()
     """Recordings the policies were trained on: their percentiles and prediction; default: the culture is recorded"""
     at_min: float | None = None
@@ -123,13 +125,12 @@ class Run(Stimulating):
         from animat.progress import Bar
         from animat.reality_gap import check_conditions, check_policies, run_policies
         from animat.recordings.reading import read_recordings
-        from animat.training.policy import load_policies
 
         # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        policies = load_policies(self.policies)
+        policies = policies_for(self.robot, self.policies)
         first = check_policies(policies)
         fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.findings import Finding, warnings_once
 
 if TYPE_CHECKING:
@@ -97,3 +97,20 @@ def say_findings(findings: Sequence[Finding]) -> None:
     """
     for sentence in warnings_once(findings):
         print(f"warning: {sentence}", file=sys.stderr)
+
+
+def policies_for(robot: str | None, path: Path) -> dict[str, Policy]:
+    """The policies of a file or a folder, and a robot of one's own imported for them.
+
+    Raises:
+        Mismatch: for policies of another robot than was named.
+    """
+    from animat.robots.registry import robot_class
+    from animat.training.policy import load_policies
+
+    expected = None if robot is None else robot_class(robot).name
+    policies = load_policies(path)
+    for name, policy in policies.items():
+        if expected not in (None, policy.robot.name):
+            raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
+    return policies

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli_responses import Fitting, say_findings
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.cli_responses import Fitting, policies_for, say_findings
+from animat.errors import InvalidArgument, UnusableData
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class Train(Fitting):
     """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
 
-    robot: Positional[Literal["cartpole", "navigation"]] = "cartpole"
-    """The robot to drive"""
+    robot: Positional[str] = "cartpole"
+    """The robot to drive: cartpole, navigation, or one of your own, such as my_package.robots:Rover"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""
     paper: bool = False
@@ -34,7 +34,7 @@ class Train(Fitting):
     policies: int | None = None
     """How many policies, each from its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
-    """Training iterations of each; default: 400000 for cartpole, 250000 for navigation, with --paper twice as many"""
+    """Training iterations of each; default: 400000 for cartpole, 250000 for others, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
     shadowing: Literal["on", "off"] = "on"
@@ -79,10 +79,11 @@ class Train(Fitting):
             duration_min=usual["duration_min"] if self.duration_min is None else self.duration_min,
             percentiles=self.percentiles,
             delivery=self.delivery,
-            commands=(-1.0, 1.0) if mapping == "none" and self.robot == "cartpole" else None,
+            commands=robot.baseline_commands if mapping == "none" else None,
         )
-        from animat.training.trainer import expect_folder_for, is_finished, train
+        from animat.training.trainer import expect_folder_for, expect_trainable, is_finished, train
 
+        expect_trainable(training, is_saved=True)
         expect_folder_for(training, self.out)
         for caveat in robot.caveats():
             print(f"warning: {caveat}", file=sys.stderr)
@@ -147,8 +148,8 @@ class Evaluate(Fitting):
     """Minute on the culture's clock whose newest recording answers; default: the last recording"""
     episodes: int = 100
     """Episodes of each policy and control"""
-    robot: Literal["cartpole", "navigation"] | None = None
-    """The robot that is expected; default: the one the policies were trained on"""
+    robot: str | None = None
+    """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
     limit: bool = False
@@ -163,13 +164,9 @@ class Evaluate(Fitting):
         from animat.compilation import keep_compilations
         from animat.evaluation.rollouts import check_at_once
         from animat.progress import Bar
-        from animat.training.policy import load_policies
 
-        policies = load_policies(self.policies)
+        policies = policies_for(self.robot, self.policies)
         check_at_once("--episodes", self.episodes, len(policies))
-        for name, policy in policies.items():
-            if self.robot is not None and policy.robot.name != self.robot:
-                raise Mismatch(f"{name}: expected a policy for {self.robot}, got one for {policy.robot.name}")
         through_neurons = any(policy.mapping is not None for policy in policies.values())
         # On what they were trained on, unless asked otherwise.
         trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
@@ -199,7 +196,7 @@ def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
-            numbers[name] = float(value)
+            numbers[name] = int(value) if value.lstrip("-").isdecimal() else float(value)
         except ValueError:
             raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
     return numbers

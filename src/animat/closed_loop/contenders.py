@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from animat.robots.base import Robot
-from animat.robots.steering import STEERED, steering
+from animat.robots.capabilities import capability
 
 LoopDelivery = Literal["chosen", "shuffled", "silent"]
 """What the culture is given; a training (`animat.animat.Delivery`) has no silence."""
@@ -58,20 +58,24 @@ class Greedy:
 
 @dataclass(frozen=True)
 class HandMadeRule:
-    """Lean right, push right: the condition that is answered most strongly where the command should be positive.
+    """The condition whose mean command is the nearest to the one that the robot's `heuristic` gives.
 
     Attributes:
-        robot: one that there is a rule for (`animat.robots.steering`).
-        up, down: the conditions with the largest and the smallest mean command.
+        robot: one with a `heuristic`.
+        means: the mean command of each condition.
     """
 
     robot: Robot[Any]
-    up: int
-    down: int
+    means: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        # Now: what JAX compiles for a first call would come late in a loop.
+        self.act(np.zeros(len(self.robot.quantities)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """Up or down."""
-        return self.up if steering(self.robot, observation) > 0 else self.down
+        """The nearest."""
+        wanted = float(capability(self.robot, "heuristic")(observation))
+        return int(np.argmin(np.abs(np.array(self.means, np.float32) - np.float32(wanted))))
 
 
 @dataclass(frozen=True)
@@ -128,16 +132,15 @@ def controls(
     robot: Robot[Any],
     labels: Sequence[str],
     *,
-    strongest: int,
-    weakest: int,
+    means: Sequence[float] | None,
     policies: Mapping[str, Controller] | None = None,
 ) -> list[Contender]:
     """The controls of the study.
 
     Args:
-        robot: that is driven; without a hand-made rule for it, that control is left out.
+        robot: that is driven.
         labels: of the conditions, in the order of their index.
-        strongest, weakest: the conditions with the largest and the smallest mean command: for the hand-made rule.
+        means: the mean command of each condition, for the rule made by hand; None: without that control.
         policies: by name, who act in turn under the silent and the shuffled control; without any these two are left
             out.
     """
@@ -148,11 +151,8 @@ def controls(
         who = InTurn(dict(policies))
         found.append(Contender("silent", "no pulse; the culture's own activity is read", who, "silent"))
         found.append(Contender("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
-    if isinstance(robot, STEERED):
-        rule = HandMadeRule(robot, strongest, weakest)
-        found.append(
-            Contender("made by hand", f"lean right, push right: {labels[strongest]} or {labels[weakest]}", rule)
-        )
+    if means is not None:
+        found.append(Contender("made by hand", "a rule without learning", HandMadeRule(robot, tuple(means))))
     return found
 
 

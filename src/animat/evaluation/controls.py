@@ -12,7 +12,6 @@ from animat.animat import Animat, Environment
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, silenced
-from animat.robots.steering import STEERED
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +43,9 @@ def controls_of(
 ) -> list[Control]:
     """The controls of an environment, each with what it is run in.
 
-    *random*, an action drawn at random; *constant*, one action always, for each of them; *made by hand*, the rule of
-    `animat.robots.steering`, for a robot that has one; and through neurons, with policies: *silent*, on a culture that
-    always answers 0; *shuffled*, with the delivered condition drawn anew at each iteration, whatever they chose.
+    *random*, an action drawn at random; *constant*, one action always, for each of them; *made by hand*, the robot's
+    `heuristic`, where it has one; and through neurons, with policies: *silent*, on a culture that always answers 0;
+    *shuffled*, with the delivered condition drawn anew at each iteration, whatever they chose.
 
     Args:
         environment, simulator: what the policies are evaluated in (no simulator without neurons).
@@ -58,7 +57,7 @@ def controls_of(
     for i, label in enumerate(labels):
         constant = Constant(jnp.array([i]))
         controls.append(Control(f"constant {label}", "this one always", environment, simulator, constant))
-    if isinstance(environment.robot, STEERED):
+    if hasattr(environment.robot, "heuristic"):
         rule = hand_made(environment, simulator)
         controls.append(Control("made by hand", "a rule without learning", environment, simulator, rule))
     if policies is not None and isinstance(environment, Animat) and simulator is not None:

@@ -14,23 +14,22 @@ from animat.animat import Environment
 from animat.evaluation.commands import commands_of
 from animat.evaluation.rollouts import Actor
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.steering import steering
+from animat.robots.capabilities import capability
 
 
 @final
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class HandMade(Actor):
-    """Full power to the side that the robot should move to: the action whose mean command lies farthest that way.
-
-    The side is that of `animat.robots.steering`.
+    """The action whose mean command is the nearest to the one that the robot's `heuristic` gives.
 
     Attributes:
-        left, right: the actions with the smallest and the largest mean command, each of one number.
+        actions: what the environment is handed for each action, shape (1, actions), for one actor.
+        means: the mean command of each, the same shape.
     """
 
-    left: Array
-    right: Array
+    actions: Array
+    means: Float[Array, "*actors actions"]
 
     def act(
         self,
@@ -38,19 +37,18 @@ class HandMade(Actor):
         observation: Float[Array, "episodes observations"],
         uniforms: Float[Array, " episodes"],
     ) -> Array:
-        side = steering(environment.robot, observation * environment.scales, jnp)
-        return jnp.where(side > 0, self.right, self.left)
+        wanted = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
+        return self.actions[jnp.argmin(jnp.abs(self.means - wanted[:, None]), axis=1)]
 
 
 def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) -> HandMade:
     """The rule for an environment and the neurons in it, as one actor for `roll_out`.
 
     Raises:
-        InvalidArgument: for a robot that no rule is known for.
+        InvalidArgument: for a robot without a `heuristic`.
     """
-    # It raises for a robot that there is no rule for.
-    steering(environment.robot, np.zeros(len(environment.robot.quantities)))
+    # It raises for a robot without one.
+    capability(environment.robot, "heuristic")
     commands = commands_of(environment, simulator)
     means = np.sum(commands.levels * commands.probabilities, axis=1)
-    left, right = (commands.actions[[i]] for i in (int(means.argmin()), int(means.argmax())))
-    return HandMade(jnp.asarray(left), jnp.asarray(right))
+    return HandMade(jnp.asarray(commands.actions)[None], jnp.asarray(means, jnp.float32)[None])

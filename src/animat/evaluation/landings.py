@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
 
 from animat.errors import InvalidArgument
-from animat.evaluation.grid import Grid
 from animat.robots.base import Robot
+from animat.robots.grid import Grid
 
 ENDED, ENDS_NEXT = -1, -2
 

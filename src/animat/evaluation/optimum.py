@@ -15,7 +15,6 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 from animat.animat import Environment
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, layers_of, nodes_for
-from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.statistics import Interval
@@ -24,6 +23,7 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import AT_FIRST, NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.recordings.findings import Finding
+from animat.robots.grid import Grid, grid_for
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
 """What a limit is asked for: an environment, and the simulator in it (None without neurons)."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from animat.animat import Animat
 from animat.errors import UnusableData
-from animat.evaluation.grid import Grid, grid_for
 from animat.evaluation.optimum import Optimum, rough_values
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.neurons.conditions import Condition
@@ -20,6 +19,7 @@ from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
+from animat.robots.grid import Grid, grid_for
 
 RESAMPLES = 39
 """The fewest whose smallest and largest are their 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""

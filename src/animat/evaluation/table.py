@@ -25,6 +25,7 @@ from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.recordings.protocol import Presentation
 from animat.robots.base import Robot
+from animat.robots.capabilities import lacking
 from animat.training.policy import Policy
 
 
@@ -168,6 +169,7 @@ class Evaluation:
             if self.not_met != (transfer.UNKNOWN,):
                 known = "a closed loop on the culture would not meet these returns"
             lines.append(f"  {known}: see the warnings ({', '.join(self.not_met)})")
+        lines += [f"  {finding.sentence}" for finding in self.findings if finding.name == "no-heuristic"]
         return "\n".join([*lines, *self._limit_lines()])
 
     def _limit_lines(self) -> list[str]:
@@ -257,6 +259,8 @@ def evaluate(
     acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
     every = controls_of(environment, simulator, _action_labels(first), networks, n)
     acting += [control for control in every if controls is None or control.name in controls]
+    if controls is None and (without := lacking(body).get("heuristic")):
+        findings += (Finding("no-heuristic", "note", without),)
     if limit_resolution is not None and not 0 < limit_resolution < float("inf"):
         raise InvalidArgument(f"limit_resolution: expected a positive number, got {limit_resolution!r}")
     rows = []

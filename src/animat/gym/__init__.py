@@ -1,4 +1,4 @@
-"""Gymnasium environments: `Animat/Cartpole-v0` and `Animat/Navigation-v0`, each alone or as a vector.
+"""Gymnasium environments: `Animat/Cartpole-v0`, `Animat/Navigation-v0` and `Animat/Robot-v0`, alone or as a vector.
 
 `import animat` registers them; `gymnasium.make("animat:Animat/Cartpole-v0")` does both. What they accept is the
 signature of `animat.gym.setup.set_up`.
@@ -7,7 +7,10 @@ signature of `animat.gym.setup.set_up`.
 from __future__ import annotations
 
 IDS = {"Animat/Cartpole-v0": "cartpole", "Animat/Navigation-v0": "navigation"}
-"""The environments, and the robot of each."""
+"""The environments of a robot each."""
+
+ANY = "Animat/Robot-v0"
+"""The environment that is told its robot."""
 
 
 def register_environments() -> None:
@@ -17,12 +20,12 @@ def register_environments() -> None:
     """
     from gymnasium.envs.registration import register, registry
 
-    for id_, robot in IDS.items():
+    for id_, robot in (*IDS.items(), (ANY, None)):
         if id_ not in registry:
             # No max_episode_steps: the robot's own episode limit truncates, and is an option like all others.
             register(
                 id_,
                 entry_point="animat.gym.single:AnimatEnv",
                 vector_entry_point="animat.gym.vector:AnimatVectorEnv",
-                kwargs={"robot": robot},
+                kwargs={} if robot is None else {"robot": robot},
             )

@@ -71,7 +71,7 @@ def set_up(
     """Read the options of `Animat/...` environments.
 
     Args:
-        robot: its name; set by the environment's id.
+        robot: its name, or where to import it from (`robot_named`); set by the environment's id, but for `Robot-v0`.
         mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`.
         recordings: files or folders of recordings of one culture to make the neurons' simulator of.
         simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions

@@ -11,7 +11,9 @@ from jaxtyping import Float32, UInt8
 from animat.errors import InvalidArgument
 from animat.gym.compiled import CompiledAnimat, Step
 from animat.gym.setup import set_up
-from animat.report.frames import draw_robot
+from animat.robots.base import Robot
+from animat.robots.capabilities import capability
+from animat.robots.drawing import draw_robot
 
 
 class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
@@ -35,9 +37,9 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's name and form
 
     def __init__(self, robot: str, *, render_mode: str | None = None, **options: Any) -> None:
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
         self.setup = set_up(robot, **options)
+        check_render_mode(render_mode, self.setup.animat.robot)
+        self.render_mode = render_mode
         self.observation_space = self.setup.observation_space
         self.action_space = self.setup.action_space
         self._compiled = CompiledAnimat(self.setup)
@@ -95,12 +97,14 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
             self._shown.append(observation.copy())
 
 
-def check_render_mode(render_mode: str | None) -> None:
-    """Refuse a render mode other than None and `rgb_array`.
+def check_render_mode(render_mode: str | None, robot: Robot[Any]) -> None:
+    """Refuse a render mode other than None and `rgb_array`, and that one for a robot that cannot be drawn.
 
     Raises:
-        InvalidArgument: naming the mode.
+        InvalidArgument: naming the mode, or the robot.
     """
     if render_mode not in (None, "rgb_array"):
         show = "; gymnasium.make shows these pictures in a window, with pygame" if render_mode == "human" else ""
         raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}{show}")
+    if render_mode is not None:
+        capability(robot, "draw")

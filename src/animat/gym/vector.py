@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument
 from animat.gym.compiled import CompiledAnimat, Rows
 from animat.gym.setup import set_up
 from animat.gym.single import check_render_mode
-from animat.report.frames import draw_robot
+from animat.robots.drawing import draw_robot
 
 IN_INFO = ("delivered", "rate_hz", "command")
 
@@ -42,10 +42,10 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
     def __init__(self, robot: str, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
         if num_envs < 1:
             raise InvalidArgument(f"num_envs: expected at least 1, got {num_envs}")
-        check_render_mode(render_mode)
+        self.setup = set_up(robot, **options)
+        check_render_mode(render_mode, self.setup.animat.robot)
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.setup = set_up(robot, **options)
         self.single_observation_space = self.setup.observation_space
         self.single_action_space = self.setup.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)

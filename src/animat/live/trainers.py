@@ -6,7 +6,6 @@ import json
 import os
 import pickle
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -18,6 +17,7 @@ from typing import Any
 from animat.errors import AnimatError
 from animat.live.exchange import Exchange
 from animat.training.group import Group
+from animat.training.worker import start_worker
 
 KEEP_S = 10.0
 """Seconds between times that the policies are written as they are: what a killed run costs of training."""
@@ -50,8 +50,7 @@ class Trainers:
             with tempfile.TemporaryFile() as job:
                 pickle.dump((group, self._exchange, self._folder, KEEP_S), job)
                 job.seek(0)
-                command = [sys.executable, "-m", "animat.live.worker", str(cores[i % len(cores)])]
-                process = subprocess.Popen(command, stdin=job, stdout=subprocess.PIPE)
+                process = start_worker("animat.live.worker", cores[i % len(cores)], job)
             self._processes.append(process)
             threading.Thread(target=self._listen, args=(process, group), daemon=True).start()
         return self

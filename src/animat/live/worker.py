@@ -20,13 +20,14 @@ def main() -> int:
     """Read a job, train until the exchange says to finish, write the policies."""
     from animat.training.worker import settle_on
 
-    settle_on(int(sys.argv[1]))
+    told = settle_on(int(sys.argv[1]))
     # Ctrl-C is for the process that records, which ends this one by the exchange.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     from animat.compilation import keep_compilations
     from animat.errors import AnimatError
     from animat.live.exchange import Exchange
+    from animat.robots.registry import register_robot
     from animat.training.group import Group, SideBySide
 
     keep_compilations()
@@ -35,9 +36,10 @@ def main() -> int:
     folder: Path
     keep_s: float
     group, exchange, folder, keep_s = pickle.load(sys.stdin.buffer)
+    register_robot(type(group.training.robot))
 
     def tell(**words: Any) -> None:
-        print(json.dumps({"members": group.members, **words}), flush=True)
+        print(json.dumps({"members": group.members, **words}), file=told, flush=True)
 
     try:
         swaps: list[dict[str, Any]] = []

@@ -33,7 +33,8 @@ from animat.reality_gap.predicting import Predicted, predict, together
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding
-from animat.robots.steering import STEERED
+from animat.robots.capabilities import lacking
+from animat.robots.grid import no_grid
 from animat.training.policy import Policy
 
 FEWEST_OF_A_CONTROL = 5
@@ -126,14 +127,16 @@ def run_policies(
     simulator = calibration.simulator
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     contenders = [Contender(name, "as trained", controller) for name, controller in acting.items()]
-    rule = None
+    rule, lacks = None, lacking(loop.robot)
     if with_controls:
-        rule = hand_made(environment, simulator) if isinstance(loop.robot, STEERED) else None
+        if "heuristic" in lacks:
+            findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
+        else:
+            rule = hand_made(environment, simulator)
         contenders += controls(
             loop.robot,
             [condition.label for condition in loop.conditions],
-            strongest=0 if rule is None else int(np.ravel(rule.right)[0]),
-            weakest=0 if rule is None else int(np.ravel(rule.left)[0]),
+            means=None if rule is None else np.ravel(rule.means).tolist(),
             policies=acting,
         )
     else:
@@ -141,9 +144,11 @@ def run_policies(
 
     # Beside the prediction, on another core: it takes as long. Nothing else runs any more when the loop does.
     limit = None
+    why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
-        sentence = f"no best possible return, as these conditions have too few responses: {', '.join(few)}"
-        findings += (Finding("no-limit", "note", sentence),)
+        why_not = f"these conditions have too few responses: {', '.join(few)}"
+    if why_not is not None:
+        findings += (Finding("no-limit", "note", f"no best possible return: {why_not}"),)
     else:
         limit = _meanwhile(lambda: best_return(environment, simulator, resolution=LIMIT_RESOLUTION, episodes=0).value)
     predicted = predict(

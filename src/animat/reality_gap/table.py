@@ -216,6 +216,7 @@ class RealityGap:
         )
         if self.limit is not None:
             lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
+        lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies live no other returns than this control; stimulation: {self.account}")

@@ -3,7 +3,7 @@
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole, CartpoleState
 from animat.robots.navigation import Navigation, NavigationState
-from animat.robots.registry import ROBOTS, robot_from_dict, robot_named, robot_to_dict
+from animat.robots.registry import ROBOTS, register_robot, robot_from_dict, robot_named, robot_to_dict
 
 __all__ = [
     "ROBOTS",
@@ -13,6 +13,7 @@ __all__ = [
     "NavigationState",
     "Quantity",
     "Robot",
+    "register_robot",
     "robot_from_dict",
     "robot_named",
     "robot_to_dict",

@@ -54,16 +54,26 @@ class Robot(abc.ABC, Generic[State]):
 
     `terminated` says that the task ended (fell, arrived). That an episode reached `episode_limit` is truncation;
     whoever runs the episode counts, and a robot never says so.
+
+    Methods that may be missing, and what needs them says so (`animat.robots.capabilities`):
+
+        heuristic(observation) -> command                              a rule made by hand, in JAX, of one observation
+        draw(observation, command, earlier, height_px) -> picture      uint8, shape (height, width, 3)
+        draw_paths(axes, paths)                                        whole episodes on Matplotlib's axes
+        value_grid() -> animat.robots.grid.Grid                        for the best possible return
     """
 
     name: ClassVar[str]
     """What `animat.robots.robot_named` knows it by."""
 
-    noise_size: ClassVar[int]
+    noise_size: ClassVar[int] = 0
     """How many uniform random numbers in [0, 1) one iteration consumes."""
 
-    paper_iterations: ClassVar[int]
-    """Iterations that the paper trained a policy for on this task."""
+    paper_iterations: ClassVar[int] = 500_000
+    """Iterations that the paper trained a policy for on this task; of others, how many are trained by default."""
+
+    baseline_commands: ClassVar[tuple[float, ...] | None] = None
+    """What the baseline without neurons picks from; None: any command in [-1, 1]."""
 
     episode_limit: int
     """Iterations after which an episode is cut off."""
@@ -110,6 +120,10 @@ class Robot(abc.ABC, Generic[State]):
 
     def caveats(self) -> tuple[str, ...]:
         """What a user should know before trusting results with these parameters, a sentence each; mostly nothing."""
+        return ()
+
+    def departures(self) -> tuple[tuple[str, str], ...]:
+        """Where it departs from a paper's print: each with a title, for the report of a study; mostly nothing."""
         return ()
 
 

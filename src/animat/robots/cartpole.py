@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, final
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
+import numpy as np
 from jaxtyping import Bool, Float
 
+from animat.errors import InvalidArgument
 from animat.robots.base import LONGEST_EPISODE, Quantity, Robot, check_parameters
+from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, INK, PAPER, RAIL, Canvas, Picture
+from animat.robots.registry import register_robot
 
 if TYPE_CHECKING:
     from jax import Array
+    from matplotlib.axes import Axes
+
+    from animat.robots.grid import Grid
+
+FORESIGHT_S = 0.1
+"""The rule made by hand goes by where the pole will lean so much later, at the speed it falls with now."""
 
 _TINY, _HUGE = 1e-9, 1e9
 
@@ -26,6 +37,7 @@ class CartpoleState(NamedTuple):
 
 
 @final
+@register_robot
 @dataclass(frozen=True)
 class Cartpole(Robot[CartpoleState]):
     """A pole hinged on a cart, pushed left or right; +1 an iteration, -100 when it falls or leaves the track.
@@ -70,6 +82,7 @@ class Cartpole(Robot[CartpoleState]):
     name: ClassVar[str] = "cartpole"
     noise_size: ClassVar[int] = 1
     paper_iterations: ClassVar[int] = 800_000
+    baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
         positive = (_TINY, _HUGE)
@@ -161,6 +174,123 @@ class Cartpole(Robot[CartpoleState]):
             f"cartpole: with angle_limit_rad = {self.angle_limit_rad:g} the pole may hang or swing round without "
             f"failing, so the task is to keep the cart on its track, not to balance",
         )
+
+    def departures(self) -> tuple[tuple[str, str], ...]:
+        """The pole's mass, and the angle that ends an episode."""
+        chosen = "the simulator's" if math.isclose(self.pole_mass_kg, 0.055) else "chosen for this study"
+        return (
+            (
+                "Pole mass",
+                "The paper's table prints 0.55 kg; the open simulator whose other numbers it repeats has 0.055 kg. "
+                f"Here it is {self.pole_mass_kg:g} kg, {chosen} (pole_mass_kg).",
+            ),
+            (
+                "12 degrees",
+                "The paper prints that an episode ends when the pole passes 12 rad, nearly two turns; the open "
+                f"simulator has 12 degrees. Here it is {math.degrees(self.angle_limit_rad):.3g} degrees "
+                "(angle_limit_rad).",
+            ),
+        )
+
+    def heuristic(self, observation: Any) -> Any:
+        """Lean right, push right, with full power: by theta + 0.1 s * theta', the pole's angle 0.1 s from now."""
+        return 2.0 * (observation[2] + FORESIGHT_S * observation[3] > 0) - 1.0
+
+    def value_grid(self) -> Grid:
+        """The grid that was measured to suit it (see docs/evaluation.md).
+
+        Position and angle are those after the next iteration, which are already decided: a state in which one of them
+        lies beyond its limit is lost, and the ends of the axes are where that begins. With l half the pole's length, a
+        push changes the cart's velocity v and the pole's angular velocity w such that v + 4/3 l w stays nearly the
+        same: it moves with gravity only, slowly, and takes the place of v. The angular velocities end, with 10 % more,
+        where the pole cannot be caught any more: r (angle limit + F / (M g)), with r the rate at which it falls, 1/s;
+        the velocities at sqrt(g angle limit track length), from which the cart can hardly be stopped on its track by
+        leaning the pole.
+
+        Raises:
+            InvalidArgument: for a pole that may swing far.
+        """
+        from animat.robots.grid import Axis, Grid
+
+        if self.angle_limit_rad > 0.75:
+            raise InvalidArgument(
+                f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {self.angle_limit_rad:g}; "
+                "hand in a Grid"
+            )
+        half_length_m = self.pole_length_m / 2
+        total_kg = self.cart_mass_kg + self.pole_mass_kg
+        shear_m = 4 / 3 * half_length_m
+        step_s = self.step_s
+        gravity = max(self.gravity_m_per_s2, 1.0)
+        rate_per_s = math.sqrt(gravity / (half_length_m * (4 / 3 - self.pole_mass_kg / total_kg)))
+        held_rad = max(self.force_n, 0.1) / (total_kg * gravity)
+        angular_velocity = 1.1 * rate_per_s * (self.angle_limit_rad + held_rad)
+        velocity = math.sqrt(gravity * self.angle_limit_rad * self.track_length_m)
+
+        def to_coordinates(state: CartpoleState) -> tuple[Array, ...]:
+            x, v, a, w = state
+            return x + step_s * v, v + shear_m * w, a + step_s * w, w
+
+        def to_state(coordinates: tuple[Array, ...]) -> CartpoleState:
+            x, z, a, w = coordinates
+            v = z - shear_m * w
+            return CartpoleState(x - step_s * v, v, a - step_s * w, w)
+
+        half_track_m = self.track_length_m / 2
+        return Grid(
+            Axis("next cart_position", "m", -half_track_m, half_track_m, 17),
+            (
+                Axis("cart_velocity + 4/3 l w", "m/s", -velocity, velocity, 17),
+                Axis("next pole_angle", "rad", -self.angle_limit_rad, self.angle_limit_rad, 41),
+                Axis("pole_angular_velocity", "rad/s", -angular_velocity, angular_velocity, 55),
+            ),
+            to_coordinates,
+            to_state,
+            smooth_commands=5,
+            end_is_known=True,
+            noise_in_command=self.force_noise,
+        )
+
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+        """The cart on its track with the pole, and the command as an arrow (see `animat.robots.drawing`)."""
+        half_track, pole = self.track_length_m / 2, self.pole_length_m
+        margin = 0.25 * pole
+        x, angle = float(observation[0]), float(observation[2])
+        # Room for a pole that hangs as well as for one that stands, once the limits allow it to hang.
+        below = pole if self.angle_limit_rad > math.pi / 2 else 0.1 * pole
+        scale = height_px / (pole + below + 2 * margin)
+        width_px = round(scale * 2 * (half_track + pole / 2 + margin))
+        canvas = Canvas(width_px, height_px, (width_px / 2, scale * (pole + margin)), scale)
+
+        cart_width, cart_height, thick = 0.3 * pole, 0.14 * pole, 0.045 * pole
+        canvas.stroke([(-half_track, 0.0), (half_track, 0.0)], 0.02 * pole, RAIL)
+        for end in (-half_track, half_track):
+            canvas.stroke([(end, -0.5 * cart_height), (end, 0.5 * cart_height)], 0.02 * pole, INK)
+        canvas.box((x - cart_width / 2, -cart_height / 2), (x + cart_width / 2, cart_height / 2), 0.02 * pole, INK)
+        tip = (x + pole * math.sin(angle), -pole * math.cos(angle))
+        canvas.stroke([(x, 0.0), tip], thick, BODY)
+        canvas.disc((x, 0.0), 0.6 * thick, PAPER)
+        if command:
+            y = cart_height / 2 + 0.12 * pole
+            head = x + 0.3 * pole * command
+            back = head - math.copysign(0.05 * pole, command)
+            canvas.stroke([(x, y), (head, y)], 0.02 * pole, ACCENT)
+            canvas.stroke([(back, y - 0.04 * pole), (head, y), (back, y + 0.04 * pole)], 0.02 * pole, ACCENT)
+        return canvas.picture()
+
+    def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
+        """How far the pole leaned in each episode, over time."""
+        limit_deg = math.degrees(self.angle_limit_rad)
+        for path in paths:
+            colour = DONE if len(path) > self.episode_limit else FAILED
+            time_s, angle_deg = np.arange(len(path)) * self.step_s, np.degrees(path[:, 2])
+            axes.plot(time_s, angle_deg, color=colour, linewidth=0.7, alpha=0.8)
+        for sign in (-1, 1):
+            axes.axhline(sign * limit_deg, color=EDGE, linewidth=0.8, linestyle="--")
+        axes.set_xlim(0, self.episode_limit * self.step_s)
+        axes.set_ylim(-1.25 * limit_deg, 1.25 * limit_deg)
+        stayed = sum(len(path) > self.episode_limit for path in paths)
+        axes.set(xlabel=f"time (s); {stayed} of {len(paths)} to the end", ylabel="pole angle (deg)")
 
     def _bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Bounds of (position, velocity) of the cart and of the pole over whole episodes that start at rest.

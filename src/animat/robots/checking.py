@@ -29,6 +29,7 @@ def check_robot(robot: Robot[Any]) -> None:
 
     name = _named(robot)
     observations, noise = len(robot.quantities), robot.noise_size
+    heuristic = getattr(robot, "heuristic", None)
 
     def episode(key: Any) -> Any:
         state = _tried(f"{name}.reset", robot.reset, key)
@@ -47,10 +48,17 @@ def check_robot(robot: Robot[Any]) -> None:
             _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
             seen = _tried(f"{name}.observe", robot.observe, after)
             told.append((after, seen, jnp.asarray(reward, jnp.float32)))
+            if heuristic is not None:
+                _expect_shape(f"{name}.heuristic", _tried(f"{name}.heuristic", heuristic, seen), (), "a command")
         return told
 
     # Under jit: what a step may not do there is seen here, and it is compiled once.
-    for state, seen, reward in jax.device_get(jax.jit(episode)(jax.random.key(0))):
+    try:
+        told = jax.device_get(jax.jit(episode)(jax.random.key(0)))
+    except InvalidArgument as error:
+        # JAX has put a note of its own to it.
+        raise InvalidArgument(str(error)) from error.__cause__
+    for state, seen, reward in told:
         for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
             if not all(np.all(np.isfinite(value)) for value in values):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")

@@ -3,15 +3,35 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, final
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
+import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.robots.base import LONGEST_EPISODE, Quantity, Robot, check_parameters
+from animat.robots.drawing import (
+    ACCENT,
+    AIM,
+    BODY,
+    DONE,
+    EDGE,
+    FAILED,
+    GOAL,
+    GOAL_FILL,
+    INK,
+    TRAIL,
+    Canvas,
+    Picture,
+)
+from animat.robots.registry import register_robot
 
 if TYPE_CHECKING:
     from jax import Array
+    from matplotlib.axes import Axes
+
+    from animat.robots.grid import Grid
 
 _TINY, _HUGE = 1e-9, 1e9
 
@@ -28,6 +48,7 @@ class NavigationState(NamedTuple):
 
 
 @final
+@register_robot
 @dataclass(frozen=True)
 class Navigation(Robot[NavigationState]):
     """A robot that turns by the command, then moves ahead; 50 at the goal, else a small cost that falls as it nears.
@@ -158,3 +179,79 @@ class Navigation(Robot[NavigationState]):
             f"navigation: the goal cannot be reached: {self.episode_limit} iterations of {self.stride_m:g} m cover "
             f"{reach_m:g} m, and a straight run to its edge takes {self.fewest_iterations_to_goal} iterations",
         )
+
+    def departures(self) -> tuple[tuple[str, str], ...]:
+        """The length of an episode, and what a wall does."""
+        told = ("; with 20 no" if self.episode_limit > 20 else ", with which no") + " policy can reach the goal."
+        return (
+            (
+                "20 iterations",
+                "The paper prints at most 20 iterations for an episode of navigation: 0.5 m of path to a goal that is "
+                f"0.89 m away. Here there are {self.episode_limit} (episode_limit){told}",
+            ),
+            (
+                "Walls",
+                "The paper does not say what a wall does. Here the robot stays inside: one that runs into a wall "
+                "slides along it, and is not punished for it.",
+            ),
+        )
+
+    def heuristic(self, observation: Any) -> Any:
+        """A full turn to the side that the goal lies on: by d sin(a), with the goal d m away at an angle a."""
+        xp = observation.__array_namespace__()
+        x_m, y_m, heading_rad = observation
+        right = xp.cos(heading_rad) * (self.goal_y_m - y_m) - xp.sin(heading_rad) * (self.goal_x_m - x_m)
+        return 2.0 * (right > 0) - 1.0
+
+    def value_grid(self) -> Grid:
+        """The grid that was measured to suit it (see docs/evaluation.md).
+
+        A hundred headings: turns of u pi/10 with u a multiple of 0.2 lead from one of them to another exactly.
+        """
+        from animat.robots.grid import Axis, Grid
+
+        return Grid(
+            Axis("x", "m", 0.0, self.arena_width_m, 61),
+            (
+                Axis("y", "m", 0.0, self.arena_height_m, 61),
+                Axis("heading", "rad", -math.pi, math.pi, 100, periodic=True),
+            ),
+            tuple,
+            lambda coordinates: NavigationState(*coordinates),
+        )
+
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+        """The robot in its arena with the goal, and the way that it came (see `animat.robots.drawing`)."""
+        x, y, heading = (float(value) for value in observation)
+        width_m, height_m = self.arena_width_m, self.arena_height_m
+        margin = 0.06 * height_m
+        scale = height_px / (height_m + 2 * margin)
+        canvas = Canvas(round(scale * (width_m + 2 * margin)), height_px, (scale * margin, scale * margin), scale)
+        line, size = 0.008 * height_m, 0.03 * height_m
+
+        goal = (self.goal_x_m, self.goal_y_m)
+        canvas.disc(goal, self.goal_radius_m, GOAL)
+        canvas.disc(goal, self.goal_radius_m - line, GOAL_FILL)
+        walls = [(0.0, 0.0), (width_m, 0.0), (width_m, height_m), (0.0, height_m), (0.0, 0.0)]
+        canvas.stroke(walls, line, INK)
+        canvas.stroke([*((float(past[0]), float(past[1])) for past in earlier), (x, y)], line, TRAIL)
+        canvas.stroke([(x, y), (x + 1.8 * size * math.cos(heading), y + 1.8 * size * math.sin(heading))], line, ACCENT)
+        canvas.disc((x, y), size, BODY)
+        return canvas.picture()
+
+    def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
+        """Where the robot went in each episode, seen from above."""
+        from matplotlib.patches import Circle, Rectangle
+
+        axes.add_patch(
+            Rectangle((0, 0), self.arena_width_m, self.arena_height_m, fill=False, color=EDGE, linewidth=0.8)
+        )
+        goal = (self.goal_x_m, self.goal_y_m)
+        axes.add_patch(Circle(goal, self.goal_radius_m, color=AIM, alpha=0.35, linewidth=0))
+        arrived = [math.hypot(*(path[-1, :2] - goal)) <= self.goal_radius_m for path in paths]
+        for path, there in zip(paths, arrived, strict=True):
+            axes.plot(path[:, 0], path[:, 1], color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
+        axes.set_aspect("equal")
+        axes.set_xlim(-0.03, self.arena_width_m + 0.03)
+        axes.set_ylim(self.arena_height_m + 0.03, -0.03)
+        axes.set(xlabel=f"x (m); {sum(arrived)} of {len(paths)} arrived", ylabel="y (m)")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import LARGEST_LOSS
-from animat.robots.cartpole import Cartpole
-from animat.robots.navigation import Navigation
 from animat.studies.specification import Study
 from animat.studies.tabulating import AIM, LEVEL
 
@@ -23,7 +20,7 @@ _CULTURES = {
 
 def decisions(study: Study) -> tuple[tuple[str, str], ...]:
     """What the paper leaves open or contradicts, and what this study does about it."""
-    return (*_of_culture(study), *_of_robots(study), *_of_simulators(study), *_of_learning(study))
+    return (*_of_culture(study), *_of_commands(study), *_of_simulators(study), *_of_learning(study))
 
 
 def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
@@ -36,42 +33,15 @@ def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
         )
 
 
-def _of_robots(study: Study) -> Iterator[tuple[str, str]]:
-    robots = [body.robot() for body in study.robots]
+def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
     if any(condition.mapping == "9-thresholds" for condition in study.conditions):
         yield (
             "Nine levels without zero",
             "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
             "eleven. Zero is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
         )
-    for cartpole in (robot for robot in robots if isinstance(robot, Cartpole)):
-        chosen = "the simulator's" if math.isclose(cartpole.pole_mass_kg, 0.055) else "chosen for this study"
-        yield (
-            "Pole mass",
-            "The paper's table prints 0.55 kg; the open simulator whose other numbers it repeats has 0.055 kg. Here "
-            f"it is {cartpole.pole_mass_kg:g} kg, {chosen} (pole_mass_kg).",
-        )
-        limit_deg = math.degrees(cartpole.angle_limit_rad)
-        yield (
-            "12 degrees",
-            "The paper prints that an episode ends when the pole passes 12 rad, nearly two turns; the open simulator "
-            f"has 12 degrees. Here it is {limit_deg:.3g} degrees (angle_limit_rad).",
-        )
-    for navigation in (robot for robot in robots if isinstance(robot, Navigation)):
-        most = navigation.episode_limit
-        yield (
-            "20 iterations",
-            "The paper prints at most 20 iterations for an episode of navigation: 0.5 m of path to a goal that is "
-            f"0.89 m away. Here there are {most} (episode_limit)"
-            + (
-                "; with 20 no policy can reach the goal." if most > 20 else ", with which no policy can reach the goal."
-            ),
-        )
-        yield (
-            "Walls",
-            "The paper does not say what a wall does. Here the robot stays inside: one that runs into a wall slides "
-            "along it, and is not punished for it.",
-        )
+    for body in study.robots:
+        yield from body.robot().departures()
 
 
 def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:

@@ -9,7 +9,6 @@ import os
 import pickle
 import selectors
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, final
@@ -17,6 +16,7 @@ from typing import Literal, final
 from animat.errors import AnimatError
 from animat.studies.jobs import Job
 from animat.studies.specification import Study
+from animat.training.worker import start_worker
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,7 @@ class Processes(Executor):
         process.stdout.close()
 
     def _spawn(self, core: int) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "animat.studies.worker", str(core)]
-        # In a process group of its own: Ctrl-C reaches this process alone, which then ends the worker without a word.
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, process_group=0)
+        process = start_worker("animat.studies.worker", core, subprocess.PIPE)
         assert process.stdout is not None
         self._selector.register(process.stdout, selectors.EVENT_READ, core)
         return process

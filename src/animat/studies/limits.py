@@ -9,6 +9,8 @@ from typing import Any, final
 from animat.animat import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
+from animat.robots.capabilities import lacking
+from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
 from animat.studies.jobs import Report, Task
 from animat.studies.places import limits_file, read_table, write_table
@@ -55,10 +57,23 @@ def limits_of_all(folder: Path, robot: str, what: str = "limits") -> list[dict[s
     return [row for row in read_table(limits_file(folder, robot, what)) if row["left_out"] is None]
 
 
+def left_out(study: Study) -> list[str]:
+    """What its robots cannot do, and the study is without: a sentence each."""
+    sentences: list[str] = []
+    for robot in dict.fromkeys(body.robot() for body in study.robots):
+        lacks = lacking(robot)
+        if (why_not := no_grid(robot)) is not None:
+            lacks.setdefault("value_grid", f"no best possible return: {why_not}")
+        sentences += lacks.values()
+    return sentences
+
+
 @final
 @dataclass(frozen=True)
 class Limit(Task):
     """The best possible return on a robot for every mapping of the study, of conditions with enough responses.
+
+    Of a robot without a grid the table is empty.
 
     Attributes:
         over_time: at every recording, on a rough grid, without the controller's return and without an interval; if not,
@@ -71,6 +86,9 @@ class Limit(Task):
     over_time: bool = False
 
     def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+        file = limits_file(folder, self.body.name, "over-time" if self.over_time else "limits")
+        if no_grid(self.body.robot()) is not None:
+            return [write_table(file, HEAD, [])]
         study, timeline = as_recorded(study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         kinds, minutes = kinds_of(study), study.limit_minutes(first, last)
@@ -117,9 +135,7 @@ class Limit(Task):
             (kind.mapping, kind.percentiles, at, *_cells(found.get(i)), "; ".join(left_out.get(i, ())) or None)
             for i, (kind, at) in enumerate(asked)
         ]
-        return [
-            write_table(limits_file(folder, self.body.name, "over-time" if self.over_time else "limits"), HEAD, rows)
-        ]
+        return [write_table(file, HEAD, rows)]
 
 
 def _compared(study: Study, first: float, last: float) -> list[tuple[StudyCondition, float]]:

@@ -27,6 +27,7 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, save_figure
+from animat.robots.capabilities import lacking
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.figure_tables import (
     write_array,
@@ -124,11 +125,13 @@ class RobotPictures(Task):
         report(0.2, "controls")
         figures["controls"] = draw_controls(_controls(folder, self.body), f"{name}: controls")
         paths = {condition.name: _paths(folder, self.body, condition) for condition in study.conditions}
-        figures["paths"] = draw_paths(
-            robot, {c: [path for path, _ in each] for c, each in paths.items()}, f"{name}: one episode of each policy"
-        )
-        middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
-        figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each condition")
+        lacks = lacking(robot)
+        if "draw_paths" not in lacks:
+            only_paths = {c: [path for path, _ in each] for c, each in paths.items()}
+            figures["paths"] = draw_paths(robot, only_paths, f"{name}: one episode of each policy")
+        if "draw" not in lacks:
+            middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
+            figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each condition")
         return tables + _save(folder, name, figures, report)
 
 

@@ -76,7 +76,7 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
         name = f"controls/{body.name}/{kind.mapping}" + ("-held" if kind.percentiles == "first" else "")
         jobs.append(Job(name, Control(body, plain), (*groups, *neurons), 6))
     resolution = body.limit_resolution or study.limit_resolution
-    cost_s = 45 * resolution**4 + 30 if body.robot().name == "cartpole" else 15 * resolution**2 + 8
+    cost_s = 40 * resolution ** len(body.robot().quantities) + 10
     jobs.append(Job(f"limit/{body.name}", Limit(body), neurons, cost_s))
     if neurons:
         jobs.append(Job(f"limit/{body.name}/over-time", Limit(body, over_time=True), neurons, 12))

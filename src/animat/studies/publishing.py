@@ -29,7 +29,7 @@ from animat.studies.shown import (
     scores_shown,
 )
 from animat.studies.specification import Study
-from animat.studies.tabulating import AIM, LEVEL
+from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL
 
 
 @final
@@ -43,7 +43,7 @@ class Publish(Task):
         if study.needs_neurons:
             sections.append(_culture(study, folder))
         sections += [_robot(folder, body.name) for body in study.robots]
-        sections += [_controls(study, folder), _done(study)]
+        sections += [_controls(study, folder), _done(study, folder)]
         if study.paper:
             sections.append(_differences(study, folder))
         sections.append(_noticed(folder))
@@ -174,8 +174,8 @@ def _controls(study: Study, folder: Path) -> Section:
         ("constant", "One stimulus always (without neurons: one command)."),
         (
             "made by hand",
-            "A rule instead of learning: the stimulus whose mean command lies farthest to the side where the pole "
-            "will lean in 0.1 s, or where the goal lies.",
+            "A rule instead of learning: the stimulus whose mean command is nearest to a push to the side where the "
+            "pole will lean in 0.1 s, to a turn towards the goal, or to what another robot's rule wants.",
         ),
         ("silent", "The trained policies on a culture that always answers 0."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
@@ -189,7 +189,7 @@ def _controls(study: Study, folder: Path) -> Section:
     )
 
 
-def _done(study: Study) -> Section:
+def _done(study: Study, folder: Path) -> Section:
     culture, simulators = study.culture, study.simulators
     if culture.kind == "files":
         recorded = f"Recordings from files: {', '.join(culture.files)}."
@@ -219,6 +219,8 @@ def _done(study: Study) -> Section:
         ),
     ]
     points.append(("Evaluation", _ACTIONS[study.actions]))
+    findings = read_table(table_file(folder, "findings"))
+    points += [("Left out", f"{row['sentence']}.") for row in findings if row["name"] == LEFT_OUT]
     for condition in study.conditions:
         said = [f"mapping {condition.mapping}" if condition.through_neurons else "the robot is moved directly"]
         if condition.through_neurons:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.progress import Progress, Silent
+from animat.robots.checking import check_robot
 from animat.studies.executor import Event, Executor, Processes
 from animat.studies.folder import describe_study, held, source_files, sums_of
 from animat.studies.jobs import Job, Receipt, in_order, receipt_of
@@ -59,7 +60,8 @@ def run_study(
     Raises:
         Mismatch: if the folder is another study's, its recordings have changed, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer workers than one, or any beside an executor.
+        InvalidArgument: for fewer workers than one, or any beside an executor, or a robot of one's own that does not
+            keep to the contract.
         AnimatError: if a job failed; its message names the job.
     """
     if workers is not None and workers < 1:
@@ -77,6 +79,9 @@ def run_study(
                 raise InvalidFile(
                     f"{folder}: {len(jobs) - len(receipts)} of {len(jobs)} jobs are left, but it cannot be written to"
                 )
+            for body in study.robots:
+                if ":" in body.kind:
+                    check_robot(body.robot())
             at = executor or Processes(workers)
             try:
                 run.finish(at)

@@ -215,7 +215,7 @@ def controls_shown(study: Study, folder: Path) -> Table:
         + (
             " Without neurons, where any command can be chosen, none is held constant."
             if any(row["mapping"] == "none" for row in rows)
-            and "navigation" in {body.robot().name for body in study.robots}
+            and any(body.robot().baseline_commands is None for body in study.robots)
             else ""
         ),
         beside="tables/controls.csv",

@@ -14,7 +14,7 @@ from animat.mapping import MAPPING_NAMES
 from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.protocol import Protocol
 from animat.robots.base import MOST_AT_ONCE, Robot
-from animat.robots.registry import robot_named
+from animat.robots.registry import is_ours, place_of, robot_named
 from animat.studies.bounds import (
     MOST_PRESENTATIONS,
     MOST_SESSIONS,
@@ -149,10 +149,10 @@ class Body:
     """A robot of the study.
 
     Attributes:
-        name: what it is called in tables and folders; of those of animat's own name, `cartpole` or `navigation`, no
-            more need be said.
-        kind: `cartpole` or `navigation`, where the name says something else, such as of two cartpoles with different
-            parameters.
+        name: what it is called in tables and folders; where it is a robot's own (`animat.robots.robot_named`), no more
+            need be said.
+        kind: the robot's own name, where this one is another, such as of two cartpoles with different parameters; or
+            where to import it from, `my_package.robots:Rover`, which is filled in for robots that are not ours.
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
         limit_resolution: of its best possible return, in place of the study's.
@@ -165,17 +165,17 @@ class Body:
     kind: str = ""
 
     def __post_init__(self) -> None:
-        if self.kind:
-            check_name("robots.name", self.name)
-            if self.name == "culture":
-                raise InvalidArgument(
-                    "robots.name: expected another name than the culture's figures have, got 'culture'"
-                )
         if self.iterations is not None:
             expect_counts("robots", self, iterations=(1, MOST_ITERATIONS))
         if self.limit_resolution is not None:
             expect_resolution("robots.limit_resolution", self.limit_resolution)
-        self.robot()
+        robot = self.robot()
+        check_name("robots.name", self.name)
+        if self.name == "culture":
+            raise InvalidArgument("robots.name: expected another name than the culture's figures have, got 'culture'")
+        if not is_ours(robot):
+            # Workers know it by that.
+            object.__setattr__(self, "kind", place_of(type(robot)))
 
     def robot(self) -> Robot[Any]:
         """The robot itself."""

@@ -14,11 +14,12 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import bracket_findings
 from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
+from animat.recordings.findings import Finding
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.heuristic import HEAD, rows_beside_heuristic
 from animat.studies.jobs import Report, Task
 from animat.studies.limits import HEAD as LIMITS
-from animat.studies.limits import kinds_of, limits_of_all
+from animat.studies.limits import kinds_of, left_out, limits_of_all
 from animat.studies.paper import PRINTED
 from animat.studies.places import (
     controls_file,
@@ -88,6 +89,9 @@ COMPARISONS = (
     "paper_p",
     "as_in_paper",
 )
+LEFT_OUT = "left-out"
+"""The finding that a robot cannot do something, which the study is without."""
+
 TRAINED = "trained: "
 """In front of a condition's name among the controls."""
 
@@ -145,6 +149,7 @@ class Tabulate(Task):
             of = (row[name] for name in ("best_return", "grid_error", "monte_carlo", "standard_error"))
             where = f"{robot}, {named_mapping(row['mapping'], row['percentiles'])}, at {row['at_min']:g} min"
             noticed += [replace(told, sentence=f"{where}: {told.sentence}") for told in bracket_findings(*of)]
+        noticed += [Finding(LEFT_OUT, "note", sentence) for sentence in left_out(study)]
         table("findings", ("severity", "name", "sentence"), ((n.severity, n.name, n.sentence) for n in noticed))
         return files
 

@@ -68,8 +68,7 @@ def training_of(study: Study, body: Body, condition: StudyCondition) -> Training
         duration_min=study.training_min,
         percentiles=condition.percentiles,
         delivery=condition.delivery,
-        # The paper's baselines: pushes to either side; any turn.
-        commands=(-1.0, 1.0) if not through_neurons and body.robot().name == "cartpole" else None,
+        commands=None if through_neurons else body.robot().baseline_commands,
         algorithm=SAC(**study.algorithm),  # type: ignore[arg-type]
     )
 

@@ -27,10 +27,7 @@ _LARGEST_MIB = 800
 
 def main() -> int:
     """Run tasks until standard input ends."""
-    settle_on(int(sys.argv[1]))
-    # What libraries print must not end up among the events.
-    events = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+    events = settle_on(int(sys.argv[1]))
 
     def tell(**event: Any) -> None:
         print(json.dumps(event), file=events, flush=True)
@@ -54,6 +51,8 @@ def main() -> int:
 
         began_s = time.process_time()
         try:
+            for body in study.robots:
+                body.robot()  # It registers one that is imported, for policies to be loaded.
             files = task.run(study, folder, report)
         except AnimatError as error:
             tell(kind="failed", words=str(error))

@@ -199,7 +199,7 @@ class Policy:
 
         Raises:
             InvalidFile: if it cannot be written; what stood there before is unchanged.
-            InvalidArgument: for a robot or mapping of one's own: the file could not be loaded again.
+            InvalidArgument: for a robot that is not registered or a mapping of one's own: the file could not be loaded.
         """
         from safetensors.numpy import save
 
@@ -232,7 +232,8 @@ class Policy:
         """Read a policy that `save` wrote.
 
         Raises:
-            InvalidFile: if the file is missing, damaged, or not a policy of this format.
+            InvalidFile: if the file is missing, damaged, or not a policy of this format; for one of a robot that is not
+                registered here, with what to import.
         """
         path = expect_plain_file(path, _MOST_BYTES)
         arrays, described = _read(path)

@@ -11,7 +11,6 @@ import pickle
 import selectors
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from animat.robots.registry import expect_loadable_robot
 from animat.training.group import CHECKPOINT_S, Group, split_groups, train_group
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
+from animat.training.worker import start_worker
 from animat.writing import alone_in, clear_away, written_whole
 
 MANIFEST = "training.json"
@@ -57,7 +57,8 @@ def train(
         training: what is trained.
         timeline: the culture's simulators; None for a training without neurons.
         folder: where the policies go; made where it is missing. None: nowhere; they are trained in this process, and
-            a training that is stopped begins anew. So can robots and mappings of one's own, which no file can name.
+            a training that is stopped begins anew. So can robots that are not registered, and mappings of one's own,
+            which no file can name.
         workers: processes to use, each pinned to a core of its own; None: as many as there are cores.
         progress: told how far it is.
         checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
@@ -117,7 +118,7 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
     if training.mapping is not None:
         check_mapping(training.mapping)
     if is_saved:
-        expect_loadable_robot(training.robot)
+        expect_loadable_robot(training.robot, in_workers=True)
         if training.mapping is not None:
             expect_loadable_mapping(training.mapping)
 
@@ -304,11 +305,4 @@ def _start(group: Group, folder: Path, core: int, checkpoint_s: float) -> subpro
             job.seek(0)
         except OSError as error:
             raise InvalidFile(f"{tempfile.gettempdir()}: cannot be written to: {error.strerror or error}") from error
-        # In a process group of its own: Ctrl-C reaches this process alone, which then ends the worker without a word.
-        return subprocess.Popen(
-            [sys.executable, "-m", "animat.training.worker", str(core)],
-            stdin=job,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-            process_group=0,
-        )
+        return start_worker("animat.training.worker", core, job)

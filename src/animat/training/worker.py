@@ -10,16 +10,19 @@ import json
 import os
 import pickle
 import signal
+import subprocess
 import sys
 from pathlib import Path
+from typing import IO, TextIO
 
 
 def main() -> int:
     """Read a job, train it, write its policies; report each chunk as a line."""
-    settle_on(int(sys.argv[1]))
+    told = settle_on(int(sys.argv[1]))
 
     from animat.compilation import keep_compilations
     from animat.errors import AnimatError, out_of_memory
+    from animat.robots.registry import register_robot
     from animat.training.group import Group, train_group
 
     keep_compilations()
@@ -27,12 +30,13 @@ def main() -> int:
     folder: Path
     checkpoint: Path
     checkpoint_s: float
-    group, folder, checkpoint, checkpoint_s = pickle.load(sys.stdin.buffer)
 
     def report(done: int, mean_return: float) -> None:
-        print(json.dumps({"done": done, "mean_return": mean_return}), flush=True)
+        print(json.dumps({"done": done, "mean_return": mean_return}), file=told, flush=True)
 
     try:
+        group, folder, checkpoint, checkpoint_s = pickle.load(sys.stdin.buffer)
+        register_robot(type(group.training.robot))
         policies = train_group(group, checkpoint, report, checkpoint_s=checkpoint_s)
         for member, policy in zip(group.members, policies, strict=True):
             policy.save(folder / f"p{member}.safetensors")
@@ -42,16 +46,35 @@ def main() -> int:
         if memory is None and not isinstance(error, AnimatError):
             raise
         sizes = "environments, replay, batch, hidden"
-        told = f"{memory}: it grows with the algorithm's {sizes}, got {group.training.algorithm}" if memory else error
-        print(json.dumps({"error": str(told)}), flush=True)
+        words = f"{memory}: it grows with the algorithm's {sizes}, got {group.training.algorithm}" if memory else error
+        print(json.dumps({"error": str(words)}), file=told, flush=True)
         return 1
     return 0
 
 
-def settle_on(core: int) -> None:
+def start_worker(module: str, core: int, stdin: IO[bytes] | int) -> subprocess.Popen[bytes]:
+    """Start a worker, `python -m MODULE CORE`, which imports from where this process does.
+
+    It is in a process group of its own: Ctrl-C reaches this process alone, which then ends the worker without a word.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-m", module, str(core)],
+        stdin=stdin,
+        stdout=subprocess.PIPE,
+        bufsize=0,
+        process_group=0,
+        # A script's own folder, or the working one: robots may lie there.
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+
+
+def settle_on(core: int) -> TextIO:
     """Make this process a worker: on one core, without an accelerator, and gone when the one that started it is.
 
     To be called before JAX or BLAS are loaded.
+
+    Returns:
+        Where to tell the one that started it: what libraries and robots print goes to standard error from now on.
     """
     # They size their threads by the cores they may use, and one pinned core beats two shared ones.
     os.sched_setaffinity(0, {core})
@@ -60,6 +83,9 @@ def settle_on(core: int) -> None:
     # However the parent ends, the kernel then kills this process.
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    told = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    return told
 
 
 if __name__ == "__main__":

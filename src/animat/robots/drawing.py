@@ -11,12 +11,12 @@ from jaxtyping import Float, UInt8
 
 from animat.errors import InvalidArgument
 from animat.robots.base import Robot
-from animat.robots.cartpole import Cartpole
-from animat.robots.navigation import Navigation
+from animat.robots.capabilities import capability
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
 Plane = np.ndarray[Any, np.dtype[np.float64]]
+Picture = UInt8[np.ndarray, "height width 3"]
 
 PAPER: Colour = (250, 250, 248)
 INK: Colour = (52, 58, 64)
@@ -27,6 +27,9 @@ GOAL: Colour = (90, 170, 110)
 GOAL_FILL: Colour = (214, 236, 219)
 TRAIL: Colour = (150, 178, 214)
 
+DONE, FAILED, AIM, EDGE = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
+"""Of figures of paths: episodes that ended well or not, where they should end, and limits (Okabe and Ito's palette)."""
+
 
 def draw_robot(
     robot: Robot[Any],
@@ -35,27 +38,26 @@ def draw_robot(
     command: float = 0.0,
     earlier: Sequence[Float[np.ndarray, " observations"]] = (),
     height_px: int = 360,
-) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture of the robot as an observation describes it.
+) -> Picture:
+    """A picture of a robot as an observation describes it.
 
     Args:
-        robot: its parameters give the sizes of what is drawn.
+        robot: one with a method `draw`.
         observation: in the robot's own units.
-        command: the motor command u in [-1, 1] that led here, drawn as an arrow (cartpole).
-        earlier: the observations of the episode before this one, drawn as a path (navigation).
+        command: the motor command u in [-1, 1] that led here.
+        earlier: the observations of the episode before this one.
         height_px: height of the picture; its width follows.
 
     Returns:
         red, green, blue from 0 to 255.
 
     Raises:
-        InvalidArgument: for a robot that no drawing is known for.
+        InvalidArgument: for a robot that has no such method, or one that gives no picture.
     """
-    draw = _DRAWINGS.get(type(robot))
-    if draw is None:
-        known = ", ".join(kind.name for kind in _DRAWINGS)
-        raise InvalidArgument(f"robot: expected one that can be drawn ({known}), got {robot.name}")
-    return draw(robot, np.asarray(observation, np.float64), command, earlier, height_px)
+    drawn = capability(robot, "draw")(np.asarray(observation, np.float64), command, earlier, height_px)
+    if (shape := np.shape(drawn))[2:] != (3,) or np.asarray(drawn).dtype != np.uint8:
+        raise InvalidArgument(f"{robot.name}.draw: expected uint8 of shape (height, width, 3), got shape {shape}")
+    return drawn  # type: ignore[no-any-return]
 
 
 class Canvas:
@@ -103,9 +105,9 @@ class Canvas:
 
         self._paint(distance, low_px, high_px, corner * self._scale, colour)
 
-    def picture(self) -> UInt8[np.ndarray, "height width 3"]:
+    def picture(self) -> Picture:
         """What was drawn so far."""
-        pixels: UInt8[np.ndarray, "height width 3"] = np.rint(self._pixels).astype(np.uint8)
+        pixels: Picture = np.rint(self._pixels).astype(np.uint8)
         return pixels
 
     def _paint(
@@ -126,59 +128,3 @@ class Canvas:
         cover = np.clip(radius_px - distance(x, y) + 0.5, 0, 1)[..., None]
         region = self._pixels[y0:y1, x0:x1]
         region += cover * (np.array(colour) - region)
-
-
-def _draw_cartpole(
-    robot: Cartpole, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int
-) -> UInt8[np.ndarray, "height width 3"]:
-    half_track, pole = robot.track_length_m / 2, robot.pole_length_m
-    margin = 0.25 * pole
-    x, angle = float(observation[0]), float(observation[2])
-    # Room for a pole that hangs as well as for one that stands, once the limits allow it to hang.
-    below = pole if robot.angle_limit_rad > math.pi / 2 else 0.1 * pole
-    scale = height_px / (pole + below + 2 * margin)
-    width_px = round(scale * 2 * (half_track + pole / 2 + margin))
-    canvas = Canvas(width_px, height_px, (width_px / 2, scale * (pole + margin)), scale)
-
-    cart_width, cart_height, thick = 0.3 * pole, 0.14 * pole, 0.045 * pole
-    canvas.stroke([(-half_track, 0.0), (half_track, 0.0)], 0.02 * pole, RAIL)
-    for end in (-half_track, half_track):
-        canvas.stroke([(end, -0.5 * cart_height), (end, 0.5 * cart_height)], 0.02 * pole, INK)
-    canvas.box((x - cart_width / 2, -cart_height / 2), (x + cart_width / 2, cart_height / 2), 0.02 * pole, INK)
-    tip = (x + pole * math.sin(angle), -pole * math.cos(angle))
-    canvas.stroke([(x, 0.0), tip], thick, BODY)
-    canvas.disc((x, 0.0), 0.6 * thick, PAPER)
-    if command:
-        y = cart_height / 2 + 0.12 * pole
-        head = x + 0.3 * pole * command
-        back = head - math.copysign(0.05 * pole, command)
-        canvas.stroke([(x, y), (head, y)], 0.02 * pole, ACCENT)
-        canvas.stroke([(back, y - 0.04 * pole), (head, y), (back, y + 0.04 * pole)], 0.02 * pole, ACCENT)
-    return canvas.picture()
-
-
-def _draw_navigation(
-    robot: Navigation, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int
-) -> UInt8[np.ndarray, "height width 3"]:
-    x, y, heading = (float(value) for value in observation)
-    width_m, height_m = robot.arena_width_m, robot.arena_height_m
-    margin = 0.06 * height_m
-    scale = height_px / (height_m + 2 * margin)
-    canvas = Canvas(round(scale * (width_m + 2 * margin)), height_px, (scale * margin, scale * margin), scale)
-    line, size = 0.008 * height_m, 0.03 * height_m
-
-    goal = (robot.goal_x_m, robot.goal_y_m)
-    canvas.disc(goal, robot.goal_radius_m, GOAL)
-    canvas.disc(goal, robot.goal_radius_m - line, GOAL_FILL)
-    walls = [(0.0, 0.0), (width_m, 0.0), (width_m, height_m), (0.0, height_m), (0.0, 0.0)]
-    canvas.stroke(walls, line, INK)
-    canvas.stroke([*((float(past[0]), float(past[1])) for past in earlier), (x, y)], line, TRAIL)
-    canvas.stroke([(x, y), (x + 1.8 * size * math.cos(heading), y + 1.8 * size * math.sin(heading))], line, ACCENT)
-    canvas.disc((x, y), size, BODY)
-    return canvas.picture()
-
-
-_DRAWINGS: dict[type[Any], Callable[..., UInt8[np.ndarray, "height width 3"]]] = {
-    Cartpole: _draw_cartpole,
-    Navigation: _draw_navigation,
-}

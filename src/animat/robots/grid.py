@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.robots.base import Robot
-from animat.robots.cartpole import Cartpole, CartpoleState
-from animat.robots.navigation import Navigation, NavigationState
+from animat.robots.capabilities import capability
 
 _FINEST = 8192.0
 
@@ -189,73 +188,21 @@ class Grid:
 
 
 def grid_for(robot: Robot[Any]) -> Grid:
-    """The grid that was measured to suit a robot of ours (see docs/evaluation.md).
-
-    *Cartpole.* Position and angle are those after the next iteration, which are already decided: a state in which one
-    of them lies beyond its limit is lost, and the ends of the axes are where that begins. With l half the pole's
-    length, a push changes the cart's velocity v and the pole's angular velocity w such that v + 4/3 l w stays nearly
-    the same: it moves with gravity only, slowly, and takes the place of v. The angular velocities end, with 10 % more,
-    where the pole cannot be caught any more: r (angle limit + F / (M g)), with r the rate at which it falls, 1/s; the
-    velocities at sqrt(g angle limit track length), from which the cart can hardly be stopped on its track by leaning
-    the pole.
-
-    *Navigation.* A hundred headings: turns of u pi/10 with u a multiple of 0.2 lead from one of them to another
-    exactly.
+    """The robot's own grid, its `value_grid`.
 
     Raises:
-        InvalidArgument: for a robot without one, or a cartpole whose pole may swing far.
+        InvalidArgument: for a robot that has none, or has none with its parameters.
     """
-    if isinstance(robot, Cartpole):
-        return _cartpole_grid(robot)
-    if isinstance(robot, Navigation):
-        return Grid(
-            Axis("x", "m", 0.0, robot.arena_width_m, 61),
-            (
-                Axis("y", "m", 0.0, robot.arena_height_m, 61),
-                Axis("heading", "rad", -math.pi, math.pi, 100, periodic=True),
-            ),
-            tuple,
-            lambda coordinates: NavigationState(*coordinates),
-        )
-    raise InvalidArgument(f"grid: expected one for {robot.name}, as there is none of ours; hand in a Grid")
+    grid = capability(robot, "value_grid")()
+    if not isinstance(grid, Grid):
+        raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {shown(grid)}")
+    return grid
 
 
-def _cartpole_grid(robot: Cartpole) -> Grid:
-    if robot.angle_limit_rad > 0.75:
-        raise InvalidArgument(
-            f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {robot.angle_limit_rad:g}; hand "
-            f"in a Grid"
-        )
-    half_length_m = robot.pole_length_m / 2
-    total_kg = robot.cart_mass_kg + robot.pole_mass_kg
-    shear_m = 4 / 3 * half_length_m
-    step_s = robot.step_s
-    gravity = max(robot.gravity_m_per_s2, 1.0)
-    rate_per_s = math.sqrt(gravity / (half_length_m * (4 / 3 - robot.pole_mass_kg / total_kg)))
-    held_rad = max(robot.force_n, 0.1) / (total_kg * gravity)
-    angular_velocity = 1.1 * rate_per_s * (robot.angle_limit_rad + held_rad)
-    velocity = math.sqrt(gravity * robot.angle_limit_rad * robot.track_length_m)
-
-    def to_coordinates(state: CartpoleState) -> tuple[Array, ...]:
-        x, v, a, w = state
-        return x + step_s * v, v + shear_m * w, a + step_s * w, w
-
-    def to_state(coordinates: tuple[Array, ...]) -> CartpoleState:
-        x, z, a, w = coordinates
-        v = z - shear_m * w
-        return CartpoleState(x - step_s * v, v, a - step_s * w, w)
-
-    half_track_m = robot.track_length_m / 2
-    return Grid(
-        Axis("next cart_position", "m", -half_track_m, half_track_m, 17),
-        (
-            Axis("cart_velocity + 4/3 l w", "m/s", -velocity, velocity, 17),
-            Axis("next pole_angle", "rad", -robot.angle_limit_rad, robot.angle_limit_rad, 41),
-            Axis("pole_angular_velocity", "rad/s", -angular_velocity, angular_velocity, 55),
-        ),
-        to_coordinates,
-        to_state,
-        smooth_commands=5,
-        end_is_known=True,
-        noise_in_command=robot.force_noise,
-    )
+def no_grid(robot: Robot[Any]) -> str | None:
+    """Why there is no grid for this robot; None where there is one."""
+    try:
+        grid_for(robot)
+    except InvalidArgument as error:
+        return str(error)
+    return None

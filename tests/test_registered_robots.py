@@ -1,0 +1,270 @@
+"""Robots of a user's own package and script: registered, trained in workers, saved, loaded, evaluated, run, drawn."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.errors import InvalidArgument, InvalidFile
+from animat.evaluation.table import evaluate
+from animat.recordings.made_up import write_made_up_series
+from animat.robots import ROBOTS, Cartpole, Navigation, Robot, register_robot, registry, robot_named, robot_to_dict
+from animat.robots.capabilities import WITHOUT, lacking
+from animat.studies.run import run_study
+from animat.studies.specification import Body, Source, Study
+from animat.studies.toml import read_study, study_to_toml
+from animat.training.policy import load_policies
+from animat.training.specification import Training
+from animat.training.trainer import train
+from test_training import SMALL, timeline_of
+
+DOCS = Path(__file__).parents[1] / "docs" / "robots.md"
+ROVER = "my_package.robots:Rover"
+
+
+@pytest.fixture(autouse=True)
+def forgetting() -> Iterator[None]:
+    """What a test registers and imports is forgotten after it."""
+    known, loaded = dict(ROBOTS), set(sys.modules)
+    forget()
+    yield
+    forget(known)
+    for name in set(sys.modules) - loaded:
+        if name.startswith("my_"):
+            del sys.modules[name]
+
+
+def forget(known: dict[str, type[Robot[Any]]] | None = None) -> None:
+    """As in a process that has imported nothing of the user's."""
+    ours = {"cartpole": Cartpole, "navigation": Navigation}
+    registry._registered.clear()
+    registry._registered.update(known or ours)
+    for name in ("my_package", "my_package.robots"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A user's package with the robot of the page on robots, in the folder that is worked in."""
+    (page,) = re.findall(r"```python\n(import .*?class Rover.*?)```", DOCS.read_text(), re.DOTALL)
+    (tmp_path / "my_package").mkdir()
+    (tmp_path / "my_package" / "__init__.py").touch()
+    (tmp_path / "my_package" / "robots.py").write_text(page)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def written(folder: Path, *changes: tuple[str, str]) -> str:
+    """Another module with the rover changed; returns where it is imported from."""
+    text = (folder / "my_package" / "robots.py").read_text()
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after)
+    number = len(list(folder.glob("my_changed*.py")))
+    (folder / f"my_changed{number}.py").write_text(text)
+    return f"my_changed{number}:Rover"
+
+
+def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path) -> None:
+    # Six policies are two groups, each in a worker of its own.
+    training = Training(ROVER, "1-threshold", policies=6, iterations=480, algorithm=SMALL)
+    trained = train(training, timeline_of(), package / "policies", workers=2)
+    rover = robot_named("rover", gain_m=0.1)
+    assert len(trained) == 6 and all(policy.robot == rover for policy in trained.values())
+    assert robot_to_dict(rover)["import"] == ROVER
+    alone = train(training, timeline_of(), None)
+    for name, policy in trained.items():
+        np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
+
+    forget()
+    with pytest.raises(InvalidFile, match=f"'rover': import my_package.robots first .*--robot {ROVER}"):
+        load_policies(package / "policies")
+    # No file makes anything be imported.
+    assert "my_package" not in sys.modules
+    robot_named(ROVER)
+    loaded = load_policies(package / "policies")
+    evaluation = evaluate(loaded, timeline_of(), episodes=5, limit_resolution=1.0)
+    assert evaluation.robot == "rover" and evaluation.names == tuple(trained)
+    assert "rover has no method `value_grid`" in (evaluation.no_limit or "")
+    assert "no rule made by hand among the controls: rover has no method `heuristic`" in evaluation.to_text()
+
+
+@pytest.mark.oracle
+def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: Any) -> None:
+    write_made_up_series(0, "recordings", sessions=1)
+    few = ["--recordings", "recordings", "--policies", "1", "--iterations", "256", "--workers", "1"]
+    assert main(["train", ROVER, *few, "--parameters", "episode_limit=12"]) == 0
+    forget()
+    assert main(["evaluate", "--recordings", "recordings"]) == 1
+    assert f"--robot {ROVER}" in capsys.readouterr().err
+    asked = ["--recordings", "recordings", "--robot", ROVER, "--episodes", "2", "--json"]
+    assert main(["evaluate", *asked, "--limit"]) == 0
+    said = capsys.readouterr().out
+    told = json.loads(said.splitlines()[-1])
+    assert told["robot"] == "rover" and told["limit"] is None and "value_grid" in told["no_limit"]
+    assert "no rule made by hand among the controls: rover has no method `heuristic`" in said
+    forget()
+    assert main(["run", *asked, "--culture", "replay"]) == 0
+    said = capsys.readouterr().out
+    told = json.loads(said.splitlines()[-1])
+    assert "made by hand" not in {row["name"] for row in told["rows"]}
+    assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
+    assert "no best possible return: robot: rover has no method `value_grid`" in said
+
+
+@pytest.mark.oracle
+def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
+    robot_named(ROVER)
+    study = Study(
+        culture=Source("made-up", sessions=1, presentations=40, channels=16),
+        robots=(Body("rover", iterations=240),),
+        policies=1,
+        episodes=2,
+        episodes_over_time=2,
+        algorithm={"environments": 8, "updates": 1, "batch": 16, "replay": 256, "hidden": 8},
+    )
+    (package / "study.toml").write_text(study_to_toml(study))
+    assert read_study(package / "study.toml") == study and study.robots[0].kind == ROVER
+    ran = run_study(study, package / "study", workers=1)
+    page = ran.report.read_text()
+    for sentence in lacking(robot_named("rover")).values():
+        assert sentence in page
+    assert not list((package / "study" / "figures").glob("rover-frames*"))
+
+
+@pytest.mark.oracle
+def test_what_is_registered_in_a_script_is_found_by_its_workers(package: Path) -> None:
+    """A script's own robot, which is `__main__`'s; what it prints is not taken for what a worker tells."""
+    script = """
+from dataclasses import dataclass
+import animat
+from my_package.robots import Rover
+from test_training import SMALL, timeline_of
+
+print("imported")
+
+@animat.register_robot
+@dataclass(frozen=True)
+class Mine(Rover):
+    name = "mine"
+
+if __name__ == "__main__":
+    training = animat.Training(Mine(), "1-threshold", policies=1, iterations=240, algorithm=SMALL)
+    print(animat.train(training, timeline_of(), "out")["p0"].robot)
+"""
+    environment = {**os.environ, "PYTHONPATH": ":".join([str(Path(__file__).parent), *sys.path])}
+    (package / "my_script.py").write_text(script)
+    ran = subprocess.run([sys.executable, "my_script.py"], capture_output=True, text=True, env=environment)
+    assert ran.stdout.splitlines() == ["imported", "Mine(gain_m=0.1, episode_limit=20)"], ran.stderr
+    mine = {"name": "mine", "parameters": {"gain_m": 0.1, "episode_limit": 20}, "import": "my_script:Mine"}
+    assert robot_to_dict(robot_named("my_script:Mine")) == mine
+
+
+def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> None:
+    @register_robot
+    @dataclass(frozen=True)
+    class Here(type(robot_named(ROVER))):  # type: ignore[misc]
+        name = "here"
+
+    with pytest.raises(InvalidArgument, match=r"at the top of a file.*<locals>\.Here.*in memory"):
+        train(Training(Here(), None, algorithm=SMALL), None, package / "out")
+
+
+def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [EntryPoint("rover", ROVER, "animat.robots"), EntryPoint("tank", ROVER, "animat.robots")]
+
+    def found(*, group: str, name: str | None = None) -> list[EntryPoint]:
+        return [point for point in points if group == point.group and name in (None, point.name)]
+
+    monkeypatch.setattr(registry, "entry_points", found)
+    with pytest.raises(InvalidArgument, match="expected one of cartpole, navigation, rover, tank, got 'plane'"):
+        robot_named("plane")
+    assert robot_named("rover", gain_m=0.2) == robot_named(ROVER, gain_m=0.2)
+    forget()
+    with pytest.raises(InvalidArgument, match="to have the name 'tank', got 'rover'"):
+        robot_named("tank")
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("my_nowhere:Rover", "expected my_nowhere:Rover to be importable, got ModuleNotFoundError"),
+        ("my_package.robots:Tank", "Tank to be importable, got AttributeError"),
+        ("my_package.robots:At", "expected a class made of animat.Robot, got <class"),
+        ("my_package.robots:", "to be importable, got "),
+        (":Rover", "to be importable, got ValueError"),
+        ((("import animat", "import animat; 1 / 0"),), "to be importable, got ZeroDivisionError: division by zero"),
+        ((("import animat", "raise SystemExit('no')"),), "to be importable, got SystemExit: no"),
+        ((("def observe", "def see"),), "expected the methods of a robot, got a class without observe"),
+        ((("@dataclass(frozen=True)", ""),), "expected a frozen dataclass"),
+        ((('name = "rover"', 'name = "a/b"'),), "name: expected letters, digits"),
+        ((('name = "rover"', 'name = "cartpole"'),), "no other robot has, got 'cartpole', which is animat.robots"),
+    ],
+)
+def test_what_cannot_be_imported_or_registered_is_named_in_a_line(place: Any, words: str, package: Path) -> None:
+    at = place if isinstance(place, str) else written(package, *place)
+    with pytest.raises(InvalidArgument, match=words) as raised:
+        robot_named(at)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("jnp.stack([state.x_m])", "state.x_m"), r"Rover.observe: .*shape \(1,\), got shape \(\)"),
+        (("-jnp.abs(x_m)", "jnp.log(x_m - 9)"), "Rover: expected finite numbers, got NaN"),
+    ],
+)
+def test_a_bad_robot_ends_in_a_line_before_anything_is_read_or_recorded(
+    change: tuple[str, str], words: str, package: Path, capsys: Any
+) -> None:
+    at = written(package, change)
+    assert main(["train", at, "--recordings", "no-such-folder"]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and re.search(words, said[0])
+    with pytest.raises(InvalidArgument, match=words):
+        run_study(Study(robots=(Body("rover", kind=at),)), package / "study")
+    assert not list((package / "study").glob("recordings/*"))
+
+
+def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Path) -> None:
+    env = gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, gain_m=0.2)
+    observation, _ = env.reset(seed=1)
+    after, *_ = env.step(4)
+    assert abs(after[0] - observation[0]) == pytest.approx(0.2, abs=1e-6)
+    with pytest.raises(InvalidArgument, match="rover has no method `draw`"):
+        gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, render_mode="rgb_array")
+
+    def drawing(returned: str) -> Callable[[], Any]:
+        draw = f"\n    def draw(self, observation, command, earlier, height_px):\n        return {returned}\n"
+        forget()
+        at = written(package, ('    name = "rover"\n', f'    name = "rover"\n{draw}'))
+        env = gymnasium.make("animat:Animat/Robot-v0", robot=at, render_mode="rgb_array")
+        env.reset(seed=1)
+        return env.render  # type: ignore[return-value]
+
+    assert drawing("np.full((height_px, 9, 3), len(earlier), np.uint8)")().shape == (360, 9, 3)
+    with pytest.raises(InvalidArgument, match=r"rover.draw: expected uint8 of shape .*got shape \(9, 9\)"):
+        drawing("np.zeros((9, 9))")()
+
+
+def test_ours_can_do_everything_and_are_pickled_as_ever() -> None:
+    for robot in (Cartpole(), Navigation()):
+        assert lacking(robot) == {} and "import" not in robot_to_dict(robot)
+        assert pickle.loads(pickle.dumps(robot)) == robot
+    assert set(WITHOUT) == {"heuristic", "value_grid", "draw", "draw_paths"}
