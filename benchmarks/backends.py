@@ -13,8 +13,9 @@ import numpy as np
 
 from animat.cultures.base import Culture
 from animat.cultures.virtual import VirtualCulture
-from animat.recordings.selection import SelectionRule
-from animat.recordings.stimulus import Phase, Pulse, Stimulus
+from animat.stimulation.pulse import Phase, Pulse
+from animat.stimulation.selection import SelectionRule
+from animat.stimulation.stimulus import Stimulus
 
 
 @contextmanager

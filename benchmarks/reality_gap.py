@@ -146,7 +146,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
     from animat.cultures.kinds import pulse_for
     from animat.neurons.series import extract_series
     from animat.reality_gap import Calibration, run_policies
-    from animat.recordings.protocol import CLOSED_LOOP
+    from animat.stimulation.protocol import CLOSED_LOOP
     from animat.training.policy import load_policies
 
     way = WAYS["memory9"]

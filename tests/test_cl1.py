@@ -19,8 +19,9 @@ from animat.cultures.contract import CultureContract
 from animat.cultures.same_culture import other_culture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import said
-from animat.recordings.protocol import Protocol
-from animat.recordings.stimulus import BALANCED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import BALANCED_PULSE, Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
 from stand_in_cl import Neurons, install
 
 

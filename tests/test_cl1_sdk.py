@@ -26,8 +26,9 @@ import json, sys
 import numpy as np
 from animat.cultures.cl1 import CL1_PULSE, SITES, CL1Culture
 from animat.cultures.cl1_source import use_simulated_culture
-from animat.recordings.protocol import Protocol
-from animat.recordings.stimulus import Phase, Pulse, Stimulus
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
 def tell(**what): print("TOLD" + json.dumps(what))
 """
 
@@ -177,7 +178,7 @@ tell(spikes=sorted(spikes), stims=sorted(stims), frames=frames)
 def test_the_driver_records_responses_of_the_simulated_culture(tmp_path: Path) -> None:
     script = """
 use_simulated_culture(seed=3, neurons=300)
-from animat.recordings.protocol import Protocol
+from animat.stimulation.protocol import Protocol
 with CL1Culture() as culture:
     pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
     protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), presentations=20, patterns=20)

@@ -18,7 +18,7 @@ from animat.neurons.conditions import (
     conditions_named,
     default_conditions,
 )
-from animat.recordings.recording import Stimuli
+from animat.stimulation.stimulus import Stimuli
 
 
 def stimuli(

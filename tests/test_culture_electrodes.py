@@ -16,11 +16,12 @@ from animat.cultures.tissue.parameters import ShortTerm
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
 from animat.cultures.visibility import NOISE_UV
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.recordings.array import MAXONE
-from animat.recordings.protocol import Protocol
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection, SelectionRule
-from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.selection import Selection, SelectionRule
+from animat.stimulation.stimulus import Stimulus
 from cultures import FEW, small_culture
 
 SHORT = Protocol((10.0, 40.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)

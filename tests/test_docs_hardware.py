@@ -18,12 +18,12 @@ from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.mapping import Thresholds
 from animat.neurons.conditions import Condition
-from animat.recordings.array import MAXONE
-from animat.recordings.patterns import draw_patterns
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE
 from animat.robots import Navigation
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.selection import Selection
 from stand_in_cl import install
 
 DOCS = Path(__file__).parents[1] / "docs"

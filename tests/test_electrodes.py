@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.recordings.array import MAXONE, ElectrodeArray
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.scan import ScannedActivity
-from animat.recordings.selection import Selection, SelectionRule, select_electrodes
+from animat.recordings.recording import Channels
+from animat.stimulation.array import MAXONE, ElectrodeArray
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.scan import ScannedActivity
+from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
 
 SMALL = ElectrodeArray("small", columns=20, rows=10, pitch_um=20.0, channels=60, stimulation_units=16)
 
@@ -161,7 +162,7 @@ def test_a_draw_that_finds_hardly_any_pattern_ends(monkeypatch: pytest.MonkeyPat
     with pytest.raises(InvalidArgument, match="24 electrodes make only 24"):
         draw_patterns(MAXONE, far, size=23, spacing_um=100.0, seed=1)
     near = np.array([220 * row + column for row in range(10, 30) for column in range(10, 30)])
-    monkeypatch.setattr("animat.recordings.patterns._MOST_LOOKED_AT", 10_000)
+    monkeypatch.setattr("animat.stimulation.patterns._MOST_LOOKED_AT", 10_000)
     with pytest.raises(InvalidArgument, match="among 10,000 beginnings of such sets 0 could be completed"):
         draw_patterns(MAXONE, near, size=25, spacing_um=100.0, seed=1, patterns=1)
 
@@ -194,7 +195,7 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
     selection.save(tmp_path / "selection.json")
     assert Selection.load(tmp_path / "selection.json") == selection
     assert hash(Selection.load(tmp_path / "selection.json")) == hash(selection)
-    channels = selection.channels
+    channels = Channels.on(SMALL, selection.recording)
     assert channels.electrode.tolist() == selection.recording.tolist()
     assert channels.has_positions
     for content in ("", "[]", "{}", json.dumps({**selection.to_dict(), "format": "other"}), "\x00"):

@@ -23,9 +23,9 @@ from animat.neurons.conditions import Condition
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.series import extract_series
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recordings
 from animat.robots import Cartpole, Navigation
+from animat.stimulation.protocol import Presentation
 from animat.training.specification import Training
 from animat.training.trainer import train
 

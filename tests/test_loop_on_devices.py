@@ -22,11 +22,11 @@ from animat.cultures.maxone import MaxOneCulture
 from animat.errors import DeviceFailed
 from animat.mapping import Thresholds
 from animat.neurons.conditions import Condition
-from animat.recordings.array import MAXONE
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, Pulse
 from animat.robots import Navigation
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.pulse import BALANCED_PULSE, Pulse
+from animat.stimulation.selection import Selection
 
 HZ = (5.0, 20.0)
 

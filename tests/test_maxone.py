@@ -17,12 +17,13 @@ from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.maxone_sequences import dac_code
 from animat.cultures.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.array import MAXONE
 from animat.recordings.formats.stimulus_text import said
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.protocol import Protocol
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
 from stand_in_maxlab import LSB_MV, Rig, Stream, install
 
 SITES = [(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)]

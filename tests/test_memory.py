@@ -34,9 +34,9 @@ from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Presentation
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.stimulation.protocol import Presentation
 from animat.studies.differences import decisions
 from animat.studies.paper import paper_study
 from animat.studies.simulating import load_timeline, save_timeline

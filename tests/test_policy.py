@@ -29,9 +29,9 @@ from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.mapping import mapping_named
 from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.kinds import Kind
-from animat.recordings.protocol import Presentation
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, load_policies
 from animat.training.provenance import READ
 from animat.training.sac import Layer, forward

@@ -38,12 +38,12 @@ from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, chec
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import ANEW_EPISODES
 from animat.reality_gap.running import planned_episodes
-from animat.recordings.array import MAXONE
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection
 from animat.robots import Cartpole, Navigation, Robot
+from animat.stimulation.array import MAXONE
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.selection import Selection
 from animat.training.policy import Policy
 from fake_culture import FakeCulture
 

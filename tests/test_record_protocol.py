@@ -15,10 +15,10 @@ from animat.cli import main
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Protocol, read_protocol
 from animat.recordings.reading import read_recording
-from animat.recordings.schedule import make_schedule
-from animat.recordings.stimulus import BALANCED_PULSE
+from animat.stimulation.protocol import Protocol, read_protocol
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.schedule import make_schedule
 
 PATTERNS = np.arange(500).reshape(100, 5)
 MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)

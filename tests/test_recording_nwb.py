@@ -16,8 +16,10 @@ from hypothesis.extra import numpy as npst
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 TEXT = st.text(st.characters(blacklist_characters="\0", blacklist_categories=("Cs",)), max_size=8)
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

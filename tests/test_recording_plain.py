@@ -18,9 +18,9 @@ from hypothesis.extra import numpy as npst
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
 from animat.recordings.noticed import noticed
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Presentation
 
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

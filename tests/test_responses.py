@@ -13,9 +13,10 @@ from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern, Conditions
 from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
 from animat.neurons.responses import Responses, extract_responses
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording
-from animat.recordings.recording import Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
 
 
 def recording(

@@ -22,10 +22,10 @@ from animat.neurons.series import extract_series
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.reading import read_recording
-from animat.recordings.selection import SelectionRule
 from animat.robots import Navigation
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
 

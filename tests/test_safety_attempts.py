@@ -33,9 +33,10 @@ from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.observed import Observed
 from animat.cultures.safety import Admitted, Guard
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.array import MAXONE
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
 from fake_culture import FakeCulture
 from test_safety import DEVICE
 

@@ -16,7 +16,7 @@ from animat.neurons.fidelity import fidelity
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import fit_empirical, fit_histogram, silenced
 from animat.neurons.timeline import fit_timeline
-from animat.recordings.protocol import Presentation
+from animat.stimulation.protocol import Presentation
 
 FREQUENCIES = (5.0, 10.0, 20.0, 40.0, 80.0)
 

@@ -37,9 +37,9 @@ from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
-from animat.recordings.selection import SelectionRule
 from animat.report.html import cell, with_error
 from animat.robots import Cartpole, Navigation
+from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
 from animat.studies.folder import describe_study, sums_of

@@ -15,9 +15,9 @@ from animat.cultures.virtual import VirtualCulture
 from animat.neurons.series import extract_series
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed
-from animat.recordings.protocol import Order, Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Order, Protocol
 from test_inspection import answering
 from test_responses import recording as of_spikes
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.recordings.protocol import Presentation
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Presentation
 from test_responses import recording
 
 QUICK = ["--policies", "1", "--iterations", "64"]

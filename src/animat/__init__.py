@@ -42,11 +42,12 @@ if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline, fit_timeline
     from animat.reality_gap import Calibration, run_policies
     from animat.recordings.findings import Finding
-    from animat.recordings.protocol import Presentation, Protocol, read_protocol
     from animat.recordings.reading import read_recording, read_recordings
-    from animat.recordings.recording import Channels, Recording, Stimuli
-    from animat.recordings.selection import Selection
+    from animat.recordings.recording import Channels, Recording
     from animat.robots import Cartpole, Navigation, Robot, robot_named
+    from animat.stimulation.protocol import Presentation, Protocol, read_protocol
+    from animat.stimulation.selection import Selection
+    from animat.stimulation.stimulus import Stimuli
     from animat.studies.paper import paper_study
     from animat.studies.run import run_study
     from animat.studies.specification import Study
@@ -57,9 +58,10 @@ if TYPE_CHECKING:
     from animat.training.trainer import train
 
 _WHERE = {
-    "recordings.recording": ("Recording", "Channels", "Stimuli"),
-    "recordings.protocol": ("Presentation", "Protocol", "read_protocol"),
-    "recordings.selection": ("Selection",),
+    "recordings.recording": ("Recording", "Channels"),
+    "stimulation.stimulus": ("Stimuli",),
+    "stimulation.protocol": ("Presentation", "Protocol", "read_protocol"),
+    "stimulation.selection": ("Selection",),
     "recordings.findings": ("Finding",),
     "recordings.reading": ("read_recording", "read_recordings"),
     "cultures.base": ("Culture",),

@@ -71,9 +71,9 @@ class Live(Stimulating):
         from animat.live.shadowing import live
         from animat.mapping import mapping_named
         from animat.progress import Bar
-        from animat.recordings.protocol import Protocol
         from animat.recordings.reading import read_recordings
         from animat.robots.registry import robot_named
+        from animat.stimulation.protocol import Protocol
         from animat.training.specification import Training
 
         simulated = self.culture in ("virtual", "replay")

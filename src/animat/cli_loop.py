@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from animat.reality_gap import Calibration, RealityGap
     from animat.recordings.findings import Finding
     from animat.recordings.recording import Recording
-    from animat.recordings.stimulus import Pulse
+    from animat.stimulation.pulse import Pulse
     from animat.training.policy import Policy
 
 CALIBRATION_FILE = "calibration.nwb"
@@ -206,7 +206,7 @@ class Run(Stimulating):
         from animat.cultures.kinds import pulse_for
         from animat.cultures.same_culture import other_culture
         from animat.cultures.same_patterns import other_patterns
-        from animat.recordings.protocol import Protocol
+        from animat.stimulation.protocol import Protocol
 
         if calibration is None:
             return pulse_for(self.culture), None, ()
@@ -222,7 +222,7 @@ class Run(Stimulating):
         """The culture as it is now, presented as the policies' recordings were."""
         from animat.cultures.kinds import pulse_for
         from animat.live.recording import record_within
-        from animat.recordings.protocol import CLOSED_LOOP, PAPER
+        from animat.stimulation.protocol import CLOSED_LOOP, PAPER
 
         presentation = first.presentation or CLOSED_LOOP.presentation
         protocol = replace(

@@ -12,7 +12,7 @@ from animat.writing import alone_in
 
 if TYPE_CHECKING:
     from animat.progress import Progress
-    from animat.recordings.protocol import Protocol
+    from animat.stimulation.protocol import Protocol
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class Record:
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
         from animat.cultures.kinds import pulse_for
-        from animat.recordings.protocol import CLOSED_LOOP, PAPER, read_protocol
+        from animat.stimulation.protocol import CLOSED_LOOP, PAPER, read_protocol
 
         assert self.culture != "made-up"
         # What a file leaves out is the paper's: it stands alone.

@@ -23,11 +23,12 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
-from animat.recordings.array import ElectrodeArray
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.recording import UNKNOWN, Channels
-from animat.recordings.stimulus import Phase, Pulse
+from animat.recordings.recording import Channels
+from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.pulse import Phase, Pulse
+from animat.tables import UNKNOWN
 
 HAND_OVER_S = 0.5
 """How long a stop waits for a pulse that is being handed over."""

@@ -13,7 +13,8 @@ from jaxtyping import Float64, Int64
 
 from animat.cultures.pace import Pace
 from animat.errors import DeviceFailed
-from animat.recordings.stimulus import Pulse, Stimulus
+from animat.stimulation.pulse import Pulse
+from animat.stimulation.stimulus import Stimulus
 
 FRAMES_PER_S = 25_000
 LEAD_US = 80

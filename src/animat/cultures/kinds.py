@@ -11,7 +11,7 @@ from animat.cultures.base import Culture
 from animat.errors import InvalidArgument
 from animat.progress import Progress
 from animat.recordings.recording import Recording
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
 
 CultureKind = Literal["virtual", "replay", "cl1", "maxone"]
 
@@ -66,7 +66,7 @@ def culture_of(
         return CL1Culture(seed=seed)
     if kind == "maxone" and selection is not None:
         from animat.cultures.maxone import MaxOneCulture
-        from animat.recordings.selection import Selection
+        from animat.stimulation.selection import Selection
 
         return MaxOneCulture(Selection.load(selection))
     raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")

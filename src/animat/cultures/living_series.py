@@ -11,9 +11,9 @@ from animat.cultures.same_patterns import other_patterns
 from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
-from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Protocol
 from animat.writing import alone_in
 
 _MAY_DIFFER = ("stimulation_units",)

@@ -26,9 +26,10 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace, from_zero
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
-from animat.recordings.recording import UNKNOWN, Channels
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import Stimulus
+from animat.recordings.recording import Channels
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 
 DAC_STEPS = 511
 """Codes on either side of 0 V."""

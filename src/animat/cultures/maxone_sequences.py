@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from animat.cultures.limits import steps_of
-from animat.recordings.stimulus import Pulse, Stimulus
+from animat.stimulation.pulse import Pulse
+from animat.stimulation.stimulus import Stimulus
 
 FRAMES_PER_S = 20_000
 SAMPLE_US = 50.0

@@ -11,8 +11,9 @@ from jaxtyping import Int64
 
 from animat.cultures.maxone_stream import AMPLIFIERS
 from animat.errors import DeviceFailed
-from animat.recordings.recording import UNKNOWN, Channels
-from animat.recordings.selection import Selection
+from animat.recordings.recording import Channels
+from animat.stimulation.selection import Selection
+from animat.tables import UNKNOWN
 
 UNITS = 32
 
@@ -68,14 +69,11 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
     for unit in unit_of.values():
         mx.send(mx.StimulationUnit(unit).power_up(True).connect(False).set_voltage_mode().dac_source(0))
     routed = [electrode for electrode in recording if electrode in amplifier_of]
-    x_um, y_um = selection.array.position_um(np.array(routed, dtype=np.int64))
     amplifier = np.array([amplifier_of[electrode] for electrode in routed], dtype=np.int64)
     row_of = np.full(AMPLIFIERS, UNKNOWN, dtype=np.int64)
     row_of[amplifier] = np.arange(len(routed))
     return Wiring(
-        channels=Channels(
-            label=amplifier.astype(np.str_), electrode=np.array(routed, dtype=np.int64), x_um=x_um, y_um=y_um
-        ),
+        channels=Channels.on(selection.array, np.array(routed, dtype=np.int64), amplifier),
         row_of=row_of,
         not_routed=tuple(electrode for electrode in recording if electrode not in amplifier_of),
         unit_of=unit_of,

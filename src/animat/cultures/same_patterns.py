@@ -7,7 +7,8 @@ from numpy import ndarray
 
 from animat.cultures.base import Culture
 from animat.recordings.findings import Finding
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
+from animat.tables import UNKNOWN
 
 
 def other_patterns(recording: Recording, culture: Culture) -> Finding | None:

@@ -14,10 +14,10 @@ from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.progress import Progress, Silent
-from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.schedule import make_schedule
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.schedule import make_schedule
 from animat.writing import alone_in, clear_away
 
 STATE_FILE = "culture.state"

@@ -16,11 +16,12 @@ from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.array import MAXONE
 from animat.recordings.recording import Channels
-from animat.recordings.scan import ScannedActivity
-from animat.recordings.selection import Selection, SelectionRule, select_electrodes
-from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.stimulation.scan import ScannedActivity
+from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
+from animat.stimulation.stimulus import Stimulus
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -260,7 +261,7 @@ class VirtualCulture(Culture):
     def _look(self) -> None:
         """Which channels see each neuron, neuron by neuron."""
         selection = self.selection
-        self._channels = selection.channels
+        self._channels = Channels.on(selection.array, selection.recording)
         pairs = self._visibility.pairs_of(selection.recording)
         order = np.lexsort((pairs.electrode, pairs.neuron))
         self._n_seen_by = np.bincount(pairs.neuron, minlength=len(self.tissue.x_um))

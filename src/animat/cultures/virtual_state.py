@@ -13,8 +13,8 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file
-from animat.recordings.array import MAXONE
-from animat.recordings.selection import Selection
+from animat.stimulation.array import MAXONE
+from animat.stimulation.selection import Selection
 from animat.writing import written_whole
 
 if TYPE_CHECKING:

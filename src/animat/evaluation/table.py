@@ -23,8 +23,8 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
 from animat.robots.base import Robot
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
 
 

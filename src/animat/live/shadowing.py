@@ -32,7 +32,7 @@ from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies
-from animat.recordings.protocol import Protocol
+from animat.stimulation.protocol import Protocol
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
 from animat.training.specification import Training

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, shown
-from animat.recordings.recording import UNKNOWN, Stimuli
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
 """The index of a stimulus that belongs to no condition."""

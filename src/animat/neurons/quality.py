@@ -16,7 +16,8 @@ from animat.neurons.memory_quality import memory_findings
 from animat.neurons.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.neurons.timing_quality import artefact_findings
 from animat.recordings.findings import Finding
-from animat.recordings.recording import Recording, Stimuli
+from animat.recordings.recording import Recording
+from animat.stimulation.stimulus import Stimuli
 
 if TYPE_CHECKING:
     from animat.neurons.responses import Responses

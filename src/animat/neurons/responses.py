@@ -16,8 +16,8 @@ from animat.neurons.conditions import NO_CONDITION, Condition, Conditions, defau
 from animat.neurons.quality import findings_on
 from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Presentation
 
 SILENCE_S = 1.0
 """So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""

@@ -19,7 +19,7 @@ from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
+from animat.stimulation.protocol import Presentation
 
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",

@@ -17,7 +17,7 @@ from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import FITTED, Policy
 
 REDRAWN = 100

@@ -67,7 +67,7 @@ def _remove_changed(folder: Path) -> None:
 
 def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
     from animat.cultures.virtual import VirtualCulture
-    from animat.recordings.protocol import Protocol
+    from animat.stimulation.protocol import Protocol
 
     culture = study.culture
     return record_virtual_series(

@@ -20,8 +20,8 @@ from animat.neurons.series import extract_series
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recordings
+from animat.stimulation.protocol import Presentation
 from animat.studies.jobs import Report, Task
 from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE, write_table
 from animat.studies.specification import Study

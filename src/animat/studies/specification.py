@@ -12,9 +12,9 @@ from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
 from animat.mapping import MAPPING_NAMES
 from animat.recordings.made_up import MadeUpCulture
-from animat.recordings.protocol import Protocol
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import robot_named
+from animat.stimulation.protocol import Protocol
 from animat.studies.bounds import (
     MOST_PRESENTATIONS,
     MOST_SESSIONS,
@@ -44,7 +44,7 @@ class Source:
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
         seed: which virtual or made-up culture.
         sessions, interval_min: how many recordings, and the minutes from one to the next.
-        order, pulses, presentations: how stimuli are presented (`animat.recordings.protocol`).
+        order, pulses, presentations: how stimuli are presented (`animat.stimulation.protocol`).
         channels: of a made-up culture.
     """
 

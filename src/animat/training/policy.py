@@ -21,9 +21,9 @@ from animat.mapping import Mapping, expect_loadable_mapping, mapping_named
 from animat.neurons.conditions import Condition
 from animat.neurons.windows import check_window
 from animat.plain_file import expect_plain_file, is_folder
-from animat.recordings.protocol import Presentation
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import expect_loadable_robot, robot_from_dict, robot_to_dict
+from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance, is_number
 from animat.writing import written_whole
 

@@ -22,7 +22,8 @@ import numpy as np
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
+from animat.tables import UNKNOWN
 
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))

@@ -32,8 +32,10 @@ from animat.compilation import user_cache
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 from animat.writing import written_whole
 
 FORMAT_VERSION = 1

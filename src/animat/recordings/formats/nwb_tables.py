@@ -18,7 +18,9 @@ from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb import FORMAT_VERSION
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
 """NWB demands a date; a recording without `recorded_at` gets this one, which every reader sees to be none."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from animat.errors import InvalidArgument
-from animat.recordings.array import ElectrodeArray
+from animat.stimulation.array import ElectrodeArray
 
 _TRIES_A_PATTERN = 200
 _MOST_LOOKED_AT = 2_000_000

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument
-from animat.recordings.protocol import Protocol
-from animat.recordings.recording import UNKNOWN, Stimuli
-from animat.recordings.stimulus import Stimulus
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.stimulus import Stimuli, Stimulus
+from animat.tables import UNKNOWN
 
 TICK_S = 50e-6
 """Stimuli start on a grid of 50 us, a sample at 20 kHz: what stimulation hardware can time exactly."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, shown
 from animat.plain_file import read_plain_text
-from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
 Order = Literal["blocked", "mixed"]
 
@@ -57,7 +57,7 @@ class Presentation:
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is done in one recording; with patterns and a seed it becomes a `Schedule` (`recordings.schedule`).
+    """What is done in one recording; with patterns and a seed it becomes a `Schedule` (`animat.stimulation.schedule`).
 
     Every pulse comes 1/f after the one before it, f being the frequency of its own presentation, and the response is
     read after the last pulse of a presentation. The defaults are the paper's: five frequencies as blocks in random

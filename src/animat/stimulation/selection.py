@@ -14,10 +14,9 @@ from jaxtyping import Float64, Int64
 from animat.brief import briefly
 from animat.errors import InvalidArgument, InvalidFile, shown
 from animat.plain_file import read_plain_text
-from animat.recordings.array import ElectrodeArray
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.recording import Channels
-from animat.recordings.scan import ScannedActivity
+from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.scan import ScannedActivity
 from animat.writing import written_whole
 
 FORMAT = "animat electrode selection 1"
@@ -100,14 +99,6 @@ class Selection:
 
     def __hash__(self) -> int:
         return hash(json.dumps(self.to_dict()))
-
-    @property
-    def channels(self) -> Channels:
-        """The recording sites as a recording's channel table."""
-        x_um, y_um = self.array.position_um(self.recording)
-        return Channels(
-            label=np.arange(len(self.recording)).astype(np.str_), electrode=self.recording, x_um=x_um, y_um=y_um
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """As data for JSON."""

@@ -1,14 +1,14 @@
-"""What is delivered to a culture: phases make a pulse, a pulse on electrodes at a time makes a stimulus."""
+"""What one electrode delivers: phases of constant voltage or current make a pulse."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from animat.errors import InvalidArgument
-from animat.recordings.plain import number, seconds, whole_number
+from animat.stimulation.plain import number
 
 Kind = Literal["voltage", "current"]
 
@@ -143,73 +143,3 @@ that (method, section 1)."""
 
 BALANCED_PULSE = Pulse((Phase(500.0, amplitude_mv=-200.0), Phase(500.0, amplitude_mv=200.0)))
 """The published pulse with its second phase as long as its first."""
-
-
-@dataclass(frozen=True)
-class Stimulus:
-    """One pulse on one or several electrodes at once.
-
-    What is given is copied as Python's own numbers: electrodes may be a list or an array of whole numbers.
-
-    Attributes:
-        time_s: its start, counted from the start of the delivery that it is part of; float64 or a whole number.
-        electrodes: numbers on the array.
-        pulse: what each electrode delivers.
-        frequency_hz: the frequency it is presented at, NaN where it has none.
-        pattern: index of the pattern that the electrodes make, -1 where they make none.
-        presentation: number of the presentation it belongs to.
-
-    Raises:
-        InvalidArgument: for numbers of another type, a time in float32 among them, or what is no pulse.
-    """
-
-    time_s: float
-    electrodes: tuple[int, ...]
-    pulse: Pulse
-    frequency_hz: float = math.nan
-    pattern: int = -1
-    presentation: int = 0
-
-    def __post_init__(self) -> None:
-        # A closed loop makes five an action: what is plain already is left as it is.
-        if type(self.time_s) is not float:
-            object.__setattr__(self, "time_s", seconds("time_s", self.time_s))
-        if type(self.electrodes) is not tuple or not _ONLY_INT.issuperset(map(type, self.electrodes)):
-            object.__setattr__(self, "electrodes", _plain_electrodes(self.electrodes))
-        if type(self.pulse) is not Pulse:
-            if not isinstance(self.pulse, Pulse):
-                raise InvalidArgument(f"pulse: expected a Pulse, got {type(self.pulse).__name__}")
-            object.__setattr__(self, "pulse", Pulse(self.pulse.phases))
-        if type(self.frequency_hz) is not float:
-            object.__setattr__(self, "frequency_hz", number("frequency_hz", self.frequency_hz))
-        for name in ("pattern", "presentation"):
-            if type(value := getattr(self, name)) is not int:
-                object.__setattr__(self, name, whole_number(name, value))
-
-
-def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
-    """Stimuli that cannot change, in a tuple of their own; one of a subclass as the `Stimulus` its attributes make.
-
-    Raises:
-        InvalidArgument: for what is no stimulus.
-    """
-    if not isinstance(stimuli, Iterable):
-        raise InvalidArgument(f"stimuli: expected several Stimulus, got {type(stimuli).__name__}")
-    return tuple([stimulus if type(stimulus) is Stimulus else _plain_stimulus(stimulus) for stimulus in stimuli])
-
-
-_ONLY_INT = frozenset({int})
-
-
-def _plain_electrodes(electrodes: Any) -> tuple[int, ...]:
-    try:
-        given = tuple(electrodes)
-    except TypeError as error:
-        raise InvalidArgument(f"electrodes: expected several, got {type(electrodes).__name__}") from error
-    return tuple(whole_number("electrodes", electrode) for electrode in given)
-
-
-def _plain_stimulus(stimulus: Any) -> Stimulus:
-    if not isinstance(stimulus, Stimulus):
-        raise InvalidArgument(f"stimuli: expected Stimulus, got {type(stimulus).__name__}")
-    return Stimulus(**{each.name: getattr(stimulus, each.name) for each in fields(Stimulus)})
