@@ -178,12 +178,13 @@ tell(spikes=sorted(spikes), stims=sorted(stims), frames=frames)
 def test_the_driver_records_responses_of_the_simulated_culture(tmp_path: Path) -> None:
     script = """
 use_simulated_culture(seed=3, neurons=300)
+from animat.recordings.formats.nwb import write_nwb
 from animat.stimulation.protocol import Protocol
 with CL1Culture() as culture:
     pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
     protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), presentations=20, patterns=20)
     recording = culture.record(protocol, seed=1)
-    recording.save("cl1.nwb")
+    write_nwb(recording, "cl1.nwb")
     window = [np.count_nonzero((recording.spike_times_s >= t + 0.002) & (recording.spike_times_s < t + 0.010))
               for t in recording.stimuli.time_s]
     rest = len(recording.spike_times_s) / recording.duration_s * 0.008

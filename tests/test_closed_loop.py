@@ -35,7 +35,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.mapping import Linear, Thresholds
 from animat.neurons.conditions import ByFrequency, Condition
-from animat.neurons.responses import extract_responses
+from animat.neurons.extraction import extract_responses
 from animat.recordings.reading import read_recording
 from animat.robots import Cartpole, Navigation, Robot
 from animat.robots.steering import steering

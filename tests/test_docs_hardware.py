@@ -18,7 +18,7 @@ from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.mapping import Thresholds
 from animat.neurons.conditions import Condition
-from animat.recordings.recording import Recording
+from animat.recordings.reading import read_recording
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
@@ -36,7 +36,7 @@ def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     example = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0]
     exec(compile(example, "hardware.md", "exec"), {})
-    recording = Recording.load(tmp_path / "cl1.nwb")
+    recording = read_recording(tmp_path / "cl1.nwb")
     assert len(recording.stimuli) == 500
     assert recording.presentation is not None
     assert recording.presentation.pulses == 5

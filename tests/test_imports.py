@@ -1,10 +1,11 @@
-"""Imports follow the story and never run back; what is heavy is imported late."""
+"""Imports follow the story and never run back or in circles; what is heavy is imported late."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -68,6 +69,13 @@ def test_no_import_runs_back_up_the_story(name: str) -> None:
     room = room_of(name)
     before = () if room in GROUND else STORY[: STORY.index(room)]
     assert {room_of(imported) for imported in IMPORTS[name]} <= {*GROUND, *before, room}
+
+
+def test_no_two_files_import_each_other() -> None:
+    try:
+        TopologicalSorter(IMPORTS).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
 def modules_after(statement: str) -> set[str]:

@@ -10,10 +10,11 @@ import pytest
 
 from animat.errors import InvalidArgument
 from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern, Condition
+from animat.neurons.extraction import extract_responses
 from animat.neurons.inspection import inspect_recording
 from animat.neurons.psth import post_stimulus_histogram
 from animat.neurons.quality import _difference
-from animat.neurons.responses import Responses, extract_responses
+from animat.neurons.responses import Responses
 from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording

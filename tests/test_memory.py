@@ -25,14 +25,16 @@ from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.mapping import Linear, Thresholds
 from animat.neurons.conditions import Condition, conditions_named
+from animat.neurons.extraction import extract_responses
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
 from animat.neurons.memory_quality import memory_findings
-from animat.neurons.responses import Presented, Responses, extract_responses
+from animat.neurons.responses import Presented, Responses
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
@@ -568,7 +570,7 @@ def test_training_tells_what_is_remembered() -> None:
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:
-    make_up_recording(1, channels=32).save(tmp_path / "made-up.nwb")
+    write_nwb(make_up_recording(1, channels=32), tmp_path / "made-up.nwb")
     with pytest.warns(UserWarning, match="presented in blocks"):
         environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "made-up.nwb", kind="memory")
     environment.reset(seed=1)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from animat.neurons.extraction import extract_responses
 from animat.neurons.inspection import inspect_recording
-from animat.neurons.responses import extract_responses
 from animat.recordings.findings import Finding
 from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.noticed import noticed

@@ -31,14 +31,17 @@ from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
 from animat.mapping import Linear, Mapping, Thresholds
 from animat.neurons.conditions import Condition
+from animat.neurons.extraction import extract_responses
 from animat.neurons.made_up import LABELS, MEANS_HZ
-from animat.neurons.responses import Responses, extract_responses
+from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import ANEW_EPISODES
 from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.robots import Cartpole, Navigation, Robot
 from animat.stimulation.array import MAXONE
@@ -511,7 +514,7 @@ class TestCommand:
     @pytest.fixture
     def folder(self, tmp_path: Path, recordings: list[Recording], series: list[Responses]) -> Path:
         for i, recording in enumerate(recordings):
-            recording.save(tmp_path / "recordings" / f"r{i}.nwb")
+            write_nwb(recording, tmp_path / "recordings" / f"r{i}.nwb")
         for i in range(2):
             policy_of(i, series).save(tmp_path / "policies" / f"p{i}.safetensors")
         return tmp_path
@@ -635,7 +638,7 @@ class TestCommand:
         printed = capsys.readouterr()
         assert "the culture is recorded first" in printed.err
         assert (out / "calibration.nwb").is_file()
-        assert Recording.load(out / "calibration.nwb").presentation == Presentation("mixed", 2)
+        assert read_recording(out / "calibration.nwb").presentation == Presentation("mixed", 2)
         assert "other-presentation" not in printed.err
 
     def test_a_bad_simulator_is_found_before_the_culture_is_recorded_for_it(

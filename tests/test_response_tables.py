@@ -11,9 +11,8 @@ import pytest
 from animat.cli import main
 from animat.errors import AnimatError, InvalidFile
 from animat.neurons.conditions import ByInterval, ByPattern, Conditions
+from animat.neurons.extraction import extract_responses, responses_of_table
 from animat.neurons.inspection import inspect_recording
-from animat.neurons.responses import extract_responses
-from animat.neurons.table_responses import responses_of_table
 from animat.neurons.windows import spikes_in
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern, Conditions
+from animat.neurons.extraction import extract_responses
 from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
-from animat.neurons.responses import Responses, extract_responses
+from animat.neurons.responses import Responses
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Presentation

@@ -11,7 +11,8 @@ from matplotlib.colors import to_hex
 
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.conditions import conditions_named
-from animat.neurons.responses import Responses, extract_responses
+from animat.neurons.extraction import extract_responses
+from animat.neurons.responses import Responses
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.recording import Recording
 from animat.report.array import draw_array, draw_selection

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
 from test_responses import recording
@@ -52,7 +53,7 @@ def warned(reported: dict[str, Any]) -> set[str]:
 
 def series(folder: Path, *recordings: Recording) -> str:
     for each in recordings:
-        each.save(folder / f"recording_{each.start_min:04.0f}_min.nwb")
+        write_nwb(each, folder / f"recording_{each.start_min:04.0f}_min.nwb")
     return str(folder)
 
 

@@ -34,14 +34,16 @@ if TYPE_CHECKING:
     from animat.evaluation.table import Evaluation, evaluate
     from animat.mapping import Linear, Mapping, Thresholds, mapping_named
     from animat.neurons.conditions import Condition, conditions_named
+    from animat.neurons.extraction import extract_responses
     from animat.neurons.inspection import Inspection, inspect_recording
     from animat.neurons.memory import fit_memory
-    from animat.neurons.responses import Responses, extract_responses
+    from animat.neurons.responses import Responses
     from animat.neurons.series import extract_series
     from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
     from animat.neurons.timeline import SimulatorTimeline, fit_timeline
     from animat.reality_gap import Calibration, run_policies
     from animat.recordings.findings import Finding
+    from animat.recordings.formats.nwb import write_nwb
     from animat.recordings.reading import read_recording, read_recordings
     from animat.recordings.recording import Channels, Recording
     from animat.robots import Cartpole, Navigation, Robot, robot_named
@@ -64,12 +66,14 @@ _WHERE = {
     "stimulation.selection": ("Selection",),
     "recordings.findings": ("Finding",),
     "recordings.reading": ("read_recording", "read_recordings"),
+    "recordings.formats.nwb": ("write_nwb",),
     "cultures.base": ("Culture",),
     "cultures.safety": ("Limits",),
     "cultures.virtual": ("VirtualCulture",),
     "cultures.replay": ("ReplayCulture",),
     "neurons.conditions": ("Condition", "conditions_named"),
-    "neurons.responses": ("Responses", "extract_responses"),
+    "neurons.responses": ("Responses",),
+    "neurons.extraction": ("extract_responses",),
     "neurons.series": ("extract_series",),
     "neurons.inspection": ("Inspection", "inspect_recording"),
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
@@ -117,6 +121,7 @@ __all__ = [  # noqa: RUF022  (the order of the story)
     "Finding",
     "read_recording",
     "read_recordings",
+    "write_nwb",
     "Culture",
     "Limits",
     "VirtualCulture",

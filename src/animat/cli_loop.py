@@ -222,6 +222,7 @@ class Run(Stimulating):
         """The culture as it is now, presented as the policies' recordings were."""
         from animat.cultures.kinds import pulse_for
         from animat.live.recording import record_within
+        from animat.recordings.formats.nwb import write_nwb
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER
 
         presentation = first.presentation or CLOSED_LOOP.presentation
@@ -234,7 +235,7 @@ class Run(Stimulating):
         )
         print("no recordings were given: the culture is recorded first", file=sys.stderr)
         recording = record_within(account, culture, protocol, self.seed, progress)
-        recording.save(self.out / CALIBRATION_FILE)
+        write_nwb(recording, self.out / CALIBRATION_FILE)
         return recording
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:

@@ -11,6 +11,7 @@ from animat.cultures.same_patterns import other_patterns
 from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -102,7 +103,7 @@ def record_in_held_folder(
                 continue
             culture.rest(max(0.0, due_s - culture.now_s))
             part = PartOfSeries(progress, session, sessions, file.name)
-            culture.record(protocol, seed * 10_000 + session, part).save(file)
+            write_nwb(culture.record(protocol, seed * 10_000 + session, part), file)
         progress.update(session + 1, sessions, file.name)
     return LivingSeries([file for file in files if file.exists()], missed_min)
 

@@ -14,6 +14,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.progress import Progress, Silent
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -111,7 +112,7 @@ def _record(
             if files[session].exists():
                 _expect_equal(files[session], recording)
             else:
-                recording.save(files[session])
+                write_nwb(recording, files[session])
             # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
             culture.save_state(folder / STATE_FILE, sessions=session + 1)
             progress.update(session + 1, sessions, files[session].name)

@@ -197,9 +197,11 @@ class VirtualCulture(Culture):
         Raises:
             InvalidFile: if it cannot be written.
         """
-        from animat.cultures.virtual_state import write_state
+        from animat.cultures.virtual_state import VirtualState, write_state
 
-        write_state(self, path, remarks)
+        held = self._held_ns, self._held_neuron
+        state = VirtualState(self.selection, self._zero_ns, self._now_ns, *held, self.tissue.snapshot(), remarks)
+        write_state(path, self.settings, state)
 
     def restore_state(self, path: str | os.PathLike[str]) -> dict[str, int]:
         """Make this culture, not yet opened, what another of the same seed and settings was; returns the remarks.
@@ -213,7 +215,14 @@ class VirtualCulture(Culture):
 
         if self.is_open:
             raise InvalidArgument("culture: expected a closed one to restore, got one that is open")
-        return read_state(self, path)
+        tissue, visibility = self._grown()
+        state = read_state(path, self.settings, tissue)
+        # Only now: a culture that could not be restored is what it was.
+        self._have(tissue, visibility)
+        self._selection = state.selection
+        self._zero_ns, self._now_ns = state.zero_ns, state.now_ns
+        self._held_ns, self._held_neuron = state.held_ns, state.held_neuron
+        return dict(state.remarks)
 
     def _open(self) -> None:
         if self._tissue is None:

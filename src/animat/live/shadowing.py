@@ -32,6 +32,7 @@ from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies
+from animat.recordings.formats.nwb import write_nwb
 from animat.stimulation.protocol import Protocol
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
@@ -262,7 +263,7 @@ class _Run:
         seed = self._training.seed * 10_000 + number
         recording = record_within(self.account, self._culture, self._protocol, seed)
         file = self.folder / RECORDINGS / recording_name(round(recording.start_min, 3))
-        recording.save(file)
+        write_nwb(recording, file)
         self.files.append(file)
         self.keep_state()
         try:

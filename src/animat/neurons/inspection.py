@@ -10,10 +10,10 @@ import numpy as np
 
 from animat.brief import briefly
 from animat.neurons.conditions import Conditions, default_conditions
+from animat.neurons.extraction import extract_responses, responses_of_table
 from animat.neurons.network_bursts import NetworkBursts, find_network_bursts
 from animat.neurons.psth import ResponseTime, find_response, spontaneous_rate
-from animat.neurons.responses import Responses, extract_responses
-from animat.neurons.table_responses import responses_of_table
+from animat.neurons.responses import Responses
 from animat.neurons.windows import DEFAULT_WINDOW_MS, count_spikes
 from animat.recordings.findings import Finding
 from animat.recordings.noticed import noticed

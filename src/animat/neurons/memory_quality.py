@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from animat.neurons.responses import Responses
 from animat.recordings.findings import Finding
-
-if TYPE_CHECKING:
-    from animat.neurons.responses import Responses
 
 CERTAIN = 4.0
 """Standard errors that the difference must be away from none."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,13 +13,11 @@ from animat.neurons.conditions import NO_CONDITION, Assignment
 from animat.neurons.drift_quality import drift_findings
 from animat.neurons.memory_quality import memory_findings
 from animat.neurons.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
+from animat.neurons.responses import Responses
 from animat.neurons.timing_quality import artefact_findings
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.stimulation.stimulus import Stimuli
-
-if TYPE_CHECKING:
-    from animat.neurons.responses import Responses
 
 FEW_SAMPLES = 30
 """Below this many non-burst responses of a condition, its distribution is little more than a guess."""

@@ -10,17 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from animat.brief import briefly
-from animat.errors import Mismatch, UnusableData
-from animat.neurons.bursts import separate_bursts
-from animat.neurons.conditions import NO_CONDITION, Condition, Conditions, default_conditions
-from animat.neurons.quality import findings_on
-from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, read_windows
+from animat.errors import Mismatch
+from animat.neurons.conditions import NO_CONDITION, Condition
 from animat.recordings.findings import Finding
-from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
-
-SILENCE_S = 1.0
-"""So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,71 +205,3 @@ class Responses:
         median_hz = self.median_rate_hz
         rates_hz = (self.rates_of(i) for i in range(len(self.conditions)))
         return np.array([np.mean(x >= median_hz) if len(x) else np.nan for x in rates_hz], dtype=np.float64)
-
-
-def extract_responses(
-    recording: Recording,
-    by: Conditions | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
-    burst_threshold: float | None = None,
-) -> Responses:
-    """The response to the last pulse of every presentation that has a condition.
-
-        x = S / (T N)
-
-    with S the spikes from window_ms[0] up to, not including, window_ms[1] after the pulse (see
-    `animat.neurons.windows.count_spikes` for the edges), T the length of the window and N the number of channels.
-
-    Presentations without a condition, and ones whose window runs past the end of the recording, are left out and
-    counted in `findings`, where also everything else is said that makes the responses doubtful.
-
-    Args:
-        recording: the spikes and stimuli.
-        by: what makes a condition; by frequency where it is known, else all in one.
-        window_ms: start and end of the window after the pulse.
-        burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
-
-    Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus.
-        UnusableData: for a recording without channels.
-
-    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
-        only where it finds two groups).
-    """
-    check_window(window_ms)
-    n_channels = len(recording.channels)
-    if not n_channels:
-        raise UnusableData("channels: expected at least one, got a recording without any; x is a mean over channels")
-    stimuli = recording.stimuli
-    by = by or default_conditions(stimuli)
-    assignment = by.assign(stimuli)
-    # An end that is the last stimulus' or spike's own time is rounded like them.
-    inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
-    presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
-    # Those without a condition are read too: they are what came before others.
-    rate_hz, active_ratio = read_windows(recording, stimuli.time_s[presented], window_ms)
-    chosen = assignment.condition[presented] != NO_CONDITION
-    used = presented[chosen]
-    bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
-    # Between the pulses of a presentation there is no silence, however long it lasts.
-    silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
-    is_rested = np.diff(silences[presented], prepend=0) > 0
-    responses = Responses(
-        condition=assignment.condition[used],
-        rate_hz=rate_hz[chosen],
-        active_ratio=active_ratio[chosen],
-        is_burst=bursts.is_burst,
-        conditions=assignment.conditions,
-        window_ms=window_ms,
-        n_channels=n_channels,
-        threshold=bursts.threshold,
-        separability=bursts.separability,
-        presentation=recording.presentation,
-        start_min=recording.start_min,
-        time_s=stimuli.time_s[used],
-        presented=Presented(assignment.condition[presented], rate_hz, active_ratio > bursts.threshold, is_rested),
-        place=np.flatnonzero(chosen),
-        by=str(by),
-        burst_threshold=burst_threshold,
-    )
-    return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))

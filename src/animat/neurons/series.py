@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.conditions import Conditions
+from animat.neurons.extraction import responses_of
 from animat.neurons.responses import Responses
-from animat.neurons.table_responses import responses_of
 from animat.neurons.windows import DEFAULT_WINDOW_MS
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording

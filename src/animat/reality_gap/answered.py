@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session
 from animat.mapping import N_PERCENTILES
-from animat.neurons.responses import SILENCE_S, Presented, Responses
+from animat.neurons.extraction import SILENCE_S
+from animat.neurons.responses import Presented, Responses
 from animat.reality_gap.passes import Passes
 
 

@@ -24,6 +24,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, Mismatch, shown
 from animat.progress import Progress, Silent
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.array import MAXONE
@@ -271,7 +272,7 @@ def write_made_up_series(
                     "remove it, or choose another folder"
                 )
         else:
-            culture.record(start_min).save(file)
+            write_nwb(culture.record(start_min), file)
         files.append(file)
         progress.update(session + 1, sessions, file.name)
     return files

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
@@ -149,19 +148,6 @@ class Recording:
     def equals(self, other: Recording) -> bool:
         """Whether every array and every value of the two recordings is the same (NaN equals NaN)."""
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the recording as NWB; the file is complete or absent (see `animat.recordings.formats.nwb`)."""
-        from animat.recordings.formats.nwb import write_nwb
-
-        write_nwb(self, path)
-
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> Recording:
-        """Read a recording in any format that is known (see `animat.recordings.reading.read_recording`)."""
-        from animat.recordings.reading import read_recording
-
-        return read_recording(path)
 
 
 def _same(a: object, b: object) -> bool:
