@@ -24,8 +24,8 @@ SETTINGS = {"CL_SDK_ACCELERATED_TIME": "1", "CL_SDK_VISUALISATION": "0"}
 HEAD = """
 import json, sys
 import numpy as np
-from animat.cultures.cl1 import CL1_PULSE, SITES, CL1Culture
-from animat.cultures.cl1_source import use_simulated_culture
+from animat.cultures.devices.cl1 import CL1_PULSE, SITES, CL1Culture
+from animat.cultures.devices.cl1_source import use_simulated_culture
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Phase, Pulse
 from animat.stimulation.stimulus import Stimulus
@@ -98,8 +98,8 @@ def test_every_pulse_that_the_guard_admits_is_one_that_the_sdk_takes(tmp_path: P
     """Designs at random about the edges of the limits: what passes our guard raises nothing in the SDK."""
     script = """
 import cl
-from animat.cultures.cl1 import CL1_LIMITS
-from animat.cultures.cl1_delivery import Delivery
+from animat.cultures.devices.cl1 import CL1_LIMITS
+from animat.cultures.devices.cl1_delivery import Delivery
 from animat.cultures.safety import Guard
 from animat.errors import UnsafeStimulus
 rng, taken, refused, wrongly = np.random.default_rng(0), 0, 0, 0

@@ -13,8 +13,8 @@ import stand_in_maxlab
 from animat.closed_loop.contenders import Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
-from animat.cultures.cl1 import CL1_LIMITS, LEAD_US
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.cl1 import CL1_LIMITS, LEAD_US
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.mapping import Thresholds
 from animat.neurons.conditions import Condition

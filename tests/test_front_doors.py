@@ -18,8 +18,8 @@ import pytest
 import stand_in_cl
 import stand_in_maxlab
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_LIMITS, SITES, CL1Culture
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.cl1 import CL1_LIMITS, SITES, CL1Culture
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits

@@ -21,10 +21,10 @@ import stand_in_maxlab
 from animat.cli import main
 from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.devices.maxone import MaxOneCulture
 from animat.cultures.kinds import culture_of
 from animat.cultures.living_series import record_living_series
-from animat.cultures.maxone import MaxOneCulture
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.errors import DeviceFailed, InvalidArgument, Mismatch

@@ -13,9 +13,9 @@ import pytest
 
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
-from animat.cultures.maxone_sequences import dac_code
-from animat.cultures.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.maxone_sequences import dac_code
+from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import said
 from animat.stimulation.array import MAXONE
@@ -365,7 +365,7 @@ def test_spikes_on_amplifiers_that_are_none_are_refused(rig: Rig) -> None:
 
 
 def test_a_stream_that_falls_silent_is_a_lost_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.cultures.maxone_stream.PATIENCE_S", 0.0)
+    monkeypatch.setattr("animat.cultures.devices.maxone_stream.PATIENCE_S", 0.0)
     stream = ZmqSpikes()
     stream.hear([np.uint64(42).tobytes(), b""])
     with pytest.raises(DeviceFailed, match="got none any more: is MaxLab Live's server running") as failed:

@@ -21,7 +21,7 @@ from animat.closed_loop.contenders import HandMadeRule
 from animat.closed_loop.following import Following
 from animat.closed_loop.session import read_session
 from animat.cultures.budget import Account, Budget
-from animat.cultures.cl1 import CL1Culture
+from animat.cultures.devices.cl1 import CL1Culture
 from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
 from animat.errors import InvalidArgument, Mismatch

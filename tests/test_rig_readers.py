@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from animat.cultures.cl1 import CL1Culture
+from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording

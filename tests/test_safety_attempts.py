@@ -27,9 +27,9 @@ import stand_in_maxlab
 from animat.cultures import holding
 from animat.cultures.base import Culture
 from animat.cultures.budget import Budget
-from animat.cultures.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
+from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.limits import SIMULATED_LIMITS, Limits
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.observed import Observed
 from animat.cultures.safety import Admitted, Guard
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus

@@ -61,11 +61,11 @@ def culture_of(
 
         return ReplayCulture(recordings, seed=seed)
     if kind == "cl1":
-        from animat.cultures.cl1 import CL1Culture
+        from animat.cultures.devices.cl1 import CL1Culture
 
         return CL1Culture(seed=seed)
     if kind == "maxone" and selection is not None:
-        from animat.cultures.maxone import MaxOneCulture
+        from animat.cultures.devices.maxone import MaxOneCulture
         from animat.stimulation.selection import Selection
 
         return MaxOneCulture(Selection.load(selection))
@@ -75,7 +75,7 @@ def culture_of(
 def pulse_for(kind: CultureKind) -> Pulse:
     """The pulse that a kind of culture is given where none is asked for."""
     if kind == "cl1":
-        from animat.cultures.cl1 import CL1_PULSE
+        from animat.cultures.devices.cl1 import CL1_PULSE
 
         return CL1_PULSE
     # The published pulse as printed is not balanced: a living culture is given one that is.

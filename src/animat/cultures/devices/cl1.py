@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
-from animat.cultures.cl1_delivery import FRAMES_PER_S, LEAD_US, Delivery
+from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Delivery
 from animat.cultures.failing import as_device_failure, in_words
 from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine, of_the_program
@@ -175,6 +175,7 @@ class CL1Culture(Culture):
             name: str(told[name]) for name in ("system_id", "chip_id", "cell_batch_id", "project_id") if name in told
         }
         return {
+            # The words that recordings have: a series goes on only where they stay, whatever the module's name.
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
             "pattern_seed": self._pattern_seed,

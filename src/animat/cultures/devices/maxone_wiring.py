@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from animat.cultures.maxone_stream import AMPLIFIERS
+from animat.cultures.devices.maxone_stream import AMPLIFIERS
 from animat.errors import DeviceFailed
 from animat.recordings.recording import Channels
 from animat.stimulation.selection import Selection

@@ -1,6 +1,6 @@
 """The simulated tissue offered to the CL1's SDK as a source of data: any CL application runs on it as on a device.
 
-from animat.cultures.cl1_source import use_simulated_culture
+from animat.cultures.devices.cl1_source import use_simulated_culture
 use_simulated_culture(seed=1)          # before `cl.open()`; the SDK's simulator then reacts to stimuli
 """
 
@@ -16,14 +16,14 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int16
 
-from animat.cultures.cl1_delivery import FRAMES_PER_S
+from animat.cultures.devices.cl1_delivery import FRAMES_PER_S
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
 from animat.cultures.virtual import WARM_UP_S
 from animat.cultures.visibility import amplitudes_at_soma_uv
 from animat.errors import InvalidArgument
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION
 
-FACTORY = "animat.cultures.cl1_source:simulated_culture"
+FACTORY = "animat.cultures.devices.cl1_source:simulated_culture"
 UV_PER_UNIT = 0.195
 BLOCK_FRAMES = 1024
 REAL_TIME_NEURONS = 200

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.base import Culture
+from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
+from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
+from animat.cultures.devices.maxone_wiring import Wiring, wire
 from animat.cultures.failing import in_words
 from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine
-from animat.cultures.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
-from animat.cultures.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
-from animat.cultures.maxone_wiring import Wiring, wire
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace, from_zero
 from animat.cultures.safety import Admitted, Limits
@@ -165,6 +165,7 @@ class MaxOneCulture(Culture):
         wiring = self._wired()
         units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
         return {
+            # The words that recordings have: a series goes on only where they stay, whatever the module's name.
             "source": "MaxOne by animat.cultures.maxone",
             "dac_lsb_mv": str(self._lsb_mv),
             "stimulation_units": units,
