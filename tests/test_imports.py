@@ -59,8 +59,7 @@ IMPORTS = {name: imports_of(name) for name in FILES}
 
 
 def room_of(name: str) -> str:
-    room = name.split(".")[1]
-    return "cli" if room.startswith("cli_") else room
+    return name.split(".")[1]
 
 
 # The package itself holds the public names, of all rooms, and `__main__` is the command line.

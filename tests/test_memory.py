@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
-from animat.cli_train import _memories
+from animat.cli.train import _memories
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made

@@ -23,7 +23,7 @@ from safetensors.numpy import load, save
 from scipy import stats
 
 from animat.animat import Delivery
-from animat.cli_responses import fit_as
+from animat.cli.responses import fit_as
 from animat.closed_loop.loop import Loop
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.mapping import mapping_named

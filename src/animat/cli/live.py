@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli_loop import Stimulating, expect_no_fault
-from animat.cli_responses import say_findings
+from animat.cli.responses import say_findings
+from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
 from animat.writing import alone_in
 

@@ -1,4 +1,4 @@
-"""The commands of the closed loop: `run` and `recover`, and what `live` shares with them."""
+"""The command that runs policies in closed loop on a culture."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli_responses import fit_as, say_findings
-from animat.errors import InvalidArgument, InvalidFile, LoopEnded
+from animat.cli.responses import fit_as, say_findings
+from animat.cli.stimulating import Stimulating, expect_no_fault
+from animat.errors import InvalidArgument
 from animat.writing import alone_in
 
 if TYPE_CHECKING:
-    from animat.closed_loop.session import Session
     from animat.cultures.base import Culture
     from animat.cultures.budget import Account
     from animat.neurons.conditions import Conditions
@@ -30,44 +30,6 @@ if TYPE_CHECKING:
 
 CALIBRATION_FILE = "calibration.nwb"
 """What `run` records first where no recordings are given, in the session's folder."""
-
-
-@dataclass(frozen=True)
-class Stimulating:
-    """On which culture, and how much it may be stimulated; the same in every command that does."""
-
-    culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
-    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1 and maxone: the devices"""
-    selection: Path | None = None
-    """For a maxone: the file of its electrodes"""
-    culture_seed: int | None = None
-    """Which virtual culture, or which patterns of a CL1; default: those of the recordings, else 1"""
-    budget_pulses: int | None = None
-    """Most pulses in all, recordings included; default: no end, but the culture's limits"""
-    budget_per_electrode: int | None = None
-    """Most pulses on any one electrode"""
-    thresholds: Literal["follow", "held"] = "follow"
-    """The mapping's percentiles in closed loop: following the culture's newest responses, or held from the recording"""
-    on_burst: Literal["use", "repeat", "skip"] = "use"
-    """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
-    on_late: Literal["continue", "stop"] = "continue"
-    """A pulse that comes late: continue and log it, or stop"""
-    pause_s: float = 2.0
-    """Without stimulation before each episode"""
-    lead_in: int | None = None
-    """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
-    patience_s: float = 10.0
-    """How much longer than it should a culture may take to answer before the session is ended"""
-
-    def _of_the_loop(self) -> dict[str, Any]:
-        """Settings of the closed loop."""
-        return {
-            "on_burst": self.on_burst,
-            "on_late": self.on_late,
-            "pause_s": self.pause_s,
-            "lead_in": self.lead_in,
-            "patience_s": self.patience_s,
-        }
 
 
 @dataclass(frozen=True)
@@ -256,34 +218,6 @@ class Run(Stimulating):
         )
 
 
-@dataclass(frozen=True)
-class Recover:
-    """Write the recording of a closed-loop session that was killed, from its log."""
-
-    session: Positional[Path] = Path("session")
-    """The session's folder"""
-    json: bool = False
-    """End with a line of JSON"""
-
-    def run(self) -> dict[str, Any]:
-        """Recover."""
-        from animat.closed_loop.session import recover_session, told_unanswered
-        from animat.progress import Bar
-
-        with Bar("reading the log") as progress:
-            session = recover_session(self.session, progress)
-        told = session.to_dict()
-        print(
-            f"{session.recording_file} and {session.ticks_file.name}: {told['ticks']} ticks, {told['pulses']} pulses; "
-            f"it ended: {told['ended']}"
-        )
-        if told["unanswered_pulses"]:
-            print(told_unanswered(session))
-        if told["lost_bytes"]:
-            print(f"{told['lost_bytes']} bytes at the end of the log make no whole record and are lost")
-        return {"recording": str(session.recording_file), **told}
-
-
 @contextmanager
 def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
     """Hold a folder that can take a new session; the error of one that cannot says what is there.
@@ -314,14 +248,3 @@ def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions |
     every = range(len(picked.values_hz))
     # Where one lacks, the recordings' own conditions say better what is there instead.
     return picked if all(set(every) <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None
-
-
-def expect_no_fault(session: Session, folder: Path) -> None:
-    """Turn an ending before its time into an error, now that all is told and written."""
-    ending = session.ending
-    if ending.by == "person":
-        raise KeyboardInterrupt
-    if ending.by != "plan":
-        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
-    if not session.recording_file.is_file():
-        raise InvalidFile(ending.sentence)

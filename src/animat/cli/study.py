@@ -1,4 +1,4 @@
-"""The commands that run whole studies: the paper's, and one's own from a TOML file."""
+"""The command that runs a study of one's own from a TOML file."""
 
 from __future__ import annotations
 
@@ -13,30 +13,6 @@ from tyro.conf import Positional
 
 if TYPE_CHECKING:
     from animat.studies.specification import Study
-
-
-@dataclass(frozen=True)
-class Reproduce:
-    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Goes on where it stopped."""
-
-    quick: bool = False
-    """Every step with fewer policies, iterations and recordings: a first look, no results"""
-    culture_seed: int = 1
-    """Which virtual culture"""
-    seed: int = 1
-    """Decides every draw of training and evaluation"""
-    workers: int | None = None
-    """Processes, each on its own core; default: one a core"""
-    out: Path = Path("study")
-    """Folder for everything; the report is report.html in it"""
-    json: bool = False
-    """End with a line of JSON"""
-
-    def run(self) -> dict[str, Any]:
-        """Run it."""
-        from animat.studies.paper import paper_study
-
-        return _run(paper_study(self.culture_seed, self.seed, quick=self.quick), Path(), self.out, self.workers)
 
 
 @dataclass(frozen=True)
@@ -56,10 +32,11 @@ class StudyFile:
         """Run it."""
         from animat.studies.toml import read_study
 
-        return _run(read_study(self.specification), self.specification.parent, self.out, self.workers)
+        return run_and_tell(read_study(self.specification), self.specification.parent, self.out, self.workers)
 
 
-def _run(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
+def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
+    """Run a study, whose files are named as seen from `base`, and print its comparisons."""
     from animat.progress import Bar
     from animat.studies.heuristic import not_outperforming
     from animat.studies.places import read_table, table_file

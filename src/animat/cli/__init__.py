@@ -19,13 +19,16 @@ import tyro
 from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
-from animat.cli_convert import Convert
-from animat.cli_inspect import Inspect
-from animat.cli_live import Live
-from animat.cli_loop import Recover, Run
-from animat.cli_record import Record
-from animat.cli_studies import Reproduce, StudyFile
-from animat.cli_train import Evaluate, Train
+from animat.cli.convert import Convert
+from animat.cli.evaluate import Evaluate
+from animat.cli.inspect import Inspect
+from animat.cli.live import Live
+from animat.cli.record import Record
+from animat.cli.recover import Recover
+from animat.cli.reproduce import Reproduce
+from animat.cli.run import Run
+from animat.cli.study import StudyFile
+from animat.cli.train import Train
 from animat.ctrl_c import heard_everywhere
 from animat.errors import AnimatError, InvalidArgument, out_of_memory
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli_responses import Responding, say_findings
+from animat.cli.responses import Responding, say_findings
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
 from animat.writing import expect_writable
 
