@@ -27,7 +27,6 @@ from scipy.stats import mannwhitneyu
 from animat.animat import Animat
 from animat.cli import main
 from animat.cultures.kinds import recorded_culture
-from animat.cultures.series import recording_name
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
@@ -35,7 +34,7 @@ from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell, with_error

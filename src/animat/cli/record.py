@@ -123,15 +123,9 @@ class Record:
             polite_kill_as_ctrl_c(),
             culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
         ):
-            series = record_in_held_folder(
-                culture,
-                self._protocol(len(culture.patterns)),
-                self.out,
-                sessions=self._sessions,
-                interval_min=self.interval_min,
-                seed=self.seed,
-                progress=progress,
-            )
+            protocol = self._protocol(len(culture.patterns))
+            settings = self._sessions, self.interval_min, self.seed
+            series = record_in_held_folder(culture, protocol, self.out, *settings, progress)
         for minute in series.missed_min:
             print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
         return series.files

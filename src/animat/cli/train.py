@@ -126,7 +126,7 @@ class Train(Fitting):
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
             "random": random["mean_return"],
             "recorded_at_min": evaluation.recorded_at_min,
-            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in evaluation.findings],
+            "findings": [finding.to_dict() for finding in evaluation.findings],
         }
 
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from animat.cultures.base import Culture
 from animat.cultures.same_patterns import other_patterns
-from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
+from animat.cultures.series import PartOfSeries, check_interval, difference_from
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -66,23 +66,21 @@ def record_living_series(
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
     _check(protocol, sessions, interval_min, seed)
+    folder, progress = Path(folder), progress or Silent()
     # Seen before it is touched: somebody else's folder stays as it is.
-    _beginning_s(culture, protocol, _files(Path(folder), sessions, interval_min), 60 * interval_min)
+    _beginning_s(culture, protocol, _files(folder, sessions, interval_min), 60 * interval_min)
     with alone_in(folder):
-        return record_in_held_folder(
-            culture, protocol, folder, sessions=sessions, interval_min=interval_min, seed=seed, progress=progress
-        )
+        return record_in_held_folder(culture, protocol, folder, sessions, interval_min, seed, progress)
 
 
 def record_in_held_folder(
     culture: Culture,
     protocol: Protocol,
-    folder: str | os.PathLike[str],
-    *,
-    sessions: int = 15,
-    interval_min: float = 10.0,
-    seed: int = 1,
-    progress: Progress | None = None,
+    folder: Path,
+    sessions: int,
+    interval_min: float,
+    seed: int,
+    progress: Progress,
 ) -> LivingSeries:
     """Do as `record_living_series` does, in a folder that the caller holds (`animat.writing.alone_in`).
 
@@ -90,7 +88,6 @@ def record_in_held_folder(
     are those of `record_living_series`.
     """
     _check(protocol, sessions, interval_min, seed)
-    folder, progress = Path(folder), progress or Silent()
     files = _files(folder, sessions, interval_min)
     missed_min = []
     # Now that nobody writes: another run may have ended just before the folder was held.

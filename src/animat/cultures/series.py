@@ -14,7 +14,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.progress import Progress, Silent
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -25,11 +25,6 @@ STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
 LONGEST_MIN = 365 * 24 * 60.0
 """From the first recording to the last: a virtual culture's clock goes no further."""
-
-
-def recording_name(start_min: float) -> str:
-    """The file name of a recording that starts at a minute of the culture's clock."""
-    return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
 
 
 def record_virtual_series(

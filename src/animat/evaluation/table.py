@@ -134,7 +134,7 @@ class Evaluation:
             "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
-            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
+            "findings": [finding.to_dict() for finding in self.findings],
         }
 
     def to_text(self) -> str:

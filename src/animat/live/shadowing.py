@@ -18,7 +18,7 @@ import jax
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.series import STATE_FILE, recording_name
+from animat.cultures.series import STATE_FILE
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.exchange import Exchange
@@ -32,7 +32,7 @@ from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.stimulation.protocol import Protocol
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy

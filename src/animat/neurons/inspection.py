@@ -152,12 +152,7 @@ class Inspection:
                 for c in self.conditions
             ],
             "findings": [
-                {
-                    "name": finding.name,
-                    "severity": finding.severity,
-                    "sentence": finding.sentence,
-                    "value": None if finding.value is None else _known(finding.value),
-                }
+                {**finding.to_dict(), "value": None if finding.value is None else _known(finding.value)}
                 for finding in self.findings
             ],
         }

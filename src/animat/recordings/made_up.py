@@ -24,7 +24,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, Mismatch, shown
 from animat.progress import Progress, Silent
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.array import MAXONE
@@ -263,7 +263,7 @@ def write_made_up_series(
     files = []
     for session in range(sessions):
         start_min = session * interval_min
-        file = Path(folder) / f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
+        file = Path(folder) / recording_name(start_min)
         if file.exists():
             there = read_recording(file)
             if dict(there.provenance) != culture.provenance or there.start_min != start_min:

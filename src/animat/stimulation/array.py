@@ -65,24 +65,6 @@ class ElectrodeArray:
             )
         return (electrode % self.columns) * self.pitch_um, (electrode // self.columns) * self.pitch_um
 
-    def electrode_at(
-        self, x_um: Float64[np.ndarray, " positions"] | float, y_um: Float64[np.ndarray, " positions"] | float
-    ) -> Int64[np.ndarray, " positions"]:
-        """The electrode nearest to each position.
-
-        Raises:
-            InvalidArgument: for a position more than a pitch outside the array.
-        """
-        x_um, y_um = np.atleast_1d(np.asarray(x_um, np.float64)), np.atleast_1d(np.asarray(y_um, np.float64))
-        column, row = np.rint(x_um / self.pitch_um), np.rint(y_um / self.pitch_um)
-        outside = ~((column >= -1) & (column <= self.columns) & (row >= -1) & (row <= self.rows))
-        if np.any(outside):
-            raise InvalidArgument(
-                f"x_um, y_um: expected positions on the {self.name}, got {x_um[outside][0]:g}, {y_um[outside][0]:g} um"
-            )
-        column, row = np.clip(column, 0, self.columns - 1), np.clip(row, 0, self.rows - 1)
-        return (row * self.columns + column).astype(np.int64)
-
     def distance_um(
         self, electrodes: Int64[np.ndarray, " electrodes"] | int, others: Int64[np.ndarray, " others"] | int
     ) -> Float64[np.ndarray, "electrodes others"]:

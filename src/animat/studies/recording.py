@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series, recording_name
+from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
 from animat.errors import InvalidFile
-from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.folder import source_files
 from animat.studies.identity import settle_identity
 from animat.studies.jobs import Receipt, Report, Task

@@ -94,6 +94,11 @@ def write_nwb(
             raise disk.error
 
 
+def recording_name(start_min: float) -> str:
+    """The file name of a recording that starts at a minute of the culture's clock."""
+    return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
+
+
 class _Disk(io.RawIOBase):
     """A file that takes everything, and remembers what it could not write: HDF5 does not recover from a full disk."""
 
@@ -150,7 +155,7 @@ def is_nwb(file: Hdf5File) -> bool:
 def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Recording:
     """Read an open file; see `read_nwb`."""
     if not is_nwb(file):
-        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {_listed(file)})")
+        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
     if not file.has(RECORDING_TABLE):
         return read_other_nwb(file, path, stimuli)
     if stimuli is not None:
@@ -236,8 +241,3 @@ def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
         electrodes=electrodes,
         presentation=file.read(f"{STIMULI_TABLE}/presentation"),
     )
-
-
-def _listed(file: Hdf5File) -> str:
-    names = file.names("/")
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
