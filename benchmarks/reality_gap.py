@@ -144,9 +144,9 @@ def main() -> None:
 def live_once(backend: str, channels: int, seed: int, robot: str, options: argparse.Namespace) -> str:
     """A line of the table: a culture that is opened once is recorded, and driven by policies trained on that."""
     from animat.cultures.kinds import pulse_for
-    from animat.neurons.series import extract_series
     from animat.reality_gap import Calibration, run_policies
     from animat.recordings.formats.nwb import write_nwb
+    from animat.responses.series import extract_series
     from animat.stimulation.protocol import CLOSED_LOOP
     from animat.training.policy import load_policies
 

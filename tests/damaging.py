@@ -20,11 +20,11 @@ import h5py
 import numpy as np
 
 from animat.errors import AnimatError
-from animat.neurons.inspection import inspect_recording
 from animat.recordings.apart import _reader
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.responses.inspection import inspect_recording
 from rig_files import (
     BITS,
     FIRST_FRAME,

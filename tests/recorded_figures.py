@@ -14,8 +14,8 @@ import numpy as np
 from animat.cultures.observed import Spikes
 from animat.cultures.tissue import TissueParameters
 from animat.cultures.virtual import VirtualCulture
-from animat.neurons.extraction import extract_responses
-from animat.neurons.responses import Responses
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
 from animat.stimulation.protocol import PAPER, Protocol
 from animat.stimulation.selection import Selection
 

@@ -25,11 +25,11 @@ from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import with_intervals
 from animat.mapping import Thresholds
-from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recordings
+from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 

@@ -34,9 +34,9 @@ from animat.cultures.contract import CultureContract
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.mapping import Linear, Thresholds
-from animat.neurons.conditions import ByFrequency, Condition
-from animat.neurons.extraction import extract_responses
 from animat.recordings.reading import read_recording
+from animat.responses.conditions import ByFrequency, Condition
+from animat.responses.extraction import extract_responses
 from animat.robots import Cartpole, Navigation, Robot
 from animat.robots.steering import steering
 from animat.stimulation.protocol import Presentation, Protocol

@@ -600,7 +600,7 @@ def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again
     given = ["run", str(tmp_path / "p0.safetensors"), "--episodes", "1", "--out", str(tmp_path / "session")]
     monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
     with monkeypatch.context() as patched:
-        patched.setattr("animat.neurons.series.extract_series", dead)
+        patched.setattr("animat.responses.series.extract_series", dead)
         assert main(given) == 1
     assert "dead-window" in capsys.readouterr().err
     recorded = tmp_path / "session" / "calibration.nwb"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument
-from animat.neurons.conditions import (
+from animat.responses.conditions import (
     All,
     ByElectrode,
     ByFrequency,

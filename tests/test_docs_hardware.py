@@ -17,8 +17,8 @@ from animat.cultures.devices.cl1 import CL1_LIMITS, LEAD_US
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition
 from animat.recordings.reading import read_recording
+from animat.responses.conditions import Condition
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns

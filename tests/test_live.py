@@ -30,11 +30,11 @@ from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
 from animat.live.shadowing import Lived, live
 from animat.mapping import Thresholds
-from animat.neurons.extraction import extract_responses
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.reading import read_recordings
+from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import PUBLISHED_PULSE

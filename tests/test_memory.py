@@ -24,18 +24,18 @@ from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.mapping import Linear, Thresholds
-from animat.neurons.conditions import Condition, conditions_named
-from animat.neurons.extraction import extract_responses
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
-from animat.neurons.memory_quality import memory_findings
-from animat.neurons.responses import Presented, Responses
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
+from animat.responses.conditions import Condition, conditions_named
+from animat.responses.extraction import extract_responses
+from animat.responses.quality.memory import memory_findings
+from animat.responses.responses import Presented, Responses
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation

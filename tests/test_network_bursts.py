@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.neurons.inspection import inspect_recording
-from animat.neurons.network_bursts import find_network_bursts
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.report.inspection import inspection_text
 from animat.report.spontaneous import draw_spontaneous
+from animat.responses.inspection import inspect_recording
+from animat.responses.network_bursts import find_network_bursts
 from test_responses import recording
 
 

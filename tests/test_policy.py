@@ -27,8 +27,8 @@ from animat.cli.responses import fit_as
 from animat.closed_loop.loop import Loop
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.mapping import mapping_named
-from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.kinds import Kind
+from animat.responses.conditions import Condition, conditions_named
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation

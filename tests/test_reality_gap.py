@@ -30,10 +30,7 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
 from animat.mapping import Linear, Mapping, Thresholds
-from animat.neurons.conditions import Condition
-from animat.neurons.extraction import extract_responses
 from animat.neurons.made_up import LABELS, MEANS_HZ
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
@@ -43,6 +40,9 @@ from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.responses.conditions import Condition
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot
 from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation, Protocol

@@ -16,14 +16,14 @@ from animat.closed_loop.session import read_session
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.responses.conditions import Condition, conditions_named
+from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.selection import SelectionRule

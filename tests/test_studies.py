@@ -32,12 +32,12 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, U
 from animat.evaluation.hand_made import hand_made
 from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
-from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell, with_error
+from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
-from animat.neurons.series import extract_series
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.responses.series import extract_series
 from animat.stimulation.protocol import Order, Protocol
 from test_inspection import answering
 from test_responses import recording as of_spikes

@@ -38,14 +38,7 @@ if TYPE_CHECKING:
     from animat.mapping import Mapping as Mapping
     from animat.mapping import Thresholds as Thresholds
     from animat.mapping import mapping_named as mapping_named
-    from animat.neurons.conditions import Condition as Condition
-    from animat.neurons.conditions import conditions_named as conditions_named
-    from animat.neurons.extraction import extract_responses as extract_responses
-    from animat.neurons.inspection import Inspection as Inspection
-    from animat.neurons.inspection import inspect_recording as inspect_recording
     from animat.neurons.memory import fit_memory as fit_memory
-    from animat.neurons.responses import Responses as Responses
-    from animat.neurons.series import extract_series as extract_series
     from animat.neurons.simulator import NeuronSimulator as NeuronSimulator
     from animat.neurons.simulator import fit_empirical as fit_empirical
     from animat.neurons.simulator import fit_histogram as fit_histogram
@@ -59,6 +52,13 @@ if TYPE_CHECKING:
     from animat.recordings.reading import read_recordings as read_recordings
     from animat.recordings.recording import Channels as Channels
     from animat.recordings.recording import Recording as Recording
+    from animat.responses.conditions import Condition as Condition
+    from animat.responses.conditions import conditions_named as conditions_named
+    from animat.responses.extraction import extract_responses as extract_responses
+    from animat.responses.inspection import Inspection as Inspection
+    from animat.responses.inspection import inspect_recording as inspect_recording
+    from animat.responses.responses import Responses as Responses
+    from animat.responses.series import extract_series as extract_series
     from animat.robots import Cartpole as Cartpole
     from animat.robots import Navigation as Navigation
     from animat.robots import Robot as Robot
@@ -90,11 +90,11 @@ _WHERE = {
     "cultures.safety": ("Limits",),
     "cultures.virtual": ("VirtualCulture",),
     "cultures.replay": ("ReplayCulture",),
-    "neurons.conditions": ("Condition", "conditions_named"),
-    "neurons.responses": ("Responses",),
-    "neurons.extraction": ("extract_responses",),
-    "neurons.series": ("extract_series",),
-    "neurons.inspection": ("Inspection", "inspect_recording"),
+    "responses.conditions": ("Condition", "conditions_named"),
+    "responses.responses": ("Responses",),
+    "responses.extraction": ("extract_responses",),
+    "responses.series": ("extract_series",),
+    "responses.inspection": ("Inspection", "inspect_recording"),
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),

@@ -15,12 +15,12 @@ from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
-    from animat.neurons.conditions import Conditions
-    from animat.neurons.inspection import Inspection
-    from animat.neurons.responses import Responses
     from animat.progress import Progress
     from animat.recordings.recording import Recording
     from animat.recordings.response_table import ResponseTable
+    from animat.responses.conditions import Conditions
+    from animat.responses.inspection import Inspection
+    from animat.responses.responses import Responses
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class Inspect(Responding):
 
     def run(self) -> dict[str, Any]:
         """Inspect each file."""
-        from animat.neurons.bursts import check_threshold
-        from animat.neurons.conditions import conditions_named
-        from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings
         from animat.report.inspection import figure_stem
+        from animat.responses.bursts import check_threshold
+        from animat.responses.conditions import conditions_named
+        from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 
         if self.out is not None:
             expect_writable(self.out)
@@ -133,7 +133,7 @@ def _inspected(
     burst_threshold: float | None,
     file: Path,
 ) -> Inspection:
-    from animat.neurons.inspection import inspect_recording
+    from animat.responses.inspection import inspect_recording
 
     try:
         return inspect_recording(source, by, window_ms, burst_threshold, file.name)

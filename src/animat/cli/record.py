@@ -154,7 +154,7 @@ class Record:
 
 def _say_too_fast(protocol: Protocol) -> None:
     """Warn of frequencies whose pulses come before the response to the one before is over."""
-    from animat.neurons.windows import DEFAULT_WINDOW_MS
+    from animat.responses.windows import DEFAULT_WINDOW_MS
 
     fast = [f"{hz:g} Hz" for hz in protocol.frequencies_hz if 1000 / hz < DEFAULT_WINDOW_MS[1]]
     if fast:

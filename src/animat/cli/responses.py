@@ -44,11 +44,11 @@ class Fitting(Responding):
 
     def timeline(self, recordings: Sequence[Path], trained: Policy | None = None) -> SimulatorTimeline:
         """Read the recordings and fit a simulator to each: as those that a policy was trained on, unless asked."""
-        from animat.neurons.conditions import conditions_named
-        from animat.neurons.series import extract_series
         from animat.neurons.timeline import fit_timeline
-        from animat.neurons.windows import DEFAULT_WINDOW_MS
         from animat.recordings.reading import read_sources
+        from animat.responses.conditions import conditions_named
+        from animat.responses.series import extract_series
+        from animat.responses.windows import DEFAULT_WINDOW_MS
 
         fitted = {} if trained is None else trained.fitted
         fit = fit_as(fitted, self.simulator, self.bins, self.range_hz)

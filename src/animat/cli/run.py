@@ -20,11 +20,11 @@ from animat.writing import alone_in
 if TYPE_CHECKING:
     from animat.cultures.base import Culture
     from animat.cultures.budget import Account
-    from animat.neurons.conditions import Conditions
     from animat.progress import Progress
     from animat.reality_gap import Calibration, RealityGap
     from animat.recordings.findings import Finding
     from animat.recordings.recording import Recording
+    from animat.responses.conditions import Conditions
     from animat.stimulation.pulse import Pulse
     from animat.training.policy import Policy
 
@@ -201,9 +201,9 @@ class Run(Stimulating):
         return recording
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:
-        from animat.neurons.series import extract_series
-        from animat.neurons.windows import DEFAULT_WINDOW_MS
         from animat.reality_gap import Calibration
+        from animat.responses.series import extract_series
+        from animat.responses.windows import DEFAULT_WINDOW_MS
 
         trained = first.fitted.get("burst_threshold")
         series = extract_series(
@@ -240,7 +240,7 @@ def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
 
 def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions | None:
     """The frequencies that policies pick from, which may be some of the recordings'; None where they are not."""
-    from animat.neurons.conditions import ByFrequency
+    from animat.responses.conditions import ByFrequency
 
     if not first.conditions or any(condition.unit != "Hz" for condition in first.conditions):
         return None

@@ -23,7 +23,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.errors import AnimatError, BudgetSpent, UnsafeStimulus
-from animat.neurons.windows import read_windows
+from animat.responses.windows import read_windows
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN

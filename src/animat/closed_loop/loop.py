@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.mapping import N_PERCENTILES, Mapping
-from animat.neurons.conditions import Condition
-from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window
 from animat.recordings.findings import Finding
+from animat.responses.conditions import Condition
+from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.robots.registry import robot_to_dict
 from animat.stimulation.protocol import Presentation

@@ -26,13 +26,13 @@ from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable,
 from animat.live.recording import record_within
 from animat.live.trainers import Trainers
 from animat.neurons.kinds import Kind
-from animat.neurons.responses import Responses
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies
 from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.responses.responses import Responses
+from animat.responses.series import extract_series
 from animat.stimulation.protocol import Protocol
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy

@@ -120,10 +120,10 @@ class Simulators:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        from animat.neurons.conditions import conditions_named
-        from animat.neurons.series import check_allowed
         from animat.neurons.simulator import LARGEST_BINS
-        from animat.neurons.windows import check_window
+        from animat.responses.conditions import conditions_named
+        from animat.responses.series import check_allowed
+        from animat.responses.windows import check_window
 
         # All before anything is recorded: whoever corrects it later needs another folder.
         expect_choices("simulators", self)

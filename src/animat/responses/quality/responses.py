@@ -8,15 +8,15 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool
 
-from animat.neurons.bursts import BurstSeparation
-from animat.neurons.conditions import NO_CONDITION, Assignment
-from animat.neurons.drift_quality import drift_findings
-from animat.neurons.memory_quality import memory_findings
-from animat.neurons.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
-from animat.neurons.responses import Responses
-from animat.neurons.timing_quality import artefact_findings
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
+from animat.responses.bursts import BurstSeparation
+from animat.responses.conditions import NO_CONDITION, Assignment
+from animat.responses.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
+from animat.responses.quality.drift import drift_findings
+from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.timing import artefact_findings
+from animat.responses.responses import Responses
 from animat.stimulation.stimulus import Stimuli
 
 FEW_SAMPLES = 30

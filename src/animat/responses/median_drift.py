@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from animat.neurons.responses import Responses
+from animat.responses.responses import Responses
 
 NEWEST = 3
 """Recordings that a drift is taken from: it slows down over hours."""

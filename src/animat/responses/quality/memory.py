@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from animat.neurons.responses import Responses
 from animat.recordings.findings import Finding
+from animat.responses.responses import Responses
 
 CERTAIN = 4.0
 """Standard errors that the difference must be away from none."""

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import Mismatch, UnusableData
-from animat.neurons.bursts import BurstSeparation, separate_bursts
-from animat.neurons.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
-from animat.neurons.quality import findings_on, findings_without_times
-from animat.neurons.responses import Presented, Responses
-from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.responses.bursts import BurstSeparation, separate_bursts
+from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
+from animat.responses.quality.responses import findings_on, findings_without_times
+from animat.responses.responses import Presented, Responses
+from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 
 SILENCE_S = 1.0
 """So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""
@@ -44,7 +44,7 @@ def extract_responses(
         x = S / (T N)
 
     with S the spikes from window_ms[0] up to, not including, window_ms[1] after the pulse (see
-    `animat.neurons.windows.count_spikes` for the edges), T the length of the window and N the number of channels.
+    `animat.responses.windows.count_spikes` for the edges), T the length of the window and N the number of channels.
 
     Presentations without a condition, and ones whose window runs past the end of the recording, are left out and
     counted in `findings`, where also everything else is said that makes the responses doubtful.

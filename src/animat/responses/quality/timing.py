@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from animat.neurons.psth import post_stimulus_histogram, spontaneous_rate
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
+from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 
 BIN_MS = 0.5
 SPAN_MS = (-10.0, 20.0)

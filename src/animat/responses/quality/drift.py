@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from animat.neurons.responses import Responses
 from animat.recordings.findings import Finding
+from animat.responses.responses import Responses
 
 LARGE = 0.25
 """Change over the recording, relative to the mean response, that is warned of."""

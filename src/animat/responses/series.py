@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from animat.errors import InvalidArgument, UnusableData
-from animat.neurons.conditions import Conditions
-from animat.neurons.extraction import responses_of
-from animat.neurons.responses import Responses
-from animat.neurons.windows import DEFAULT_WINDOW_MS
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.responses.conditions import Conditions
+from animat.responses.extraction import responses_of
+from animat.responses.responses import Responses
+from animat.responses.windows import DEFAULT_WINDOW_MS
 
 REFUSING = (
     "no-stimuli",

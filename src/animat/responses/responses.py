@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.brief import briefly
 from animat.errors import Mismatch
-from animat.neurons.conditions import NO_CONDITION, Condition
 from animat.recordings.findings import Finding
+from animat.responses.conditions import NO_CONDITION, Condition
 from animat.stimulation.protocol import Presentation
 
 
@@ -58,7 +58,7 @@ class Responses:
         threshold: of the active ratio, by Otsu's method unless it was given; 1 where that separates nothing, NaN
             without responses.
         separability: between-class over total variance of the active ratio, of Otsu's classes or of those that a given
-            threshold makes; NaN where that leaves one (see `animat.neurons.bursts`).
+            threshold makes; NaN where that leaves one (see `animat.responses.bursts`).
         presentation: how stimuli were presented, None where it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         findings: what was noticed about them.

@@ -9,16 +9,16 @@ from typing import Any, Literal
 import numpy as np
 
 from animat.brief import briefly
-from animat.neurons.conditions import Conditions, default_conditions
-from animat.neurons.extraction import extract_responses, responses_of_table
-from animat.neurons.network_bursts import NetworkBursts, find_network_bursts
-from animat.neurons.psth import ResponseTime, find_response, spontaneous_rate
-from animat.neurons.responses import Responses
-from animat.neurons.windows import DEFAULT_WINDOW_MS, count_spikes
 from animat.recordings.findings import Finding
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.responses.conditions import Conditions, default_conditions
+from animat.responses.extraction import extract_responses, responses_of_table
+from animat.responses.network_bursts import NetworkBursts, find_network_bursts
+from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
+from animat.responses.responses import Responses
+from animat.responses.windows import DEFAULT_WINDOW_MS, count_spikes
 
 Verdict = Literal["usable", "usable with care", "not usable"]
 
