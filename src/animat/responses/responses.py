@@ -168,37 +168,28 @@ class Responses:
         """
         rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
         drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
-        presented, place = self.presentations
-        return replace(
-            self,
-            condition=self.condition[drawn],
-            rate_hz=self.rate_hz[drawn],
-            active_ratio=self.active_ratio[drawn],
-            is_burst=self.is_burst[drawn],
-            findings=(),
-            time_s=None if self.time_s is None else self.time_s[drawn],
-            presented=presented,
-            place=place[drawn],
-        )
+        return replace(self._rows(drawn), findings=())
 
     def only(self, conditions: Sequence[int]) -> Responses:
         """The responses to some conditions, by index; what was presented before them is kept."""
         index = np.full(len(self.conditions) + 1, NO_CONDITION)
         index[list(conditions)] = np.arange(len(conditions))
-        presented, place = self.presentations
-        kept = index[self.condition] != NO_CONDITION
+        kept = self._rows(np.flatnonzero(index[self.condition] != NO_CONDITION))
+        presented, _ = kept.presentations
         return replace(
-            self,
-            condition=index[self.condition[kept]],
-            rate_hz=self.rate_hz[kept],
-            active_ratio=self.active_ratio[kept],
-            is_burst=self.is_burst[kept],
+            kept,
+            condition=index[kept.condition],
             conditions=tuple(self.conditions[i] for i in conditions),
-            time_s=None if self.time_s is None else self.time_s[kept],
             # No condition is the last index, -1, and stays none.
             presented=replace(presented, condition=index[presented.condition]),
-            place=place[kept],
         )
+
+    def _rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
+        """Some of the responses; what was presented before them is kept."""
+        presented, place = self.presentations
+        columns = {name: getattr(self, name)[rows] for name in ("condition", "rate_hz", "active_ratio", "is_burst")}
+        time_s = None if self.time_s is None else self.time_s[rows]
+        return replace(self, **columns, time_s=time_s, presented=presented, place=place[rows])
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
         """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""
