@@ -166,8 +166,7 @@ class Run(Stimulating):
     ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
         """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
         from animat.cultures.kinds import pulse_for
-        from animat.cultures.same_culture import other_culture
-        from animat.cultures.same_patterns import other_patterns
+        from animat.cultures.same_culture import other_culture, other_patterns
         from animat.stimulation.protocol import Protocol
 
         if calibration is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from animat.cultures.base import Culture
-from animat.cultures.same_patterns import other_patterns
+from animat.cultures.same_culture import other_patterns
 from animat.cultures.series import PartOfSeries, check_interval, difference_from
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
