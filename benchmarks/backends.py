@@ -13,16 +13,17 @@ import numpy as np
 
 from animat.cultures.base import Culture
 from animat.cultures.virtual import VirtualCulture
-from animat.recordings.selection import SelectionRule
-from animat.recordings.stimulus import Phase, Pulse, Stimulus
+from animat.stimulation.pulse import Phase, Pulse
+from animat.stimulation.selection import SelectionRule
+from animat.stimulation.stimulus import Stimulus
 
 
 @contextmanager
 def opened(backend: str, channels: int, seed: int) -> Iterator[Culture]:
     """A culture by the name of its backend, open; the number of channels is the virtual one's."""
     if backend == "cl1":
-        from animat.cultures.cl1 import CL1Culture
-        from animat.cultures.cl1_source import use_simulated_culture
+        from animat.cultures.devices.cl1 import CL1Culture
+        from animat.cultures.devices.cl1_source import use_simulated_culture
 
         use_simulated_culture(seed=seed, neurons=1200)
         with CL1Culture(seed=seed) as cl1:
@@ -44,7 +45,7 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
 
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
     import stand_in_maxlab
-    from animat.cultures.maxone import MaxOneCulture
+    from animat.cultures.devices.maxone import MaxOneCulture
 
     class Answering(stand_in_maxlab.Stream):
         """Lets the tissue live as far as frames are waited for."""

@@ -41,8 +41,8 @@ from animat.cultures.base import Culture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.mapping import mapping_named
-from animat.neurons.conditions import Condition
 from animat.recordings.recording import Channels
+from animat.responses.conditions import Condition
 from animat.robots import Cartpole
 from animat.training.policy import Policy
 

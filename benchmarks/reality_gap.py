@@ -144,9 +144,10 @@ def main() -> None:
 def live_once(backend: str, channels: int, seed: int, robot: str, options: argparse.Namespace) -> str:
     """A line of the table: a culture that is opened once is recorded, and driven by policies trained on that."""
     from animat.cultures.kinds import pulse_for
-    from animat.neurons.series import extract_series
     from animat.reality_gap import Calibration, run_policies
-    from animat.recordings.protocol import CLOSED_LOOP
+    from animat.recordings.formats.nwb import write_nwb
+    from animat.responses.series import extract_series
+    from animat.stimulation.protocol import CLOSED_LOOP
     from animat.training.policy import load_policies
 
     way = WAYS["memory9"]
@@ -159,7 +160,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
             recording = culture.record(protocol, seed=seed)
             recordings = folder / f"recordings{int(culture.now_s)}"
             recordings.mkdir(parents=True, exist_ok=True)
-            recording.save(recordings / "recording.nwb")
+            write_nwb(recording, recordings / "recording.nwb")
             given = training_options(way, robot, options.policies, options.iterations)
             out = str(free(folder / "policies"))
             expect(["train", robot, "--recordings", str(recordings), *given, "--out", out])

@@ -218,9 +218,9 @@ def timeline() -> Any:
     import jax
     import numpy as np
 
-    from animat.neurons.conditions import Condition
     from animat.neurons.made_up import LABELS, made_up_simulator
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.responses.conditions import Condition
 
     return SimulatorTimeline(
         simulators=jax.tree.map(lambda leaf: leaf[None], made_up_simulator()),
@@ -269,7 +269,7 @@ def forward(calls: int) -> dict[str, Any]:
     import numpy as np
 
     from animat.mapping import mapping_named
-    from animat.neurons.conditions import Condition
+    from animat.responses.conditions import Condition
     from animat.robots.cartpole import Cartpole
     from animat.training.policy import Policy
     from animat.training.sac import Layer

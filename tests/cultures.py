@@ -6,7 +6,7 @@ from typing import Any
 
 from animat.cultures.tissue import TissueParameters
 from animat.cultures.virtual import VirtualCulture
-from animat.recordings.selection import SelectionRule
+from animat.stimulation.selection import SelectionRule
 
 FEW = TissueParameters(neurons=300, in_degree_e=30, in_degree_i=15)
 RULE = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=20)

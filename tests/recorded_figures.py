@@ -14,9 +14,10 @@ import numpy as np
 from animat.cultures.observed import Spikes
 from animat.cultures.tissue import TissueParameters
 from animat.cultures.virtual import VirtualCulture
-from animat.neurons.responses import Responses, extract_responses
-from animat.recordings.protocol import PAPER, Protocol
-from animat.recordings.selection import Selection
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
+from animat.stimulation.protocol import PAPER, Protocol
+from animat.stimulation.selection import Selection
 
 PRESENTED = {
     "blocked, 1 pulse": PAPER,

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from animat.cultures.observed import Observed, Spikes, assembled
-from animat.recordings.protocol import Protocol
 from animat.recordings.recording import Channels
-from animat.recordings.schedule import make_schedule
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.schedule import make_schedule
 
 ONE_CHANNEL = Channels(label=np.array(["0"]), electrode=np.array([0]), x_um=np.zeros(1), y_um=np.zeros(1))
 PROTOCOL = Protocol((20.0, 40.0, 80.0), patterns=1, presentations=2, setup_s=0.0, pause_s=0.1)

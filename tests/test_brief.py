@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from animat.neurons.inspection import inspect_recording
-from animat.neurons.responses import extract_responses
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.made_up import make_up_recording
+from animat.responses.extraction import extract_responses
+from animat.responses.inspection import inspect_recording
 
 
 @pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from skimage.filters import threshold_otsu
 
 from animat.errors import InvalidArgument
-from animat.neurons.bursts import otsu_threshold, separability, separate_bursts
+from animat.responses.bursts import otsu_threshold, separability, separate_bursts
 
 
 def criterion(values: np.ndarray, threshold: float) -> float:

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_LIMITS, CL1_PULSE, SITES, CL1Culture
 from animat.cultures.contract import CultureContract
+from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, SITES, CL1Culture
 from animat.cultures.same_culture import other_culture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import said
-from animat.recordings.protocol import Protocol
-from animat.recordings.stimulus import BALANCED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import BALANCED_PULSE, Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
 from stand_in_cl import Neurons, install
 
 
@@ -225,7 +226,7 @@ def test_a_stop_from_another_thread_lets_nothing_through_after_it(neurons: Neuro
 def test_a_hand_over_that_hangs_does_not_keep_a_stop_from_taking_back_what_is_queued(
     neurons: Neurons, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.cultures.cl1.HAND_OVER_S", 0.1)
+    monkeypatch.setattr("animat.cultures.devices.cl1.HAND_OVER_S", 0.1)
     hanging, released, made = threading.Event(), threading.Event(), neurons.create_stim_plan
 
     def plan() -> object:

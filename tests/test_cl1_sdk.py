@@ -24,10 +24,11 @@ SETTINGS = {"CL_SDK_ACCELERATED_TIME": "1", "CL_SDK_VISUALISATION": "0"}
 HEAD = """
 import json, sys
 import numpy as np
-from animat.cultures.cl1 import CL1_PULSE, SITES, CL1Culture
-from animat.cultures.cl1_source import use_simulated_culture
-from animat.recordings.protocol import Protocol
-from animat.recordings.stimulus import Phase, Pulse, Stimulus
+from animat.cultures.devices.cl1 import CL1_PULSE, SITES, CL1Culture
+from animat.cultures.devices.cl1_source import use_simulated_culture
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
 def tell(**what): print("TOLD" + json.dumps(what))
 """
 
@@ -97,8 +98,8 @@ def test_every_pulse_that_the_guard_admits_is_one_that_the_sdk_takes(tmp_path: P
     """Designs at random about the edges of the limits: what passes our guard raises nothing in the SDK."""
     script = """
 import cl
-from animat.cultures.cl1 import CL1_LIMITS
-from animat.cultures.cl1_delivery import Delivery
+from animat.cultures.devices.cl1 import CL1_LIMITS
+from animat.cultures.devices.cl1_delivery import Delivery
 from animat.cultures.safety import Guard
 from animat.errors import UnsafeStimulus
 rng, taken, refused, wrongly = np.random.default_rng(0), 0, 0, 0
@@ -177,12 +178,13 @@ tell(spikes=sorted(spikes), stims=sorted(stims), frames=frames)
 def test_the_driver_records_responses_of_the_simulated_culture(tmp_path: Path) -> None:
     script = """
 use_simulated_culture(seed=3, neurons=300)
-from animat.recordings.protocol import Protocol
+from animat.recordings.formats.nwb import write_nwb
+from animat.stimulation.protocol import Protocol
 with CL1Culture() as culture:
     pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
     protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), presentations=20, patterns=20)
     recording = culture.record(protocol, seed=1)
-    recording.save("cl1.nwb")
+    write_nwb(recording, "cl1.nwb")
     window = [np.count_nonzero((recording.spike_times_s >= t + 0.002) & (recording.spike_times_s < t + 0.010))
               for t in recording.stimuli.time_s]
     rest = len(recording.spike_times_s) / recording.duration_s * 0.008
@@ -199,7 +201,7 @@ from animat.closed_loop.contenders import controls
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.mapping import mapping_named
-from animat.neurons.conditions import Condition
+from animat.responses.conditions import Condition
 from animat.robots.registry import robot_named
 use_simulated_culture(seed=1, neurons=300)
 pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))

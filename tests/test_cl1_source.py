@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.cultures import cl1_source
-from animat.cultures.cl1 import NO_STIMULATION
-from animat.cultures.cl1_source import BEFORE, REAL_TIME_NEURONS, SAMPLES, SimulatedCL1
+from animat.cultures.devices import cl1_source
+from animat.cultures.devices.cl1 import NO_STIMULATION
+from animat.cultures.devices.cl1_source import BEFORE, REAL_TIME_NEURONS, SAMPLES, SimulatedCL1
 from animat.errors import InvalidArgument
 
 

@@ -19,17 +19,17 @@ import pytest
 
 from animat.animat import Animat
 from animat.cli import COMMANDS, main
-from animat.cli_responses import say_findings
-from animat.cli_train import Train
+from animat.cli.responses import say_findings
+from animat.cli.train import Train
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import with_intervals
 from animat.mapping import Thresholds
-from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recordings
+from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
@@ -85,7 +85,7 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
     def never(*_: object) -> None:
         raise AssertionError("the recordings were read")
 
-    monkeypatch.setattr("animat.cli_train.Train.timeline", never)
+    monkeypatch.setattr("animat.cli.train.Train.timeline", never)
     for option, difference in (
         (["--seed", "9"], "training.seed: 1 there, 9 now"),
         (["--shadowing", "off"], "training.shadowing: True there, False now"),

@@ -34,12 +34,13 @@ from animat.cultures.contract import CultureContract
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.mapping import Linear, Thresholds
-from animat.neurons.conditions import ByFrequency, Condition
-from animat.neurons.responses import extract_responses
-from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.reading import read_recording
-from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
+from animat.responses.conditions import ByFrequency, Condition
+from animat.responses.extraction import extract_responses
 from animat.robots import Cartpole, Navigation, Robot
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from fake_culture import CHANNELS, FakeCulture
 

@@ -29,8 +29,9 @@ from animat.cultures.request import Request
 from animat.cultures.safety import SIMULATED_LIMITS
 from animat.errors import InvalidFile, UnsafeStimulus, UnusableData
 from animat.recordings.reading import read_recording
-from animat.recordings.stimulus import BALANCED_PULSE, Stimulus
 from animat.robots import Navigation
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.stimulus import Stimulus
 from fake_culture import FakeCulture, Fault
 from test_closed_loop import RANDOM, assert_read_alike, loop_of
 from test_run_on_recordings import policy_of
@@ -57,7 +58,7 @@ def assert_safe(session: Session, culture: FakeCulture, at_least: int) -> None:
 
 
 def session_pulse() -> Any:
-    from animat.recordings.stimulus import PUBLISHED_PULSE
+    from animat.stimulation.pulse import PUBLISHED_PULSE
 
     return PUBLISHED_PULSE
 
@@ -599,7 +600,7 @@ def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again
     given = ["run", str(tmp_path / "p0.safetensors"), "--episodes", "1", "--out", str(tmp_path / "session")]
     monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
     with monkeypatch.context() as patched:
-        patched.setattr("animat.neurons.series.extract_series", dead)
+        patched.setattr("animat.responses.series.extract_series", dead)
         assert main(given) == 1
     assert "dead-window" in capsys.readouterr().err
     recorded = tmp_path / "session" / "calibration.nwb"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument
-from animat.neurons.conditions import (
+from animat.responses.conditions import (
     All,
     ByElectrode,
     ByFrequency,
@@ -18,7 +18,7 @@ from animat.neurons.conditions import (
     conditions_named,
     default_conditions,
 )
-from animat.recordings.recording import Stimuli
+from animat.stimulation.stimulus import Stimuli
 
 
 def stimuli(

@@ -16,11 +16,14 @@ from animat.cultures.tissue.parameters import ShortTerm
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
 from animat.cultures.visibility import NOISE_UV
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.recordings.array import MAXONE
-from animat.recordings.protocol import Protocol
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection, SelectionRule
-from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.selection import Selection, SelectionRule
+from animat.stimulation.stimulus import Stimulus
 from cultures import FEW, small_culture
 
 SHORT = Protocol((10.0, 40.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
@@ -304,8 +307,8 @@ def test_a_culture_that_another_s_state_was_given_to_is_what_it_was(tmp_path: Pa
 def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:
     with small_culture() as culture:
         recording = culture.record(SHORT)
-    recording.save(tmp_path / "one.nwb")
-    again = Recording.load(tmp_path / "one.nwb")
+    write_nwb(recording, tmp_path / "one.nwb")
+    again = read_recording(tmp_path / "one.nwb")
     assert again.equals(recording)
     assert Protocol.from_json(again.provenance["protocol"]) == SHORT
 

@@ -18,9 +18,9 @@ from animat.cultures.same_culture import other_culture
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording, read_recordings
-from animat.recordings.selection import Selection
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.selection import Selection
 from animat.writing import alone_in
 from cultures import small_culture
 

@@ -23,7 +23,8 @@ from animat.recordings.detection.troughs import find_troughs
 from animat.recordings.raw import ArrayTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.recordings.spikes_of_traces import read_traces
-from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
+from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from rig_files import event_table, mapping_table, write_cl1, write_maxwell
 

@@ -13,17 +13,17 @@ import stand_in_maxlab
 from animat.closed_loop.contenders import Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
-from animat.cultures.cl1 import CL1_LIMITS, LEAD_US
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.cl1 import CL1_LIMITS, LEAD_US
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition
-from animat.recordings.array import MAXONE
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE
+from animat.recordings.reading import read_recording
+from animat.responses.conditions import Condition
 from animat.robots import Navigation
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.selection import Selection
 from stand_in_cl import install
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -36,7 +36,7 @@ def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     example = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0]
     exec(compile(example, "hardware.md", "exec"), {})
-    recording = Recording.load(tmp_path / "cl1.nwb")
+    recording = read_recording(tmp_path / "cl1.nwb")
     assert len(recording.stimuli) == 500
     assert recording.presentation is not None
     assert recording.presentation.pulses == 5

@@ -13,7 +13,8 @@ def names_in_the_code() -> set[str]:
     """The first argument of every `Finding(...)` in the package that extracts responses and fits simulators."""
     calls = [
         node
-        for file in (ROOT / "src" / "animat" / "neurons").glob("*.py")
+        for room in ("responses", "neurons")
+        for file in (ROOT / "src" / "animat" / room).rglob("*.py")
         for node in ast.walk(ast.parse(file.read_text()))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Finding"
     ]

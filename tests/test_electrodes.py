@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.recordings.array import MAXONE, ElectrodeArray
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.scan import ScannedActivity
-from animat.recordings.selection import Selection, SelectionRule, select_electrodes
+from animat.recordings.recording import Channels
+from animat.stimulation.array import MAXONE, ElectrodeArray
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.scan import ScannedActivity
+from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
 
 SMALL = ElectrodeArray("small", columns=20, rows=10, pitch_um=20.0, channels=60, stimulation_units=16)
 
@@ -32,17 +31,9 @@ def test_the_maxone_is_as_large_as_the_paper_says() -> None:
     assert (MAXONE.columns * MAXONE.pitch_um, MAXONE.rows * MAXONE.pitch_um) == (3850.0, 2100.0)
 
 
-@given(st.integers(0, len(MAXONE) - 1), st.floats(-8.7, 8.7), st.floats(-8.7, 8.7))
-def test_a_position_is_its_nearest_electrode(electrode: int, dx_um: float, dy_um: float) -> None:
-    x_um, y_um = MAXONE.position_um(electrode)
-    assert MAXONE.electrode_at(x_um + dx_um, y_um + dy_um).tolist() == [electrode]
-
-
-def test_positions_off_the_array_are_refused() -> None:
+def test_electrodes_off_the_array_are_refused() -> None:
     with pytest.raises(InvalidArgument, match="expected numbers from 0 to 26399 on the MaxOne, got 26400"):
         MAXONE.position_um(26_400)
-    with pytest.raises(InvalidArgument, match="expected positions on the MaxOne, got -100, 0 um"):
-        MAXONE.electrode_at(-100.0, 0.0)
 
 
 def test_scan_blocks_cover_every_electrode_once_in_26_blocks() -> None:
@@ -161,7 +152,7 @@ def test_a_draw_that_finds_hardly_any_pattern_ends(monkeypatch: pytest.MonkeyPat
     with pytest.raises(InvalidArgument, match="24 electrodes make only 24"):
         draw_patterns(MAXONE, far, size=23, spacing_um=100.0, seed=1)
     near = np.array([220 * row + column for row in range(10, 30) for column in range(10, 30)])
-    monkeypatch.setattr("animat.recordings.patterns._MOST_LOOKED_AT", 10_000)
+    monkeypatch.setattr("animat.stimulation.patterns._MOST_LOOKED_AT", 10_000)
     with pytest.raises(InvalidArgument, match="among 10,000 beginnings of such sets 0 could be completed"):
         draw_patterns(MAXONE, near, size=25, spacing_um=100.0, seed=1, patterns=1)
 
@@ -194,7 +185,7 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
     selection.save(tmp_path / "selection.json")
     assert Selection.load(tmp_path / "selection.json") == selection
     assert hash(Selection.load(tmp_path / "selection.json")) == hash(selection)
-    channels = selection.channels
+    channels = Channels.on(SMALL, selection.recording)
     assert channels.electrode.tolist() == selection.recording.tolist()
     assert channels.has_positions
     for content in ("", "[]", "{}", json.dumps({**selection.to_dict(), "format": "other"}), "\x00"):

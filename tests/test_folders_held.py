@@ -12,6 +12,7 @@ from animat.cli import main
 from animat.errors import DeviceFailed, Mismatch
 from animat.live.plan import Timetable
 from animat.live.shadowing import live
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.writing import LOCK, alone_in
 from fake_culture import FakeCulture
@@ -26,7 +27,7 @@ def command(name: str, folder: Path) -> list[str]:
     policy_of(0).save(folder / "p0.safetensors")
     made_up = folder / "made-up.nwb"
     if not made_up.exists():
-        make_up_recording(1, channels=32).save(made_up)
+        write_nwb(make_up_recording(1, channels=32), made_up)
     return {
         "record made-up": ["record", "--culture", "made-up", "--sessions", "1"],
         "record cl1": ["record", "--culture", "cl1"],

@@ -18,16 +18,17 @@ import pytest
 import stand_in_cl
 import stand_in_maxlab
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_LIMITS, SITES, CL1Culture
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.cl1 import CL1_LIMITS, SITES, CL1Culture
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import UnsafeStimulus
-from animat.recordings.array import MAXONE
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.pulse import Phase, Pulse
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from stand_in_maxlab import LSB_MV
 

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.stimulus import Phase, Pulse, Stimulus
+from animat.stimulation.pulse import Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
 from test_front_doors import BACKENDS, Door, Out, Requests, breaches, end_of, left_over
 
 

@@ -23,6 +23,7 @@ from animat.gym import IDS, register_environments
 from animat.mapping import Linear, mapping_named
 from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.simulator import silenced
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.robots import Cartpole, robot_named
 
@@ -348,7 +349,7 @@ def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
 def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -> None:
     for number in range(3):
         made_up = make_up_recording(number, start_min=30.0 * number, patterns=4, channels=16)
-        made_up.save(tmp_path / f"{number}.nwb")
+        write_nwb(made_up, tmp_path / f"{number}.nwb")
     with pytest.warns(UserWarning) as told:
         gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path)
     few = [str(each.message) for each in told if "a distribution takes 30 or more" in str(each.message)]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidFile
-from animat.recordings.protocol import read_protocol
-from animat.recordings.selection import Selection
+from animat.stimulation.protocol import read_protocol
+from animat.stimulation.selection import Selection
 from animat.training.group import Group, train_group
 from test_training import SHORT, timeline_of
 

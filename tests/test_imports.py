@@ -1,86 +1,81 @@
-"""Imports follow the story and never run back; what is heavy is imported late."""
+"""Imports follow the story and never run back or in circles; what is heavy is imported late."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
-EVERYWHERE = {"brief", "differences", "errors", "plain_file", "writing", "progress", "compilation", "ctrl_c"}
+GROUND = ("brief", "compilation", "ctrl_c", "differences", "errors", "plain_file", "progress", "tables", "writing")
 """What stands under the story and may be used by all of it."""
 
-MAY_IMPORT = {
-    "differences": set(),
-    "brief": set(),
-    "errors": set(),
-    "plain_file": {"errors"},
-    "writing": {"errors"},
-    "progress": set(),
-    "compilation": set(),
-    "ctrl_c": set(),
-    "recordings": set(),
-    "neurons": {"recordings"},
-    "robots": set(),
-    "mapping": set(),
-    "animat": {"neurons", "mapping", "robots"},
-    "training": {"animat", "neurons", "mapping", "robots", "recordings"},
-    "evaluation": {"training", "animat", "neurons", "mapping", "robots", "recordings"},
-    "cultures": {"recordings"},
-    "closed_loop": {"cultures", "evaluation", "neurons", "mapping", "robots", "recordings"},
-    "reality_gap": {
-        "closed_loop",
-        "cultures",
-        "evaluation",
-        "training",
-        "animat",
-        "mapping",
-        "neurons",
-        "robots",
-        "recordings",
-    },
-    "live": {"reality_gap", "closed_loop", "cultures", "training", "neurons", "mapping", "robots", "recordings"},
-    "report": {"recordings", "neurons", "robots", "mapping", "training", "evaluation", "cultures"},
-    "studies": {
-        "recordings",
-        "cultures",
-        "neurons",
-        "robots",
-        "mapping",
-        "animat",
-        "training",
-        "evaluation",
-        "report",
-    },
-    "gym": {"animat", "neurons", "mapping", "robots", "recordings"},
+STORY = (
+    "stimulation",
+    "recordings",
+    "responses",
+    "neurons",
+    "mapping",
+    "robots",
+    "animat",
+    "training",
+    "evaluation",
+    "cultures",
+    "closed_loop",
+    "reality_gap",
+    "live",
+    "report",
+    "studies",
+    "gym",
+    "cli",
+)
+"""The rooms in the order of the story: each may look into those before it. A study records and draws: it comes late."""
+
+FILES = {
+    ".".join(("animat", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): file
+    for file in sorted(PACKAGE.rglob("*.py"))
 }
-"""Each room, and the rooms before it in the story that it may look into; `cli` and the public names look into all."""
+"""Every module of the package by its name."""
 
 
-def imports_of(file: Path) -> set[str]:
-    """Rooms of animat that a file imports, at its top or late."""
-    rooms = set()
-    for node in ast.walk(ast.parse(file.read_text())):
+def imports_of(name: str) -> set[str]:
+    """The modules of animat that a module imports: at its top, late, or for types only."""
+    found = set()
+    for node in ast.walk(ast.parse(FILES[name].read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
-            parts = [node.module]
+            # What is imported from a package may be a module of it, or a name that stands in the package itself.
+            within = (f"{node.module}.{alias.name}" for alias in node.names)
+            found |= {module if module in FILES else node.module for module in within}
         elif isinstance(node, ast.Import):
-            parts = [alias.name for alias in node.names]
-        else:
-            continue
-        rooms |= {name.split(".")[1] for name in parts if name.startswith("animat.")}
-    return rooms
+            found |= {alias.name for alias in node.names}
+    return found & FILES.keys() - {name}
 
 
-@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
-def test_no_import_runs_back_up_the_story(file: Path) -> None:
-    room = file.relative_to(PACKAGE).parts[0].removesuffix(".py")
-    if room in ("__init__", "__main__") or room.split("_")[0] == "cli":
-        return
-    assert imports_of(file) <= MAY_IMPORT[room] | EVERYWHERE | {room}
+IMPORTS = {name: imports_of(name) for name in FILES}
+
+
+def room_of(name: str) -> str:
+    return name.split(".")[1]
+
+
+# The package itself holds the public names, of all rooms, and `__main__` is the command line.
+@pytest.mark.parametrize("name", sorted(FILES.keys() - {"animat", "animat.__main__"}))
+def test_no_import_runs_back_up_the_story(name: str) -> None:
+    room = room_of(name)
+    before = () if room in GROUND else STORY[: STORY.index(room)]
+    assert {room_of(imported) for imported in IMPORTS[name]} <= {*GROUND, *before, room}
+
+
+def test_no_two_files_import_each_other() -> None:
+    try:
+        TopologicalSorter(IMPORTS).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
 def modules_after(statement: str) -> set[str]:
@@ -117,7 +112,7 @@ def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
     # What is in the package under the same name would be there or not, by what was imported before.
     assert not set(animat.__all__) & {path.stem for path in PACKAGE.iterdir()}
     # The nouns of the story that a study is made of are not those of its specification.
-    assert animat.Condition.__module__ == "animat.neurons.conditions"
+    assert animat.Condition.__module__ == "animat.responses.conditions"
     assert {"Study", "run_study", "read_study", "paper_study", "best_return"} <= set(animat.__all__)
 
 

@@ -9,11 +9,6 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern, Condition
-from animat.neurons.inspection import inspect_recording
-from animat.neurons.psth import post_stimulus_histogram
-from animat.neurons.quality import _difference
-from animat.neurons.responses import Responses, extract_responses
 from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -23,6 +18,12 @@ from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms, rate_edges
 from animat.report.style import condition_colours, save_figure
+from animat.responses.conditions import All, ByFrequency, ByInterval, ByPattern, Condition
+from animat.responses.extraction import extract_responses
+from animat.responses.inspection import inspect_recording
+from animat.responses.psth import post_stimulus_histogram
+from animat.responses.quality.responses import _difference
+from animat.responses.responses import Responses
 from test_responses import names, recording
 
 

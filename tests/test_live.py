@@ -31,13 +31,13 @@ from animat.live.recording import record_within
 from animat.live.shadowing import Lived, live
 from animat.mapping import Thresholds
 from animat.neurons.made_up import made_up_simulator
-from animat.neurons.responses import extract_responses
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
-from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recordings
-from animat.recordings.stimulus import PUBLISHED_PULSE
+from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.training.policy import load_policies
 from animat.training.sac import SAC
 from animat.training.specification import Training

@@ -21,20 +21,20 @@ import stand_in_maxlab
 from animat.cli import main
 from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.devices.maxone import MaxOneCulture
 from animat.cultures.kinds import culture_of
 from animat.cultures.living_series import record_living_series
-from animat.cultures.maxone import MaxOneCulture
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.errors import DeviceFailed, InvalidArgument, Mismatch
-from animat.recordings.array import MAXONE
 from animat.recordings.made_up import make_up_recording, write_made_up_series
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.protocol import Protocol
 from animat.recordings.reading import read_recording, read_recordings
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.selection import Selection
 from animat.writing import alone_in
 from fake_culture import FakeCulture
 

@@ -17,16 +17,16 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_PULSE, CL1Culture
-from animat.cultures.maxone import MaxOneCulture
+from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
+from animat.cultures.devices.maxone import MaxOneCulture
 from animat.errors import DeviceFailed
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition
-from animat.recordings.array import MAXONE
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, Pulse
+from animat.responses.conditions import Condition
 from animat.robots import Navigation
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.pulse import BALANCED_PULSE, Pulse
+from animat.stimulation.selection import Selection
 
 HZ = (5.0, 20.0)
 

@@ -13,16 +13,17 @@ import pytest
 
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
-from animat.cultures.maxone_sequences import dac_code
-from animat.cultures.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.maxone_sequences import dac_code
+from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.array import MAXONE
 from animat.recordings.formats.stimulus_text import said
-from animat.recordings.patterns import draw_patterns
-from animat.recordings.protocol import Protocol
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
 from stand_in_maxlab import LSB_MV, Rig, Stream, install
 
 SITES = [(20 + 25 * (i // 8)) * 220 + 15 + 25 * (i % 8) for i in range(32)]
@@ -364,7 +365,7 @@ def test_spikes_on_amplifiers_that_are_none_are_refused(rig: Rig) -> None:
 
 
 def test_a_stream_that_falls_silent_is_a_lost_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.cultures.maxone_stream.PATIENCE_S", 0.0)
+    monkeypatch.setattr("animat.cultures.devices.maxone_stream.PATIENCE_S", 0.0)
     stream = ZmqSpikes()
     stream.hear([np.uint64(42).tobytes(), b""])
     with pytest.raises(DeviceFailed, match="got none any more: is MaxLab Live's server running") as failed:

@@ -17,26 +17,28 @@ from hypothesis import strategies as st
 
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
-from animat.cli_train import _memories
+from animat.cli.train import _memories
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.mapping import Linear, Thresholds
-from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
-from animat.neurons.memory_quality import memory_findings
-from animat.neurons.responses import Presented, Responses, extract_responses
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Presentation
+from animat.responses.conditions import Condition, conditions_named
+from animat.responses.extraction import extract_responses
+from animat.responses.quality.memory import memory_findings
+from animat.responses.responses import Presented, Responses
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.stimulation.protocol import Presentation
 from animat.studies.differences import decisions
 from animat.studies.paper import paper_study
 from animat.studies.simulating import load_timeline, save_timeline
@@ -568,7 +570,7 @@ def test_training_tells_what_is_remembered() -> None:
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:
-    make_up_recording(1, channels=32).save(tmp_path / "made-up.nwb")
+    write_nwb(make_up_recording(1, channels=32), tmp_path / "made-up.nwb")
     with pytest.warns(UserWarning, match="presented in blocks"):
         environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "made-up.nwb", kind="memory")
     environment.reset(seed=1)

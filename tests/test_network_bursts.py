@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.neurons.inspection import inspect_recording
-from animat.neurons.network_bursts import find_network_bursts
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.report.inspection import inspection_text
 from animat.report.spontaneous import draw_spontaneous
+from animat.responses.inspection import inspect_recording
+from animat.responses.network_bursts import find_network_bursts
 from test_responses import recording
 
 
@@ -50,7 +51,7 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     figure = draw_spontaneous(source, find_network_bursts(source))
     assert figure.axes[0].get_xlim() == (0.0, 300.0)
     assert figure.axes[0].collections[0].get_offsets().shape[0] == len(source.spike_times_s)
-    source.save(tmp_path / "a.nwb")
+    write_nwb(source, tmp_path / "a.nwb")
     assert main(["inspect", str(tmp_path / "a.nwb"), "--out", str(tmp_path / "figures"), "--json"]) == 1
     told = capsys.readouterr().out
     assert "figures of the series" not in told

@@ -13,10 +13,10 @@ import pytest
 from animat.closed_loop.loop import Loop
 from animat.cultures.budget import Account, Budget
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition
-from animat.neurons.median_drift import MedianDrift, median_drift
-from animat.neurons.responses import Responses
 from animat.reality_gap.outlook import Outlook, outlook
+from animat.responses.conditions import Condition
+from animat.responses.median_drift import MedianDrift, median_drift
+from animat.responses.responses import Responses
 from animat.robots import Navigation
 
 CONDITIONS = (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))

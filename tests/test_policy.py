@@ -23,15 +23,15 @@ from safetensors.numpy import load, save
 from scipy import stats
 
 from animat.animat import Delivery
-from animat.cli_responses import fit_as
+from animat.cli.responses import fit_as
 from animat.closed_loop.loop import Loop
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.mapping import mapping_named
-from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.kinds import Kind
-from animat.recordings.protocol import Presentation
+from animat.responses.conditions import Condition, conditions_named
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, load_policies
 from animat.training.provenance import READ
 from animat.training.sac import Layer, forward

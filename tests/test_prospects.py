@@ -21,11 +21,13 @@ from animat.evaluation.prospects import prospects
 from animat.evaluation.resampling import _rough, with_intervals
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.mapping import Thresholds
-from animat.neurons.conditions import NO_CONDITION, Condition
-from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.simulator import fit_histogram
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.responses.conditions import NO_CONDITION, Condition
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
 from animat.robots import Cartpole
 from animat.robots.grid import grid_for
 
@@ -53,7 +55,7 @@ def test_inspect_tells_the_limit(
 ) -> None:
     rough = partial(prospects, resolution=0.25, episodes=20, resamples=4)
     monkeypatch.setattr("animat.evaluation.prospects.prospects", rough)
-    make_up_recording(1, patterns=40, channels=64).save(tmp_path / "a.nwb")
+    write_nwb(make_up_recording(1, patterns=40, channels=64), tmp_path / "a.nwb")
     assert main(["inspect", str(tmp_path / "a.nwb"), "--limit", "cartpole", "--json"]) == 0
     said = capsys.readouterr().out.splitlines()
     (inspected,) = json.loads(said[-1])["recordings"]
@@ -68,7 +70,7 @@ def test_inspect_tells_the_limit(
 
 
 def test_where_there_is_no_limit_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    make_up_recording(1, patterns=5, channels=16).save(tmp_path / "a.nwb")
+    write_nwb(make_up_recording(1, patterns=5, channels=16), tmp_path / "a.nwb")
     command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--limit", "navigation", "--json"]
     assert main(command) == 1
     said = capsys.readouterr().out

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument, InvalidFile
-from animat.recordings.protocol import CLOSED_LOOP, PAPER, Presentation, Protocol, read_protocol
-from animat.recordings.schedule import make_schedule
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.protocol import CLOSED_LOOP, PAPER, Presentation, Protocol, read_protocol
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.schedule import make_schedule
 
 PATTERNS = np.arange(500).reshape(100, 5)
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from animat.neurons.inspection import inspect_recording
-from animat.neurons.responses import extract_responses
 from animat.recordings.findings import Finding
 from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.responses.extraction import extract_responses
+from animat.responses.inspection import inspect_recording
 from test_inspection import answering
 from test_responses import recording
 

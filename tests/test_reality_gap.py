@@ -22,7 +22,7 @@ from animat.closed_loop.contenders import HandMadeRule
 from animat.closed_loop.following import Following
 from animat.closed_loop.session import read_session
 from animat.cultures.budget import Account, Budget
-from animat.cultures.cl1 import CL1Culture
+from animat.cultures.devices.cl1 import CL1Culture
 from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
 from animat.errors import InvalidArgument, Mismatch
@@ -31,20 +31,23 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
 from animat.mapping import Linear, Mapping, Thresholds
-from animat.neurons.conditions import Condition
 from animat.neurons.made_up import LABELS, MEANS_HZ
-from animat.neurons.responses import Responses, extract_responses
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import ANEW_EPISODES
 from animat.reality_gap.running import planned_episodes
-from animat.recordings.array import MAXONE
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation, Protocol
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection
+from animat.responses.conditions import Condition
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot
+from animat.stimulation.array import MAXONE
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.selection import Selection
 from animat.training.policy import Policy
 from fake_culture import FakeCulture
 
@@ -513,7 +516,7 @@ class TestCommand:
     @pytest.fixture
     def folder(self, tmp_path: Path, recordings: list[Recording], series: list[Responses]) -> Path:
         for i, recording in enumerate(recordings):
-            recording.save(tmp_path / "recordings" / f"r{i}.nwb")
+            write_nwb(recording, tmp_path / "recordings" / f"r{i}.nwb")
         for i in range(2):
             policy_of(i, series).save(tmp_path / "policies" / f"p{i}.safetensors")
         return tmp_path
@@ -637,7 +640,7 @@ class TestCommand:
         printed = capsys.readouterr()
         assert "the culture is recorded first" in printed.err
         assert (out / "calibration.nwb").is_file()
-        assert Recording.load(out / "calibration.nwb").presentation == Presentation("mixed", 2)
+        assert read_recording(out / "calibration.nwb").presentation == Presentation("mixed", 2)
         assert "other-presentation" not in printed.err
 
     def test_a_bad_simulator_is_found_before_the_culture_is_recorded_for_it(

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from animat.neurons.conditions import Condition
-from animat.neurons.responses import Presented, Responses
 from animat.reality_gap.answered import Answered
 from animat.reality_gap.passes import Passes
 from animat.reality_gap.predicting import Predicted
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
-from animat.recordings.protocol import Presentation
+from animat.responses.conditions import Condition
+from animat.responses.responses import Presented, Responses
+from animat.stimulation.protocol import Presentation
 
 CONDITIONS = (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))
 MEANS_HZ = np.array([10.0, 14.0])

@@ -14,11 +14,12 @@ import pytest
 from animat.cli import main
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Protocol, read_protocol
 from animat.recordings.reading import read_recording
-from animat.recordings.schedule import make_schedule
-from animat.recordings.stimulus import BALANCED_PULSE
+from animat.stimulation.protocol import Protocol, read_protocol
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.schedule import make_schedule
 
 PATTERNS = np.arange(500).reshape(100, 5)
 MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)
@@ -27,7 +28,7 @@ MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.
 @pytest.fixture
 def replayed(tmp_path: Path) -> list[str]:
     """The command that records a replay of a made-up recording, as far as the protocol."""
-    make_up_recording(1, patterns=6, channels=16).save(tmp_path / "made-up.nwb")
+    write_nwb(make_up_recording(1, patterns=6, channels=16), tmp_path / "made-up.nwb")
     return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(tmp_path / "made-up.nwb"), "--out",
             str(tmp_path / "out")]  # fmt: skip
 

@@ -11,8 +11,10 @@ import pytest
 from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.noticed import as_provenance, noticed
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 
 def channels(n: int = 3) -> Channels:

@@ -13,9 +13,9 @@ from skimage.filters import threshold_otsu
 from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.made_up import MadeUpCulture, make_up_recording, write_made_up_series
 from animat.recordings.noticed import noticed
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Presentation
 
 MEANS_HZ = {5: 30.0, 10: 36.0, 20: 42.0, 40: 48.0, 80: 54.0}
 

@@ -16,8 +16,11 @@ from hypothesis.extra import numpy as npst
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.reading import read_recording
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 TEXT = st.text(st.characters(blacklist_characters="\0", blacklist_categories=("Cs",)), max_size=8)
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -72,8 +75,8 @@ def made_up() -> Recording:
 @FEW
 @given(recording=recordings())
 def test_a_saved_recording_reads_back_equal(recording: Recording, tmp_path: Path) -> None:
-    recording.save(tmp_path / "a.nwb")
-    assert Recording.load(tmp_path / "a.nwb").equals(recording)
+    write_nwb(recording, tmp_path / "a.nwb")
+    assert read_recording(tmp_path / "a.nwb").equals(recording)
 
 
 @settings(FEW, max_examples=8)
@@ -81,7 +84,7 @@ def test_a_saved_recording_reads_back_equal(recording: Recording, tmp_path: Path
 def test_pynwb_finds_every_saved_recording_valid(recording: Recording, tmp_path: Path) -> None:
     import pynwb
 
-    recording.save(tmp_path / "a.nwb")
+    write_nwb(recording, tmp_path / "a.nwb")
     assert pynwb.validate(path=str(tmp_path / "a.nwb")) == []
 
 
@@ -96,14 +99,14 @@ def test_a_recording_of_205_000_spikes_on_1024_channels_reads_back_equal(tmp_pat
         start_s=-1.0,
         duration_s=101.0,
     )
-    recording.save(tmp_path / "a.nwb")
+    write_nwb(recording, tmp_path / "a.nwb")
     assert read_nwb(tmp_path / "a.nwb").equals(recording)
 
 
 def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(made_up: Recording, tmp_path: Path) -> None:
     import pynwb
 
-    made_up.save(tmp_path / "a.nwb")
+    write_nwb(made_up, tmp_path / "a.nwb")
     with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r") as nwb_io:
         nwb = nwb_io.read()
         assert len(nwb.units) == len(made_up.channels)
@@ -126,7 +129,7 @@ def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(made_up: Recording, 
 def test_who_recorded_what_goes_into_the_fields_of_nwb(made_up: Recording, tmp_path: Path) -> None:
     import pynwb
 
-    with_subject(made_up).save(tmp_path / "a.nwb")
+    write_nwb(with_subject(made_up), tmp_path / "a.nwb")
     with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r") as nwb_io:
         nwb = nwb_io.read()
         assert nwb.experimenter == ("Doe, Jane", "Roe, Richard")
@@ -140,7 +143,7 @@ def test_nwbinspector_finds_nothing_critical_and_no_violation(made_up: Recording
     pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
     from nwbinspector import Importance, inspect_nwbfile
 
-    with_subject(made_up).save(tmp_path / "a.nwb")
+    write_nwb(with_subject(made_up), tmp_path / "a.nwb")
     messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "a.nwb")))
     # What is left is a suggestion: the table of scalars has one row.
     assert [m.check_function_name for m in messages if m.importance != Importance.BEST_PRACTICE_SUGGESTION] == []
@@ -151,7 +154,7 @@ def test_nwbinspector_finds_nothing_critical_in_what_a_culture_records(made_up: 
     pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
     from nwbinspector import Importance, inspect_nwbfile
 
-    made_up.save(tmp_path / "a.nwb")
+    write_nwb(made_up, tmp_path / "a.nwb")
     messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "a.nwb")))
     grave = (Importance.CRITICAL, Importance.ERROR, Importance.PYNWB_VALIDATION)
     assert [m.check_function_name for m in messages if m.importance in grave] == []
@@ -182,19 +185,19 @@ def with_subject(recording: Recording) -> Recording:
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.999])
 def test_a_truncated_file_is_one_clear_line(made_up: Recording, tmp_path: Path, share: float) -> None:
     path = tmp_path / "a.nwb"
-    made_up.save(path)
+    write_nwb(made_up, path)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(
         InvalidFile, match=r"a\.nwb: expected a whole (NWB|HDF5) recording, but it is cut off"
     ) as caught:
-        Recording.load(path)
+        read_recording(path)
     assert "\n" not in str(caught.value)
 
 
 def test_damage_anywhere_in_the_file_is_an_error_of_ours_or_harmless(made_up: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
-    made_up.save(path)
+    write_nwb(made_up, path)
     content = path.read_bytes()
     rng = np.random.default_rng(0)
     for start in rng.integers(8, len(content) - 64, 60).tolist():
@@ -213,16 +216,16 @@ def test_another_programs_files_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["voltage"] = np.zeros(3)
     with pytest.raises(InvalidFile, match=r"a\.h5: expected NWB, MaxWell or CL1, got another HDF5 file \(it holds: vo"):
-        Recording.load(tmp_path / "a.h5")
+        read_recording(tmp_path / "a.h5")
     start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
     with pynwb.NWBHDF5IO(str(tmp_path / "b.nwb"), "w") as nwb_io:
         nwb_io.write(pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start))
     with pytest.raises(InvalidFile, match=r"b\.nwb: expected spikes in /units, found none and no traces either"):
-        Recording.load(tmp_path / "b.nwb")
+        read_recording(tmp_path / "b.nwb")
 
 
 def test_a_file_of_a_later_format_version_is_refused(made_up: Recording, tmp_path: Path) -> None:
-    made_up.save(tmp_path / "a.nwb")
+    write_nwb(made_up, tmp_path / "a.nwb")
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
         file["processing/ecephys/animat_recording/format_version"][0] = 2
     with pytest.raises(InvalidFile, match="expected format version 1 or older, got 2: update animat"):
@@ -246,12 +249,13 @@ def test_text_that_the_file_cannot_hold_is_refused(
 SAVE_ON_A_FULL_DISK = """
 import resource, signal, sys
 from animat.errors import InvalidFile
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 recording = make_up_recording(4)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 try:
-    recording.save(sys.argv[1])
+    write_nwb(recording, sys.argv[1])
 except InvalidFile as error:
     print(error)
     sys.exit(3)
@@ -260,7 +264,7 @@ except InvalidFile as error:
 
 def test_a_full_disk_leaves_the_old_file_whole(made_up: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
-    made_up.save(path)
+    write_nwb(made_up, path)
     before = path.read_bytes()
     assert len(before) > 100_000
     done = subprocess.run(

@@ -17,10 +17,11 @@ from hypothesis.extra import numpy as npst
 
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.noticed import noticed
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Presentation
 
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -511,7 +512,7 @@ def test_folders_are_read_in_the_order_of_the_cultures_clock(tmp_path: Path) -> 
     folder = tmp_path / "series"
     folder.mkdir()
     first = read_recording(npz(tmp_path, **SPIKES, **STIMULI, start_min=20.0))
-    first.save(folder / "a.nwb")
+    write_nwb(first, folder / "a.nwb")
     npz(folder, **SPIKES, **STIMULI, start_min=5.0)
     csv(folder, "time,channel\n0.5,1\n", "0.25\n")
     (folder / ".b.nwb.partial.nwb").write_bytes(b"half a file")
@@ -551,8 +552,8 @@ def test_the_organoid_recording(real_data: Path, tmp_path: Path) -> None:
         assert np.array_equal(recording.stimuli.electrodes, truth["stim_electrodes"])
     window = [np.searchsorted(recording.spike_times_s, recording.stimuli.time_s + s) for s in (0.002, 0.010)]
     assert np.mean(window[1] - window[0]) == pytest.approx(20.26, abs=0.005)
-    recording.save(tmp_path / "a.nwb")
-    assert Recording.load(tmp_path / "a.nwb").equals(recording)
+    write_nwb(recording, tmp_path / "a.nwb")
+    assert read_recording(tmp_path / "a.nwb").equals(recording)
 
 
 def test_the_brainoware_recording(real_data: Path) -> None:

@@ -10,17 +10,16 @@ import pytest
 
 from animat.cli import main
 from animat.errors import AnimatError, InvalidFile
-from animat.neurons.conditions import ByInterval, ByPattern, Conditions
-from animat.neurons.inspection import inspect_recording
-from animat.neurons.responses import extract_responses
-from animat.neurons.table_responses import responses_of_table
-from animat.neurons.windows import spikes_in
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording, read_source, read_sources
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.inspection import inspection_text
+from animat.responses.conditions import ByInterval, ByPattern, Conditions
+from animat.responses.extraction import extract_responses, responses_of_table
+from animat.responses.inspection import inspect_recording
+from animat.responses.windows import spikes_in
 from test_responses import recording as of_spikes
 
 

@@ -10,12 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument, Mismatch, UnusableData
-from animat.neurons.conditions import All, ByFrequency, ByInterval, ByPattern, Conditions
-from animat.neurons.psth import find_response, post_stimulus_histogram, spontaneous_rate
-from animat.neurons.responses import Responses, extract_responses
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording
-from animat.recordings.recording import Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.responses.conditions import All, ByFrequency, ByInterval, ByPattern, Conditions
+from animat.responses.extraction import extract_responses
+from animat.responses.psth import find_response, post_stimulus_histogram, spontaneous_rate
+from animat.responses.responses import Responses
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
 
 
 def recording(
@@ -191,7 +193,7 @@ def test_blocks_of_windows_give_the_same_channels(monkeypatch: pytest.MonkeyPatc
     rng = np.random.default_rng(0)
     source = poisson(rng, rate_hz=50, n_channels=7, duration_s=20)
     whole = extract_responses(source)
-    monkeypatch.setattr("animat.neurons.windows._BLOCK", 30)
+    monkeypatch.setattr("animat.responses.windows._BLOCK", 30)
     assert extract_responses(source).active_ratio.tolist() == whole.active_ratio.tolist()
 
 

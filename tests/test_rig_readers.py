@@ -10,13 +10,13 @@ import h5py
 import numpy as np
 import pytest
 
-from animat.cultures.cl1 import CL1Culture
+from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.noticed import noticed
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.recordings.spikes_of_traces import read_traces
+from animat.stimulation.protocol import Presentation
 from rig_files import (
     BITS,
     FIRST_FRAME,

@@ -16,16 +16,17 @@ from animat.closed_loop.session import read_session
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
 from animat.mapping import Thresholds
-from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.reading import read_recording
-from animat.recordings.selection import SelectionRule
+from animat.responses.conditions import Condition, conditions_named
+from animat.responses.series import extract_series
 from animat.robots import Navigation
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
 
@@ -113,7 +114,7 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
 def test_recordings_of_no_virtual_culture_are_told(
     tmp_path: Path, small_ones: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make_up_recording(1, channels=32).save(tmp_path / "made-up.nwb")
+    write_nwb(make_up_recording(1, channels=32), tmp_path / "made-up.nwb")
     assert run(tmp_path / "session", policy_of(0), tmp_path / "made-up.nwb") == 0
     assert "the recordings are of no virtual culture, and this is virtual culture 1" in capsys.readouterr().err
 

@@ -16,7 +16,8 @@ import pytest
 from animat.cultures.history import History
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Guard, Limits
 from animat.errors import InvalidArgument, UnsafeStimulus
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
 
 SITES = range(10, 16)
 LIMITS = Limits(

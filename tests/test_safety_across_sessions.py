@@ -13,15 +13,16 @@ import pytest
 import stand_in_cl
 import stand_in_maxlab
 from animat.cultures.base import Culture
-from animat.cultures.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
+from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import DeviceFailed, UnsafeStimulus
-from animat.recordings.array import MAXONE
 from animat.recordings.recording import Channels
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.pulse import BALANCED_PULSE
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
 
 SITES = tuple(range(10, 16))
 LIMITS = replace(

@@ -27,15 +27,16 @@ import stand_in_maxlab
 from animat.cultures import holding
 from animat.cultures.base import Culture
 from animat.cultures.budget import Budget
-from animat.cultures.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
+from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
+from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.limits import SIMULATED_LIMITS, Limits
-from animat.cultures.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.observed import Observed
 from animat.cultures.safety import Admitted, Guard
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.array import MAXONE
-from animat.recordings.selection import Selection
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
 from fake_culture import FakeCulture
 from test_safety import DEVICE
 

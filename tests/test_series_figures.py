@@ -10,18 +10,19 @@ import pytest
 from matplotlib.colors import to_hex
 
 from animat.errors import InvalidArgument, Mismatch
-from animat.neurons.conditions import conditions_named
-from animat.neurons.responses import Responses, extract_responses
-from animat.recordings.array import MAXONE
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.recording import Recording
-from animat.recordings.selection import Selection
 from animat.report.array import draw_array, draw_selection
 from animat.report.drift import draw_drift
 from animat.report.first_and_last import draw_first_and_last
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.series import draw_series
 from animat.report.style import MEDIAN
+from animat.responses.conditions import conditions_named
+from animat.responses.extraction import extract_responses
+from animat.responses.responses import Responses
+from animat.stimulation.array import MAXONE
+from animat.stimulation.selection import Selection
 
 
 @pytest.fixture(scope="module")

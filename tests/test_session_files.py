@@ -26,7 +26,8 @@ from animat.closed_loop.session import Session, read_session, recover_session
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
-from animat.recordings.recording import Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.stimulus import Stimuli
 from fake_culture import FakeCulture
 from test_closed_loop import RANDOM, loop_of
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from animat.errors import InvalidArgument, Mismatch, UnusableData
-from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import fidelity
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import fit_empirical, fit_histogram, silenced
 from animat.neurons.timeline import fit_timeline
-from animat.recordings.protocol import Presentation
+from animat.responses.conditions import Condition
+from animat.responses.responses import Responses
+from animat.stimulation.protocol import Presentation
 
 FREQUENCIES = (5.0, 10.0, 20.0, 40.0, 80.0)
 

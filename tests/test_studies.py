@@ -27,19 +27,19 @@ from scipy.stats import mannwhitneyu
 from animat.animat import Animat
 from animat.cli import main
 from animat.cultures.kinds import recorded_culture
-from animat.cultures.series import recording_name
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
 from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
-from animat.neurons.series import extract_series
 from animat.neurons.timeline import fit_timeline
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
-from animat.recordings.selection import SelectionRule
 from animat.report.html import cell, with_error
+from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
+from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.executor import Event, Executor
 from animat.studies.folder import describe_study, sums_of
@@ -363,7 +363,7 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path) ->
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
         made = make_up_recording(1, patterns=20, channels=channels)
-        replace(made, start_min=minute).save(folder / "recordings" / recording_name(minute))
+        write_nwb(replace(made, start_min=minute), folder / "recordings" / recording_name(minute))
     study = Study(culture=Source("files", files=("recordings",)))
     CulturePictures().run(study, folder, lambda share, words="": None)
     assert sum(bool(row["channel"]) for row in rows(folder / "tables" / "culture-array.csv")) == 24
@@ -377,7 +377,7 @@ def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
 
 def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
     for i, start_min in enumerate((1234567.0, 1234567.25)):
-        make_up_recording(1, start_min=start_min, patterns=5, channels=16).save(tmp_path / f"{i}.nwb")
+        write_nwb(make_up_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
     study = Study(culture=Source("files", files=("0.nwb", "1.nwb")))
     with pytest.raises(InvalidFile, match=r"two that would both be recording_1\.23457e"):
         Record(tmp_path).run(study, tmp_path / "study", lambda share, words: None)
@@ -392,7 +392,7 @@ def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     written = tmp_path / "study" / "study.toml"
     assert read_study(written) == study
     assert written.read_text().startswith("# files: as seen from where the specification lay.")
-    make_up_recording(2, start_min=0.0, patterns=5, channels=16).save(sorted(made.glob("*.nwb"))[0])
+    write_nwb(make_up_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
 
@@ -519,7 +519,7 @@ def test_simulators_are_kept_whole(finished: Path) -> None:
 def test_the_same_recording_is_the_same_file(tmp_path: Path) -> None:
     recording = make_up_recording(1, patterns=5, channels=16)
     for name in ("a.nwb", "b.nwb"):
-        recording.save(tmp_path / name)
+        write_nwb(recording, tmp_path / name)
     assert (tmp_path / "a.nwb").read_bytes() != (tmp_path / "b.nwb").read_bytes()
     for name in ("a.nwb", "b.nwb"):
         settle_identity(tmp_path / name)
@@ -529,7 +529,7 @@ def test_the_same_recording_is_the_same_file(tmp_path: Path) -> None:
     settle_identity(tmp_path / "a.nwb")
     assert (tmp_path / "a.nwb").read_bytes() == settled
     other = make_up_recording(2, patterns=5, channels=16)
-    other.save(tmp_path / "c.nwb")
+    write_nwb(other, tmp_path / "c.nwb")
     settle_identity(tmp_path / "c.nwb")
     ids = [set(re.findall(rb"[0-9a-f]{8}-[0-9a-f]{4}-5[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}", data))
            for data in (settled, (tmp_path / "c.nwb").read_bytes())]  # fmt: skip

@@ -16,10 +16,10 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.statistics import holm
 from animat.mapping import Thresholds
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.reading import read_recordings
+from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.studies.draws import draw_seed
 from animat.studies.evaluating import HEAD, Evaluate

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
-from animat.neurons.series import extract_series
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed
-from animat.recordings.protocol import Order, Protocol
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.responses.series import extract_series
+from animat.stimulation.protocol import Order, Protocol
 from test_inspection import answering
 from test_responses import recording as of_spikes
 
@@ -128,7 +129,7 @@ def test_channels_that_fire_faster_than_neurons_can() -> None:
 
 
 def test_training_on_milliseconds_is_refused_unless_allowed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    in_unit(make_up_recording(1, patterns=20, channels=32), 1e3).save(tmp_path / "a.nwb")
+    write_nwb(in_unit(make_up_recording(1, patterns=20, channels=32), 1e3), tmp_path / "a.nwb")
     train = ["train", "cartpole", "--recordings", str(tmp_path / "a.nwb"), "--policies", "1", "--iterations", "64"]
     train += ["--out", str(tmp_path / "policies")]
     assert main(train) == 1

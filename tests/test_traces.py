@@ -8,7 +8,8 @@ from scipy import signal
 
 from animat.cultures.traces import Traces, record_traces, waveform
 from animat.errors import InvalidArgument
-from animat.recordings.stimulus import PUBLISHED_PULSE, Stimulus
+from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.recordings.protocol import Presentation
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Presentation
 from test_responses import recording
 
 QUICK = ["--policies", "1", "--iterations", "64"]
@@ -52,7 +53,7 @@ def warned(reported: dict[str, Any]) -> set[str]:
 
 def series(folder: Path, *recordings: Recording) -> str:
     for each in recordings:
-        each.save(folder / f"recording_{each.start_min:04.0f}_min.nwb")
+        write_nwb(each, folder / f"recording_{each.start_min:04.0f}_min.nwb")
     return str(folder)
 
 

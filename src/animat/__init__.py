@@ -11,65 +11,92 @@ from typing import TYPE_CHECKING
 from animat.gym import register_environments
 
 if TYPE_CHECKING:
-    from animat.animat import Animat, WithoutNeurons
-    from animat.closed_loop.loop import Loop
-    from animat.cultures.base import Culture
-    from animat.cultures.replay import ReplayCulture
-    from animat.cultures.safety import Limits
-    from animat.cultures.virtual import VirtualCulture
-    from animat.errors import (
-        AnimatError,
-        BudgetSpent,
-        DeviceFailed,
-        InvalidArgument,
-        InvalidFile,
-        LoopEnded,
-        Mismatch,
-        UnsafeStimulus,
-        UnusableData,
-    )
-    from animat.evaluation.optimum import Optimum, best_return, best_returns
-    from animat.evaluation.prospects import prospects
-    from animat.evaluation.statistics import compare
-    from animat.evaluation.table import Evaluation, evaluate
-    from animat.mapping import Linear, Mapping, Thresholds, mapping_named
-    from animat.neurons.conditions import Condition, conditions_named
-    from animat.neurons.inspection import Inspection, inspect_recording
-    from animat.neurons.memory import fit_memory
-    from animat.neurons.responses import Responses, extract_responses
-    from animat.neurons.series import extract_series
-    from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
-    from animat.neurons.timeline import SimulatorTimeline, fit_timeline
-    from animat.reality_gap import Calibration, run_policies
-    from animat.recordings.findings import Finding
-    from animat.recordings.protocol import Presentation, Protocol, read_protocol
-    from animat.recordings.reading import read_recording, read_recordings
-    from animat.recordings.recording import Channels, Recording, Stimuli
-    from animat.recordings.selection import Selection
-    from animat.robots import Cartpole, Navigation, Quantity, Robot, register_robot, robot_named
-    from animat.studies.paper import paper_study
-    from animat.studies.run import run_study
-    from animat.studies.specification import Study
-    from animat.studies.toml import read_study
-    from animat.training.policy import Policy, load_policies
-    from animat.training.sac import SAC
-    from animat.training.specification import Training
-    from animat.training.trainer import train
+    from animat.animat import Animat as Animat
+    from animat.animat import WithoutNeurons as WithoutNeurons
+    from animat.closed_loop.loop import Loop as Loop
+    from animat.cultures.base import Culture as Culture
+    from animat.cultures.replay import ReplayCulture as ReplayCulture
+    from animat.cultures.safety import Limits as Limits
+    from animat.cultures.virtual import VirtualCulture as VirtualCulture
+    from animat.errors import AnimatError as AnimatError
+    from animat.errors import BudgetSpent as BudgetSpent
+    from animat.errors import DeviceFailed as DeviceFailed
+    from animat.errors import InvalidArgument as InvalidArgument
+    from animat.errors import InvalidFile as InvalidFile
+    from animat.errors import LoopEnded as LoopEnded
+    from animat.errors import Mismatch as Mismatch
+    from animat.errors import UnsafeStimulus as UnsafeStimulus
+    from animat.errors import UnusableData as UnusableData
+    from animat.evaluation.optimum import Optimum as Optimum
+    from animat.evaluation.optimum import best_return as best_return
+    from animat.evaluation.optimum import best_returns as best_returns
+    from animat.evaluation.prospects import prospects as prospects
+    from animat.evaluation.statistics import compare as compare
+    from animat.evaluation.table import Evaluation as Evaluation
+    from animat.evaluation.table import evaluate as evaluate
+    from animat.mapping import Linear as Linear
+    from animat.mapping import Mapping as Mapping
+    from animat.mapping import Thresholds as Thresholds
+    from animat.mapping import mapping_named as mapping_named
+    from animat.neurons.memory import fit_memory as fit_memory
+    from animat.neurons.simulator import NeuronSimulator as NeuronSimulator
+    from animat.neurons.simulator import fit_empirical as fit_empirical
+    from animat.neurons.simulator import fit_histogram as fit_histogram
+    from animat.neurons.timeline import SimulatorTimeline as SimulatorTimeline
+    from animat.neurons.timeline import fit_timeline as fit_timeline
+    from animat.reality_gap import Calibration as Calibration
+    from animat.reality_gap import run_policies as run_policies
+    from animat.recordings.findings import Finding as Finding
+    from animat.recordings.formats.nwb import write_nwb as write_nwb
+    from animat.recordings.reading import read_recording as read_recording
+    from animat.recordings.reading import read_recordings as read_recordings
+    from animat.recordings.recording import Channels as Channels
+    from animat.recordings.recording import Recording as Recording
+    from animat.responses.conditions import Condition as Condition
+    from animat.responses.conditions import conditions_named as conditions_named
+    from animat.responses.extraction import extract_responses as extract_responses
+    from animat.responses.inspection import Inspection as Inspection
+    from animat.responses.inspection import inspect_recording as inspect_recording
+    from animat.responses.responses import Responses as Responses
+    from animat.responses.series import extract_series as extract_series
+    from animat.robots import Cartpole as Cartpole
+    from animat.robots import Navigation as Navigation
+    from animat.robots import Quantity as Quantity
+    from animat.robots import Robot as Robot
+    from animat.robots import register_robot as register_robot
+    from animat.robots import robot_named as robot_named
+    from animat.stimulation.protocol import Presentation as Presentation
+    from animat.stimulation.protocol import Protocol as Protocol
+    from animat.stimulation.protocol import read_protocol as read_protocol
+    from animat.stimulation.selection import Selection as Selection
+    from animat.stimulation.stimulus import Stimuli as Stimuli
+    from animat.studies.paper import paper_study as paper_study
+    from animat.studies.run import run_study as run_study
+    from animat.studies.specification import Study as Study
+    from animat.studies.toml import read_study as read_study
+    from animat.training.policy import Policy as Policy
+    from animat.training.policy import load_policies as load_policies
+    from animat.training.sac import SAC as SAC
+    from animat.training.specification import Training as Training
+    from animat.training.trainer import train as train
 
 _WHERE = {
-    "recordings.recording": ("Recording", "Channels", "Stimuli"),
-    "recordings.protocol": ("Presentation", "Protocol", "read_protocol"),
-    "recordings.selection": ("Selection",),
+    "recordings.recording": ("Recording", "Channels"),
+    "stimulation.stimulus": ("Stimuli",),
+    "stimulation.protocol": ("Presentation", "Protocol", "read_protocol"),
+    "stimulation.selection": ("Selection",),
     "recordings.findings": ("Finding",),
     "recordings.reading": ("read_recording", "read_recordings"),
+    "recordings.formats.nwb": ("write_nwb",),
     "cultures.base": ("Culture",),
     "cultures.safety": ("Limits",),
     "cultures.virtual": ("VirtualCulture",),
     "cultures.replay": ("ReplayCulture",),
-    "neurons.conditions": ("Condition", "conditions_named"),
-    "neurons.responses": ("Responses", "extract_responses"),
-    "neurons.series": ("extract_series",),
-    "neurons.inspection": ("Inspection", "inspect_recording"),
+    "responses.conditions": ("Condition", "conditions_named"),
+    "responses.responses": ("Responses",),
+    "responses.extraction": ("extract_responses",),
+    "responses.series": ("extract_series",),
+    "responses.inspection": ("Inspection", "inspect_recording"),
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
@@ -102,77 +129,10 @@ _WHERE = {
         "DeviceFailed",
     ),
 }
+"""The modules of the public names, in the order of the story."""
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
-__all__ = [  # noqa: RUF022  (the order of the story)
-    "Recording",
-    "Channels",
-    "Stimuli",
-    "Presentation",
-    "Protocol",
-    "read_protocol",
-    "Selection",
-    "Finding",
-    "read_recording",
-    "read_recordings",
-    "Culture",
-    "Limits",
-    "VirtualCulture",
-    "ReplayCulture",
-    "Condition",
-    "conditions_named",
-    "Responses",
-    "extract_responses",
-    "extract_series",
-    "Inspection",
-    "inspect_recording",
-    "NeuronSimulator",
-    "fit_histogram",
-    "fit_empirical",
-    "fit_memory",
-    "SimulatorTimeline",
-    "fit_timeline",
-    "Mapping",
-    "Thresholds",
-    "Linear",
-    "mapping_named",
-    "Robot",
-    "Quantity",
-    "Cartpole",
-    "Navigation",
-    "register_robot",
-    "robot_named",
-    "Animat",
-    "WithoutNeurons",
-    "SAC",
-    "Training",
-    "train",
-    "Policy",
-    "load_policies",
-    "Evaluation",
-    "evaluate",
-    "Optimum",
-    "best_return",
-    "best_returns",
-    "prospects",
-    "compare",
-    "Loop",
-    "Calibration",
-    "run_policies",
-    "Study",
-    "paper_study",
-    "read_study",
-    "run_study",
-    "AnimatError",
-    "InvalidArgument",
-    "InvalidFile",
-    "UnusableData",
-    "Mismatch",
-    "UnsafeStimulus",
-    "BudgetSpent",
-    "LoopEnded",
-    "DeviceFailed",
-]
+__all__ = list(_MODULE_OF)
 
 # Gymnasium has known plugins only by their import since 1.0. Nothing of an environment is loaded by this.
 register_environments()

@@ -20,6 +20,10 @@ RobotState = TypeVar("RobotState")
 
 Delivery = Literal["chosen", "shuffled"]
 
+Uniforms = Float[Array, " noise"]
+Number = Float[Array, ""]
+Actuated = tuple[Array, Answer, Number]
+
 
 class EpisodeState(NamedTuple):
     """Where an episode stands: the robot's state, the iterations done, and what the neurons remember.
@@ -32,7 +36,7 @@ class EpisodeState(NamedTuple):
 
     robot: Any
     iteration: Int[Array, ""]
-    past: Float[Array, ""]
+    past: Number
 
 
 class Outcome(NamedTuple):
@@ -49,12 +53,12 @@ class Outcome(NamedTuple):
     """
 
     state: EpisodeState
-    reward: Float[Array, ""]
+    reward: Number
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
     delivered: Array
-    rate_hz: Float[Array, ""]
-    command: Float[Array, ""]
+    rate_hz: Number
+    command: Number
 
 
 class Environment(abc.ABC, Generic[RobotState]):
@@ -76,13 +80,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         """How many uniforms in [0, 1) one iteration consumes."""
 
     @abc.abstractmethod
-    def actuate(
-        self,
-        uniforms: Float[Array, " noise"],
-        past: Float[Array, ""],
-        action: Array,
-        simulator: NeuronSimulator | None,
-    ) -> tuple[Array, Answer, Float[Array, ""]]:
+    def actuate(self, uniforms: Uniforms, past: Number, action: Array, simulator: NeuronSimulator | None) -> Actuated:
         """Turn an action into (what was delivered, the answer after a past, the command in [-1, 1])."""
 
     @property
@@ -108,7 +106,7 @@ class Environment(abc.ABC, Generic[RobotState]):
     @final
     def advance(
         self,
-        uniforms: Float[Array, " noise"],
+        uniforms: Uniforms,
         state: EpisodeState,
         action: Array,
         simulator: NeuronSimulator | None,
@@ -153,13 +151,7 @@ class Animat(Environment[RobotState]):
     def noise_size(self) -> int:
         return self.robot.noise_size + 2
 
-    def actuate(
-        self,
-        uniforms: Float[Array, " noise"],
-        past: Float[Array, ""],
-        action: Array,
-        simulator: NeuronSimulator | None,
-    ) -> tuple[Array, Answer, Float[Array, ""]]:
+    def actuate(self, uniforms: Uniforms, past: Number, action: Array, simulator: NeuronSimulator | None) -> Actuated:
         if simulator is None:
             raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
         if self.delivery == "shuffled":
@@ -188,12 +180,6 @@ class WithoutNeurons(Environment[RobotState]):
     def noise_size(self) -> int:
         return self.robot.noise_size
 
-    def actuate(
-        self,
-        uniforms: Float[Array, " noise"],
-        past: Float[Array, ""],
-        action: Array,
-        simulator: NeuronSimulator | None,
-    ) -> tuple[Array, Answer, Float[Array, ""]]:
+    def actuate(self, uniforms: Uniforms, past: Number, action: Array, simulator: NeuronSimulator | None) -> Actuated:
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
         return action, Answer(jnp.float32(jnp.nan), past), jnp.clip(command, -1.0, 1.0)

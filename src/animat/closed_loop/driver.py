@@ -23,10 +23,10 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.errors import AnimatError, BudgetSpent, UnsafeStimulus
-from animat.neurons.windows import read_windows
-from animat.recordings.recording import UNKNOWN
-from animat.recordings.schedule import TICK_S, on_ticks
-from animat.recordings.stimulus import Stimulus
+from animat.responses.windows import read_windows
+from animat.stimulation.schedule import TICK_S, on_ticks
+from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 
 
 class Stop(Exception):

@@ -12,10 +12,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, shown
-from animat.recordings.protocol import Presentation
 from animat.recordings.recording import Channels
 from animat.robots.base import Robot
 from animat.robots.registry import robot_from_dict
+from animat.stimulation.protocol import Presentation
 
 FORMAT = "animat closed-loop session 1"
 

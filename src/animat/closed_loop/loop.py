@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.mapping import N_PERCENTILES, Mapping
-from animat.neurons.conditions import Condition
-from animat.neurons.windows import DEFAULT_WINDOW_MS, check_window
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
-from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse
+from animat.responses.conditions import Condition
+from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.robots.registry import robot_to_dict
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
 OnBurst = Literal["use", "repeat", "skip"]
 OnLate = Literal["continue", "stop"]

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from animat.recordings.recording import UNKNOWN, Stimuli
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 
 class Pulses:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Channels
-from animat.recordings.stimulus import Stimulus
+from animat.stimulation.stimulus import Stimulus
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,8 +88,3 @@ class Ending:
 
     by: EndedBy
     sentence: str
-
-    @property
-    def is_fault(self) -> bool:
-        """Whether something went wrong that nobody asked for."""
-        return self.by not in ("plan", "budget", "person")

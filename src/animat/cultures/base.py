@@ -17,11 +17,12 @@ from animat.cultures.safety import Admitted
 from animat.cultures.sealing import refuse_overrides
 from animat.errors import AnimatError, InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.plain import number, seconds
-from animat.recordings.protocol import Presentation, Protocol
 from animat.recordings.recording import Channels, Recording
-from animat.recordings.schedule import Schedule, make_schedule
-from animat.recordings.stimulus import Pulse, Stimulus, plain_stimuli
+from animat.stimulation.plain import number, seconds
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.pulse import Pulse
+from animat.stimulation.schedule import Schedule, make_schedule
+from animat.stimulation.stimulus import Stimulus, plain_stimuli
 
 
 class Culture(Openable):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from animat.errors import BudgetSpent, InvalidArgument
-from animat.recordings.plain import whole_number
-from animat.recordings.stimulus import Stimulus
+from animat.stimulation.plain import whole_number
+from animat.stimulation.stimulus import Stimulus
 
 
 @dataclass(frozen=True)

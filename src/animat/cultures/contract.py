@@ -21,9 +21,10 @@ from animat.cultures.base import Culture
 from animat.cultures.observed import Observed
 from animat.cultures.safety import Admitted
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.protocol import Protocol
-from animat.recordings.recording import UNKNOWN
-from animat.recordings.stimulus import PUBLISHED_PULSE, Phase, Pulse, Stimulus
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
+from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 
 
 class CultureContract(abc.ABC):

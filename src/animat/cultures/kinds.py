@@ -11,7 +11,7 @@ from animat.cultures.base import Culture
 from animat.errors import InvalidArgument
 from animat.progress import Progress
 from animat.recordings.recording import Recording
-from animat.recordings.stimulus import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
 
 CultureKind = Literal["virtual", "replay", "cl1", "maxone"]
 
@@ -61,12 +61,12 @@ def culture_of(
 
         return ReplayCulture(recordings, seed=seed)
     if kind == "cl1":
-        from animat.cultures.cl1 import CL1Culture
+        from animat.cultures.devices.cl1 import CL1Culture
 
         return CL1Culture(seed=seed)
     if kind == "maxone" and selection is not None:
-        from animat.cultures.maxone import MaxOneCulture
-        from animat.recordings.selection import Selection
+        from animat.cultures.devices.maxone import MaxOneCulture
+        from animat.stimulation.selection import Selection
 
         return MaxOneCulture(Selection.load(selection))
     raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")
@@ -75,7 +75,7 @@ def culture_of(
 def pulse_for(kind: CultureKind) -> Pulse:
     """The pulse that a kind of culture is given where none is asked for."""
     if kind == "cl1":
-        from animat.cultures.cl1 import CL1_PULSE
+        from animat.cultures.devices.cl1 import CL1_PULSE
 
         return CL1_PULSE
     # The published pulse as printed is not balanced: a living culture is given one that is.

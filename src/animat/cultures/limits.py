@@ -9,8 +9,8 @@ from math import floor, isfinite
 from typing import Any
 
 from animat.errors import InvalidArgument
-from animat.recordings.plain import number, whole_number
-from animat.recordings.stimulus import Kind, Phase, Pulse
+from animat.stimulation.plain import number, whole_number
+from animat.stimulation.pulse import Kind, Phase, Pulse
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from animat.cultures.base import Culture
-from animat.cultures.same_patterns import other_patterns
-from animat.cultures.series import PartOfSeries, check_interval, difference_from, recording_name
+from animat.cultures.same_culture import other_patterns
+from animat.cultures.series import PartOfSeries, check_interval, difference_from
 from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Progress, Silent
-from animat.recordings.protocol import Protocol
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Protocol
 from animat.writing import alone_in
 
 _MAY_DIFFER = ("stimulation_units",)
@@ -65,23 +66,21 @@ def record_living_series(
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
     _check(protocol, sessions, interval_min, seed)
+    folder, progress = Path(folder), progress or Silent()
     # Seen before it is touched: somebody else's folder stays as it is.
-    _beginning_s(culture, protocol, _files(Path(folder), sessions, interval_min), 60 * interval_min)
+    _beginning_s(culture, protocol, _files(folder, sessions, interval_min), 60 * interval_min)
     with alone_in(folder):
-        return record_in_held_folder(
-            culture, protocol, folder, sessions=sessions, interval_min=interval_min, seed=seed, progress=progress
-        )
+        return record_in_held_folder(culture, protocol, folder, sessions, interval_min, seed, progress)
 
 
 def record_in_held_folder(
     culture: Culture,
     protocol: Protocol,
-    folder: str | os.PathLike[str],
-    *,
-    sessions: int = 15,
-    interval_min: float = 10.0,
-    seed: int = 1,
-    progress: Progress | None = None,
+    folder: Path,
+    sessions: int,
+    interval_min: float,
+    seed: int,
+    progress: Progress,
 ) -> LivingSeries:
     """Do as `record_living_series` does, in a folder that the caller holds (`animat.writing.alone_in`).
 
@@ -89,7 +88,6 @@ def record_in_held_folder(
     are those of `record_living_series`.
     """
     _check(protocol, sessions, interval_min, seed)
-    folder, progress = Path(folder), progress or Silent()
     files = _files(folder, sessions, interval_min)
     missed_min = []
     # Now that nobody writes: another run may have ended just before the folder was held.
@@ -102,7 +100,7 @@ def record_in_held_folder(
                 continue
             culture.rest(max(0.0, due_s - culture.now_s))
             part = PartOfSeries(progress, session, sessions, file.name)
-            culture.record(protocol, seed * 10_000 + session, part).save(file)
+            write_nwb(culture.record(protocol, seed * 10_000 + session, part), file)
         progress.update(session + 1, sessions, file.name)
     return LivingSeries([file for file in files if file.exists()], missed_min)
 

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
-from animat.recordings.schedule import Schedule
-from animat.recordings.stimulus import Stimulus
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.schedule import Schedule
+from animat.stimulation.stimulus import Stimuli, Stimulus
+from animat.tables import UNKNOWN
 
 
 class Spikes(NamedTuple):

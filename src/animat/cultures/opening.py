@@ -18,7 +18,7 @@ from animat.cultures.limits import Limits, plain_limits
 from animat.cultures.safety import Guard
 from animat.cultures.turns import Turns
 from animat.errors import InvalidArgument
-from animat.recordings.plain import seconds
+from animat.stimulation.plain import seconds
 
 
 class Openable(abc.ABC):

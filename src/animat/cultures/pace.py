@@ -8,7 +8,7 @@ from dataclasses import replace
 from animat.cultures.history import History
 from animat.cultures.safety import Guard, Limits
 from animat.errors import UnsafeStimulus
-from animat.recordings.stimulus import Stimulus
+from animat.stimulation.stimulus import Stimulus
 
 LATER_S = 0.001
 """How much later stimuli are tried when they would come too soon after what was delivered before."""

@@ -12,8 +12,9 @@ from animat.cultures.base import Culture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData
-from animat.recordings.recording import UNKNOWN, Channels, Recording
-from animat.recordings.stimulus import Stimulus
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 
 NS = 1_000_000_000
 REACH_S = 1.0

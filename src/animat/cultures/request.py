@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from animat.errors import InvalidArgument
-from animat.recordings.plain import seconds
-from animat.recordings.stimulus import Stimulus, plain_stimuli
+from animat.stimulation.plain import seconds
+from animat.stimulation.stimulus import Stimulus, plain_stimuli
 
 
 class Request(NamedTuple):

@@ -10,8 +10,9 @@ from typing import Final, NoReturn
 from animat.cultures.history import NS, Event, History
 from animat.cultures.limits import SIMULATED_LIMITS, Limits, delivered_pulse, is_multiple, plain_limits, sign_of
 from animat.errors import InvalidArgument, UnsafeStimulus
-from animat.recordings.plain import seconds
-from animat.recordings.stimulus import Pulse, Stimulus, plain_stimuli
+from animat.stimulation.plain import seconds
+from animat.stimulation.pulse import Pulse
+from animat.stimulation.stimulus import Stimulus, plain_stimuli
 
 __all__ = ["SIMULATED_LIMITS", "Admitted", "Guard", "Limits"]
 

@@ -14,21 +14,17 @@ from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.progress import Progress, Silent
-from animat.recordings.protocol import Protocol
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.schedule import make_schedule
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.schedule import make_schedule
 from animat.writing import alone_in, clear_away
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
 LONGEST_MIN = 365 * 24 * 60.0
 """From the first recording to the last: a virtual culture's clock goes no further."""
-
-
-def recording_name(start_min: float) -> str:
-    """The file name of a recording that starts at a minute of the culture's clock."""
-    return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
 
 
 def record_virtual_series(
@@ -111,7 +107,7 @@ def _record(
             if files[session].exists():
                 _expect_equal(files[session], recording)
             else:
-                recording.save(files[session])
+                write_nwb(recording, files[session])
             # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
             culture.save_state(folder / STATE_FILE, sessions=session + 1)
             progress.update(session + 1, sessions, files[session].name)

@@ -12,7 +12,7 @@ from animat.cultures.observed import Spikes
 from animat.cultures.virtual import VirtualCulture
 from animat.cultures.visibility import NOISE_UV
 from animat.errors import InvalidArgument
-from animat.recordings.stimulus import Stimulus
+from animat.stimulation.stimulus import Stimulus
 
 BAND_HZ = (100.0, 3000.0)
 SHAPE_MS = (1.0, 2.5)

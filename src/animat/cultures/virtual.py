@@ -16,11 +16,12 @@ from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.array import MAXONE
 from animat.recordings.recording import Channels
-from animat.recordings.scan import ScannedActivity
-from animat.recordings.selection import Selection, SelectionRule, select_electrodes
-from animat.recordings.stimulus import PUBLISHED_PULSE, Pulse, Stimulus
+from animat.stimulation.array import MAXONE
+from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.stimulation.scan import ScannedActivity
+from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
+from animat.stimulation.stimulus import Stimulus
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -196,9 +197,11 @@ class VirtualCulture(Culture):
         Raises:
             InvalidFile: if it cannot be written.
         """
-        from animat.cultures.virtual_state import write_state
+        from animat.cultures.virtual_state import VirtualState, write_state
 
-        write_state(self, path, remarks)
+        held = self._held_ns, self._held_neuron
+        state = VirtualState(self.selection, self._zero_ns, self._now_ns, *held, self.tissue.snapshot(), remarks)
+        write_state(path, self.settings, state)
 
     def restore_state(self, path: str | os.PathLike[str]) -> dict[str, int]:
         """Make this culture, not yet opened, what another of the same seed and settings was; returns the remarks.
@@ -212,7 +215,14 @@ class VirtualCulture(Culture):
 
         if self.is_open:
             raise InvalidArgument("culture: expected a closed one to restore, got one that is open")
-        return read_state(self, path)
+        tissue, visibility = self._grown()
+        state = read_state(path, self.settings, tissue)
+        # Only now: a culture that could not be restored is what it was.
+        self._have(tissue, visibility)
+        self._selection = state.selection
+        self._zero_ns, self._now_ns = state.zero_ns, state.now_ns
+        self._held_ns, self._held_neuron = state.held_ns, state.held_neuron
+        return dict(state.remarks)
 
     def _open(self) -> None:
         if self._tissue is None:
@@ -260,7 +270,7 @@ class VirtualCulture(Culture):
     def _look(self) -> None:
         """Which channels see each neuron, neuron by neuron."""
         selection = self.selection
-        self._channels = selection.channels
+        self._channels = Channels.on(selection.array, selection.recording)
         pairs = self._visibility.pairs_of(selection.recording)
         order = np.lexsort((pairs.electrode, pairs.neuron))
         self._n_seen_by = np.bincount(pairs.neuron, minlength=len(self.tissue.x_um))

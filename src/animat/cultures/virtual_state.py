@@ -6,19 +6,28 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
+from animat.cultures.tissue import Tissue
+from animat.cultures.tissue.coupling import Kicks
+from animat.cultures.tissue.snapshot import (
+    LONGEST_NS,
+    Snapshot,
+    expect_array,
+    expect_rising,
+    expect_whole,
+    expect_within,
+)
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file
-from animat.recordings.array import MAXONE
-from animat.recordings.selection import Selection
+from animat.stimulation.array import MAXONE
+from animat.stimulation.selection import Selection
 from animat.writing import written_whole
-
-if TYPE_CHECKING:
-    from animat.cultures.virtual import VirtualCulture
 
 FORMAT = "animat virtual culture state 1"
 _HELD = ("held_ns", "held_neuron")
@@ -28,18 +37,39 @@ _AHEAD_NS = 1_000_000_000
 """The tissue is ahead of the culture's clock by a step for each pulse that came in the middle of one."""
 
 
-def write_state(culture: VirtualCulture, path: str | os.PathLike[str], remarks: Mapping[str, int]) -> None:
-    """Write the state; see `VirtualCulture.save_state`."""
-    snapshot = culture.tissue.snapshot()
+@dataclass(frozen=True, eq=False)
+class VirtualState:
+    """All that decides what a virtual culture of known settings does next.
+
+    Attributes:
+        selection: the electrodes in use.
+        zero_ns, now_ns: on the tissue's clock, when the culture's clock was 0 and where it is.
+        held_ns, held_neuron: spikes of the step that the clock is in the middle of, on the tissue's clock.
+        snapshot: of the tissue.
+        remarks: whole numbers kept with it.
+    """
+
+    selection: Selection
+    zero_ns: int
+    now_ns: int
+    held_ns: Int64[np.ndarray, " held"]
+    held_neuron: Int64[np.ndarray, " held"]
+    snapshot: Snapshot
+    remarks: Mapping[str, int]
+
+
+def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state: VirtualState) -> None:
+    """Write the state of a culture of these settings; see `VirtualCulture.save_state`."""
+    snapshot = state.snapshot
     head = {
         "format": FORMAT,
-        "culture": culture.settings,
-        "selection": culture.selection.to_dict(),
-        "zero_ns": culture._zero_ns,
-        "now_ns": culture._now_ns,
+        "culture": dict(settings),
+        "selection": state.selection.to_dict(),
+        "zero_ns": state.zero_ns,
+        "now_ns": state.now_ns,
         "tissue_now_ns": snapshot.now_ns,
         "tissue_step": snapshot.step,
-        "remarks": dict(remarks),
+        "remarks": dict(state.remarks),
     }
     arrays = {f"state_{name}": values for name, values in snapshot.state._asdict().items()}
     arrays |= {f"kicks_{name}": values for name, values in snapshot.kicks._asdict().items()}
@@ -47,31 +77,20 @@ def write_state(culture: VirtualCulture, path: str | os.PathLike[str], remarks: 
         np.savez_compressed(
             file,
             head=np.array(json.dumps(head)),
-            held_ns=culture._held_ns,
-            held_neuron=culture._held_neuron,
+            held_ns=state.held_ns,
+            held_neuron=state.held_neuron,
             **arrays,
         )
 
 
-def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[str, int]:
-    """Put a state into a culture; see `VirtualCulture.restore_state`."""
-    from animat.cultures.tissue.coupling import Kicks
-    from animat.cultures.tissue.snapshot import (
-        LONGEST_NS,
-        Snapshot,
-        expect_array,
-        expect_rising,
-        expect_whole,
-        expect_within,
-    )
-
+def read_state(path: str | os.PathLike[str], settings: Mapping[str, str], tissue: Tissue) -> VirtualState:
+    """Read the state of a culture of these settings into its fresh tissue; see `VirtualCulture.restore_state`."""
     path = expect_plain_file(path)
-    tissue, visibility = culture._grown()
     fresh = tissue.snapshot()
     lengths = {f"state_{name}": values.nbytes for name, values in fresh.state._asdict().items()}
     lengths |= dict.fromkeys((*(f"kicks_{name}" for name in Kicks._fields), *_HELD, "head"), _MOST_BYTES)
     head, arrays = _read(path, lengths)
-    for name, value in culture.settings.items():
+    for name, value in settings.items():
         if head["culture"].get(name) != value:
             again = "remove it to begin anew, or use the same settings"
             if name == "tissue_revision":
@@ -111,12 +130,7 @@ def read_state(culture: VirtualCulture, path: str | os.PathLike[str]) -> dict[st
             f"{path}: expected the state of a virtual culture of this version, got one that cannot be ({error}): "
             "remove it to begin anew"
         ) from error
-    # Only now: a culture that could not be restored is what it was.
-    culture._have(tissue, visibility)
-    culture._selection = selection
-    culture._zero_ns, culture._now_ns = zero_ns, now_ns
-    culture._held_ns, culture._held_neuron = held_ns, held_neuron
-    return dict(remarks)
+    return VirtualState(selection, zero_ns, now_ns, held_ns, held_neuron, snapshot, remarks)
 
 
 def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.recordings.array import ElectrodeArray
-from animat.recordings.scan import ScannedActivity
+from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.scan import ScannedActivity
 
 REACH_UM = 25.0
 """An electrode sees every neuron within this distance, and none beyond."""

@@ -12,13 +12,13 @@ from animat.animat import Animat
 from animat.errors import UnusableData
 from animat.evaluation.optimum import Optimum, rough_values
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.neurons.conditions import Condition
 from animat.neurons.kinds import fit_simulator
-from animat.neurons.quality import FEW_SAMPLES
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
+from animat.responses.conditions import Condition
+from animat.responses.quality.responses import FEW_SAMPLES
+from animat.responses.responses import Responses
 from animat.robots.grid import Grid, grid_for
 
 RESAMPLES = 39

@@ -23,17 +23,15 @@ from animat.robots.base import MOST_AT_ONCE
 from animat.training.policy import Policy
 from animat.training.sac import Layer, Network, draw_action, forward
 
+Seen = Float[Array, "episodes observations"]
+Uniforms = Float[Array, " episodes"]
+
 
 class Actor(abc.ABC):
     """Whoever picks the actions of episodes: a pytree, so that several are run side by side."""
 
     @abc.abstractmethod
-    def act(
-        self,
-        environment: Environment[Any],
-        observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, " episodes"],
-    ) -> Array:
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         """An action for each observation (scaled), from uniforms in [0, 1); shape (episodes,)."""
 
 
@@ -53,12 +51,7 @@ class Networks(Actor):
     scales: Float[Array, "*actors observations"]
     greedy: bool = False
 
-    def act(
-        self,
-        environment: Environment[Any],
-        observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, " episodes"],
-    ) -> Array:
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         # Exactly 1 on the robot it was trained on.
         observation = observation * (environment.scales / self.scales)
         if not self.greedy:
@@ -73,12 +66,7 @@ class Networks(Actor):
 class Uniform(Actor):
     """Every action equally likely, whatever is observed: the random control."""
 
-    def act(
-        self,
-        environment: Environment[Any],
-        observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, " episodes"],
-    ) -> Array:
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         if environment.n_actions is None:
             return 2.0 * uniforms - 1.0
         return jnp.minimum((uniforms * environment.n_actions).astype(jnp.int32), environment.n_actions - 1)
@@ -92,12 +80,7 @@ class Constant(Actor):
 
     action: Int[Array, "*actors"]
 
-    def act(
-        self,
-        environment: Environment[Any],
-        observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, " episodes"],
-    ) -> Array:
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         return jnp.broadcast_to(self.action, uniforms.shape)
 
 

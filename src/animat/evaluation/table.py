@@ -23,9 +23,9 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
 from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
 
 
@@ -135,7 +135,7 @@ class Evaluation:
             "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
-            "findings": [{"name": f.name, "severity": f.severity, "sentence": f.sentence} for f in self.findings],
+            "findings": [finding.to_dict() for finding in self.findings],
         }
 
     def to_text(self) -> str:

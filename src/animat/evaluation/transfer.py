@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
+from animat.stimulation.protocol import Presentation
 
 UNKNOWN = "unknown-presentation"
 

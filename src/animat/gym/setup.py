@@ -14,15 +14,15 @@ from gymnasium import spaces
 from animat.animat import Animat, Delivery
 from animat.errors import InvalidArgument
 from animat.mapping import Mapping, mapping_named
-from animat.neurons.conditions import conditions_named
 from animat.neurons.kinds import Kind
 from animat.neurons.made_up import LABELS, made_up_simulator
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
-from animat.neurons.windows import DEFAULT_WINDOW_MS
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
+from animat.responses.conditions import conditions_named
+from animat.responses.series import extract_series
+from animat.responses.windows import DEFAULT_WINDOW_MS
 from animat.robots.registry import robot_named
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]

@@ -18,9 +18,9 @@ from animat.closed_loop.running import check_episodes
 from animat.closed_loop.session import expect_no_file
 from animat.errors import InvalidArgument, Mismatch
 from animat.mapping import N_PERCENTILES
-from animat.neurons.conditions import Condition
-from animat.recordings.protocol import Protocol
-from animat.recordings.schedule import make_schedule
+from animat.responses.conditions import Condition
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.schedule import make_schedule
 from animat.training.specification import Training
 from animat.training.trainer import expect_trainable
 from animat.writing import LOCK

@@ -6,8 +6,8 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.errors import AnimatError
 from animat.progress import Progress, Silent
-from animat.recordings.protocol import Protocol
 from animat.recordings.recording import Recording
+from animat.stimulation.protocol import Protocol
 
 
 def record_within(

@@ -18,7 +18,7 @@ import jax
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.series import STATE_FILE, recording_name
+from animat.cultures.series import STATE_FILE
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.exchange import Exchange
@@ -26,13 +26,14 @@ from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable,
 from animat.live.recording import record_within
 from animat.live.trainers import Trainers
 from animat.neurons.kinds import Kind
-from animat.neurons.responses import Responses
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress, Silent
 from animat.reality_gap import Calibration, RealityGap, run_policies
-from animat.recordings.protocol import Protocol
+from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.responses.responses import Responses
+from animat.responses.series import extract_series
+from animat.stimulation.protocol import Protocol
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
 from animat.training.specification import Training
@@ -262,7 +263,7 @@ class _Run:
         seed = self._training.seed * 10_000 + number
         recording = record_within(self.account, self._culture, self._protocol, seed)
         file = self.folder / RECORDINGS / recording_name(round(recording.start_min, 3))
-        recording.save(file)
+        write_nwb(recording, file)
         self.files.append(file)
         self.keep_state()
         try:

@@ -1,1 +1,1 @@
-"""What stimulation does: responses, bursts set apart, and neuron simulators made of them."""
+"""Neuron simulators: what a culture answers, drawn from its responses, and their timeline over recordings."""

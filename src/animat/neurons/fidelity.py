@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
 from animat.recordings.findings import Finding
+from animat.responses.responses import Responses
 
 LARGEST_LOSS = 0.05
 """A difference in P(x >= P50) between data and simulator above which `findings` warns."""

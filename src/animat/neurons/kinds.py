@@ -6,8 +6,8 @@ from typing import Literal, get_args
 
 from animat.errors import InvalidArgument
 from animat.neurons.memory import Memory, fit_memory
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
+from animat.responses.responses import Responses
 
 Kind = Literal["histogram", "empirical", "memory"]
 """A distribution in bins (the paper); a measured value; one that was measured after a past like the present one."""

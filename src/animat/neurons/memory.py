@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
 from animat.brief import briefly
-from animat.neurons.conditions import NO_CONDITION
-from animat.neurons.responses import Presented, Responses
 from animat.neurons.simulator import AT_FIRST, Answer, EmpiricalSimulator, Stored, fit_empirical
+from animat.responses.conditions import NO_CONDITION
+from animat.responses.responses import Presented, Responses
 
 
 class Memory(NamedTuple):

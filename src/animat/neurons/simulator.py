@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
 from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
-from animat.neurons.responses import Responses
+from animat.responses.responses import Responses
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it is on its way to another process."""

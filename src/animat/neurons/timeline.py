@@ -13,13 +13,13 @@ from jaxtyping import Float64
 
 from animat.brief import briefly
 from animat.errors import InvalidArgument, Mismatch
-from animat.neurons.conditions import Condition
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
+from animat.responses.conditions import Condition
+from animat.responses.responses import Responses
+from animat.stimulation.protocol import Presentation
 
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",

@@ -9,15 +9,15 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.conditions import Condition
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.median_drift import MedianDrift, median_drift
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.responses import Responses
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
+from animat.responses.conditions import Condition
+from animat.responses.median_drift import MedianDrift, median_drift
+from animat.responses.responses import Responses
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import FITTED, Policy
 
 REDRAWN = 100

@@ -10,8 +10,8 @@ from jaxtyping import Float64
 
 from animat.closed_loop.loop import Loop
 from animat.cultures.budget import Account
-from animat.neurons.drift_quality import LARGE
 from animat.reality_gap.calibration import Calibration
+from animat.responses.quality.drift import LARGE
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from animat.neurons.conditions import Condition
-from animat.neurons.memory_quality import memory_findings
-from animat.neurons.quality import FEW_SAMPLES
 from animat.reality_gap.answered import Answered
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Predicted
 from animat.recordings.findings import Finding
+from animat.responses.conditions import Condition
+from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.responses import FEW_SAMPLES
 
 LEVEL = 0.01
 """How often each check that tests something names a reason that is none, at most."""

@@ -179,13 +179,13 @@ class RealityGap:
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
             "verdict": self.verdict(),
-            "reasons": [_plain(reason) for reason in self.reasons],
+            "reasons": [reason.to_dict() for reason in self.reasons],
             "planned_min": self.outlook.planned_min,
             "outlook": str(self.outlook),
             "session": self.session.to_dict(),
             "folder": str(self.session.folder),
             "budget": self.account.to_dict(),
-            "findings": [_plain(finding) for finding in self.findings],
+            "findings": [finding.to_dict() for finding in self.findings],
         }
 
     def to_text(self) -> str:
@@ -229,10 +229,6 @@ class RealityGap:
         if self.session.left_out:
             lines.append(f"  left out: {in_words(self.session.left_out)}")
         return "\n".join(lines)
-
-
-def _plain(finding: Finding) -> dict[str, Any]:
-    return {"name": finding.name, "severity": finding.severity, "sentence": finding.sentence}
 
 
 def _more_or_less(gap: float) -> str:

@@ -28,8 +28,9 @@ import numpy as np
 
 from animat import errors
 from animat.errors import AnimatError, InvalidFile
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
 
 PROCESSOR_S, PROCESSOR_S_PER_MB = 2.0, 0.2
 """Processor time that a file may take: for any, and more by its size."""

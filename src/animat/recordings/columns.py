@@ -12,8 +12,10 @@ from jaxtyping import Float64, Int64
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.noticed import as_provenance
-from animat.recordings.protocol import Order, Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli, expect_times
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Order, Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN, expect_times
 
 Column = np.ndarray[Any, Any]
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from animat.errors import InvalidArgument
 from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 
@@ -138,5 +139,5 @@ def convert_recording(
     unsaid = {"sex": "U"} if "subject_id" in words else {}
     start_min = recording.start_min if start_min is None else start_min
     recording = replace(recording, provenance={**unsaid, **recording.provenance, **words}, start_min=float(start_min))
-    recording.save(out)
+    write_nwb(recording, out)
     return recording

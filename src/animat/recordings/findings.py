@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 Severity = Literal["note", "warning", "refuse"]
 
@@ -27,6 +27,10 @@ class Finding:
     sentence: str
     value: float | None = None
     at_min: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What it says, as plain data."""
+        return {"name": self.name, "severity": self.severity, "sentence": self.sentence}
 
 
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:

@@ -24,10 +24,12 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, Mismatch, shown
 from animat.progress import Progress, Silent
-from animat.recordings.array import MAXONE
-from animat.recordings.protocol import Presentation
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.recording import Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.array import MAXONE
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
 
 WINDOW_S = (0.002, 0.010)
 """In which a response's spikes lie; they keep 0.2 ms away from its ends, so that rounding cannot move one out."""
@@ -155,9 +157,7 @@ class MadeUpCulture:
         while len(patterns) < self.patterns:
             chosen = rng.choice(stimulating, PATTERN_ELECTRODES, replace=False)
             patterns[tuple(sorted(chosen.tolist()))] = None
-        x_um, y_um = MAXONE.position_um(electrode)
-        channels = Channels(label=np.arange(self.channels).astype(np.str_), electrode=electrode, x_um=x_um, y_um=y_um)
-        return channels, np.array(list(patterns), dtype=np.int64)
+        return Channels.on(MAXONE, electrode), np.array(list(patterns), dtype=np.int64)
 
     def _protocol(
         self, rng: np.random.Generator
@@ -263,7 +263,7 @@ def write_made_up_series(
     files = []
     for session in range(sessions):
         start_min = session * interval_min
-        file = Path(folder) / f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
+        file = Path(folder) / recording_name(start_min)
         if file.exists():
             there = read_recording(file)
             if dict(there.provenance) != culture.provenance or there.start_min != start_min:
@@ -272,7 +272,7 @@ def write_made_up_series(
                     "remove it, or choose another folder"
                 )
         else:
-            culture.record(start_min).save(file)
+            write_nwb(culture.record(start_min), file)
         files.append(file)
         progress.update(session + 1, sessions, file.name)
     return files

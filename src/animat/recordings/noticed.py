@@ -9,9 +9,10 @@ import numpy as np
 
 from animat.recordings.channel_quality import channel_findings
 from animat.recordings.findings import Finding, Severity
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import time_findings
+from animat.tables import UNKNOWN
 
 MANY_STIMULI = 100
 STIMULI_A_SPIKE = 10.0

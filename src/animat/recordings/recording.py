@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
@@ -13,14 +12,10 @@ from jaxtyping import Float64, Int64
 
 from animat.brief import briefly
 from animat.errors import UnusableData
-from animat.recordings.protocol import Presentation
-
-UNKNOWN = -1
-"""Stands for an unknown electrode or pattern, and pads `Stimuli.electrodes`."""
-
-CENTURY_S = 100 * 365.25 * 24 * 3600
-FASTEST_HZ = 1e9
-"""No time of a recording is farther from 0 than the one, and no rate or frequency above the other."""
+from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import CENTURY_S, FASTEST_HZ, expect_rising_times, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +39,21 @@ class Channels:
     y_um: Float64[np.ndarray, " channels"]
 
     def __post_init__(self) -> None:
-        _freeze(self, "the channel table", label=np.str_, electrode=np.int64, x_um=np.float64, y_um=np.float64)
+        freeze(self, "the channel table", label=np.str_, electrode=np.int64, x_um=np.float64, y_um=np.float64)
         labels, counts = np.unique(self.label, return_counts=True)
         if np.any(counts > 1):
             raise UnusableData(f"channels.label: expected each label once, got '{labels[counts > 1][0]}' twice or more")
+
+    @staticmethod
+    def on(array: ElectrodeArray, electrode: Int64[np.ndarray, " channels"], label: Any = None) -> Channels:
+        """The table of channels that read these electrodes; without labels they are numbered from 0.
+
+        Raises:
+            InvalidArgument: for an electrode that is not on the array.
+        """
+        x_um, y_um = array.position_um(electrode)
+        label = np.arange(len(electrode)) if label is None else np.asarray(label)
+        return Channels(label=label.astype(np.str_), electrode=electrode, x_um=x_um, y_um=y_um)
 
     def __len__(self) -> int:
         return len(self.label)
@@ -56,56 +62,6 @@ class Channels:
     def has_positions(self) -> bool:
         """Whether every channel's position is known."""
         return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
-
-
-@dataclass(frozen=True, eq=False)
-class Stimuli:
-    """The table of stimulation pulses, one row a pulse, in the order of time.
-
-    Attributes:
-        time_s: start of each pulse on the recording's clock, shape (stimuli,).
-        frequency_hz: the stimulus frequency it was presented at, NaN where it is not known, shape (stimuli,).
-        pattern: index of the stimulation pattern, `UNKNOWN` where it is not known, shape (stimuli,).
-        electrodes: electrodes pulsed together, padded with `UNKNOWN`, shape (stimuli, electrodes).
-        presentation: number of the presentation each pulse belongs to; a response is read after the last pulse of a
-            presentation, shape (stimuli,).
-    """
-
-    __repr__ = briefly
-
-    time_s: Float64[np.ndarray, " stimuli"]
-    frequency_hz: Float64[np.ndarray, " stimuli"]
-    pattern: Int64[np.ndarray, " stimuli"]
-    electrodes: Int64[np.ndarray, "stimuli electrodes"]
-    presentation: Int64[np.ndarray, " stimuli"]
-
-    def __post_init__(self) -> None:
-        kinds = {"time_s": np.float64, "frequency_hz": np.float64, "pattern": np.int64, "presentation": np.int64}
-        _freeze(self, "the stimulus table", **kinds, electrodes=np.int64)
-        if self.electrodes.ndim != 2:
-            raise UnusableData(
-                f"stimuli.electrodes: expected shape (stimuli, electrodes), padded with -1, got {self.electrodes.shape}"
-            )
-        _check_times("stimuli.time_s", self.time_s)
-        known = self.frequency_hz[~np.isnan(self.frequency_hz)]
-        wrong = (known <= 0) | (known > FASTEST_HZ)
-        if np.any(wrong):
-            raise UnusableData(
-                f"stimuli.frequency_hz: expected positive frequencies up to {FASTEST_HZ:g} Hz, or NaN, got "
-                f"{known[wrong][0]:g}"
-            )
-        if np.any(np.diff(self.presentation) < 0):
-            raise UnusableData("stimuli.presentation: expected numbers that do not fall as time goes on")
-
-    def __len__(self) -> int:
-        return len(self.time_s)
-
-    @property
-    def is_last_of_presentation(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Whether a pulse is the last one of its presentation, the one whose response is read; shape (stimuli,)."""
-        last = np.ones(len(self), dtype=bool)
-        last[:-1] = self.presentation[1:] != self.presentation[:-1]
-        return last
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +102,9 @@ class Recording:
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _freeze(self, "spikes", spike_times_s=np.float64, spike_channels=np.int64)
+        freeze(self, "spikes", spike_times_s=np.float64, spike_channels=np.int64)
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
-        _check_times("spike_times_s", self.spike_times_s)
+        expect_rising_times("spike_times_s", self.spike_times_s)
         outside = (self.spike_channels < 0) | (self.spike_channels >= len(self.channels))
         if np.any(outside):
             raise UnusableData(
@@ -192,56 +148,6 @@ class Recording:
     def equals(self, other: Recording) -> bool:
         """Whether every array and every value of the two recordings is the same (NaN equals NaN)."""
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the recording as NWB; the file is complete or absent (see `animat.recordings.formats.nwb`)."""
-        from animat.recordings.formats.nwb import write_nwb
-
-        write_nwb(self, path)
-
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> Recording:
-        """Read a recording in any format that is known (see `animat.recordings.reading.read_recording`)."""
-        from animat.recordings.reading import read_recording
-
-        return read_recording(path)
-
-
-def _freeze(table: object, name: str, **dtypes: Any) -> None:
-    """Turn the named attributes into read-only arrays of these types and of one length."""
-    length = None
-    for attribute, dtype in dtypes.items():
-        array = np.array(getattr(table, attribute), dtype=dtype)
-        if array.ndim == 0 or (length is not None and len(array) != length):
-            raise UnusableData(
-                f"{attribute}: expected {length if length is not None else 'a column of'} values in {name}, "
-                f"got shape {array.shape}"
-            )
-        length = len(array)
-        array.setflags(write=False)
-        object.__setattr__(table, attribute, array)
-
-
-def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse times that are not finite, or not within a century.
-
-    Raises:
-        UnusableData: by the name of the column.
-    """
-    bad = np.count_nonzero(~np.isfinite(times_s))
-    if bad:
-        raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
-    far = np.abs(times_s) > CENTURY_S
-    if np.any(far):
-        raise UnusableData(
-            f"{name}: expected times in seconds, within a century, got {times_s[far][0]:g}; are they in seconds?"
-        )
-
-
-def _check_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    expect_times(name, times_s)
-    if np.any(np.diff(times_s) < 0):
-        raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
 
 
 def _same(a: object, b: object) -> bool:

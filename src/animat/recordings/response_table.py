@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import UnusableData
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import Channels, Stimuli
+from animat.recordings.recording import Channels
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
 
 Kind = Literal["count", "rate_hz"]
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.recordings.findings import Finding
-from animat.recordings.recording import Recording, Stimuli
+from animat.recordings.recording import Recording
+from animat.stimulation.stimulus import Stimuli
 
 NAME = "times-not-in-seconds"
 CONTRADICTED = "other-frequencies"

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from animat.neurons.responses import Responses
 from animat.report.response_histograms import rate_edges
 from animat.report.style import BLACK, BLUE, BURST, NON_BURST, add_legend, new_figure, style_axes
+from animat.responses.responses import Responses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,9 +6,6 @@ import math
 import os
 from pathlib import Path
 
-from animat.neurons.inspection import Inspection
-from animat.neurons.network_bursts import NetworkBursts
-from animat.neurons.psth import PostStimulusHistogram, post_stimulus_histogram
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.burst_separation import draw_burst_separation
@@ -17,6 +14,9 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.spontaneous import draw_spontaneous
 from animat.report.style import save_figure
+from animat.responses.inspection import Inspection
+from animat.responses.network_bursts import NetworkBursts
+from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 
 _MOST_CONDITIONS = 16
 _MARK = {"refuse": "!!", "warning": "! ", "note": "- "}

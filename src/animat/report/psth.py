@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.neurons.psth import PostStimulusHistogram
 from animat.report.style import BLUE, GREY, RED, WINDOW, add_legend, new_figure, style_axes
+from animat.responses.psth import PostStimulusHistogram
 
 _ARTEFACT_MS = 5.0
 """Bins nearer to the stimulus than this do not set the height of the axis when they would dwarf all others."""

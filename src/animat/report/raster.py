@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.neurons.responses import Responses
-from animat.neurons.windows import spikes_in
 from animat.recordings.recording import Recording
 from animat.report.style import BLACK, RED, WINDOW, add_legend, condition_colours, new_figure, style_axes
+from animat.responses.responses import Responses
+from animat.responses.windows import spikes_in
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

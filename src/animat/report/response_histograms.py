@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.responses import Responses
 from animat.report.style import MEDIAN, add_legend, condition_colours, new_figure, style_axes
+from animat.responses.responses import Responses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

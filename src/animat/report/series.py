@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from animat.errors import InvalidArgument, Mismatch
-from animat.neurons.responses import Responses
 from animat.recordings.recording import Recording
 from animat.report.array import draw_array
 from animat.report.drift import draw_drift
 from animat.report.first_and_last import draw_first_and_last
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import save_figure
+from animat.responses.responses import Responses
 
 
 def draw_series(

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.neurons.network_bursts import NetworkBursts
 from animat.recordings.recording import Recording
 from animat.report.style import BLACK, WINDOW, add_legend, new_figure, style_axes
+from animat.responses.network_bursts import NetworkBursts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

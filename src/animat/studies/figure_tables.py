@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from animat.neurons.psth import PostStimulusHistogram
-from animat.neurons.responses import Responses
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
 from animat.report.array import rates_of_sites
 from animat.report.drift import PERCENTILES, Drift
 from animat.report.learning_curves import LearningCurve, mean_with_interval
 from animat.report.over_time import Courses
+from animat.responses.psth import PostStimulusHistogram
+from animat.responses.responses import Responses
 from animat.studies.places import table_file, write_table
+from animat.tables import UNKNOWN
 
 
 def write_psth(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from animat.neurons.psth import post_stimulus_histogram, spontaneous_rate
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.reading import read_recordings
 from animat.report.array import draw_array
@@ -27,6 +26,7 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, save_figure
+from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.capabilities import lacking
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.figure_tables import (

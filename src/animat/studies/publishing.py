@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, final
 
 from animat.evaluation.statistics import p_of_u
-from animat.recordings.protocol import Presentation
 from animat.report.html import Picture, Section, Table, write_page
 from animat.report.style import FORMATS
+from animat.stimulation.protocol import Presentation
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST

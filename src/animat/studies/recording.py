@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series, recording_name
+from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
 from animat.errors import InvalidFile
+from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.folder import source_files
 from animat.studies.identity import settle_identity
 from animat.studies.jobs import Receipt, Report, Task
@@ -53,7 +54,7 @@ class Record(Task):
                     f"culture.files: expected recordings of different minutes, got two that would both be {copy.name}"
                 )
             copies.append(copy)
-            recording.save(copy)
+            write_nwb(recording, copy)
             progress.update(i + 1, len(recordings))
         return copies
 
@@ -67,7 +68,7 @@ def _remove_changed(folder: Path) -> None:
 
 def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
     from animat.cultures.virtual import VirtualCulture
-    from animat.recordings.protocol import Protocol
+    from animat.stimulation.protocol import Protocol
 
     culture = study.culture
     return record_virtual_series(

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 
 from animat.evaluation.optimum import bracket_findings
 from animat.neurons.fidelity import LARGEST_LOSS
-from animat.neurons.quality import FEW_SAMPLES
 from animat.report.html import Table, cell, with_error
+from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.limits import limits_of_all, rough_kinds
 from animat.studies.places import read_table, table_file

@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, UnusableData
-from animat.neurons.conditions import Condition, conditions_named
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.responses import Responses
-from animat.neurons.series import extract_series
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.findings import Finding
-from animat.recordings.protocol import Presentation
 from animat.recordings.reading import read_recordings
+from animat.responses.conditions import Condition, conditions_named
+from animat.responses.responses import Responses
+from animat.responses.series import extract_series
+from animat.stimulation.protocol import Presentation
 from animat.studies.jobs import Report, Task
 from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE, write_table
 from animat.studies.specification import Study

@@ -12,9 +12,9 @@ from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
 from animat.mapping import MAPPING_NAMES
 from animat.recordings.made_up import MadeUpCulture
-from animat.recordings.protocol import Protocol
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import is_ours, place_of, robot_named
+from animat.stimulation.protocol import Protocol
 from animat.studies.bounds import (
     MOST_PRESENTATIONS,
     MOST_SESSIONS,
@@ -44,7 +44,7 @@ class Source:
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
         seed: which virtual or made-up culture.
         sessions, interval_min: how many recordings, and the minutes from one to the next.
-        order, pulses, presentations: how stimuli are presented (`animat.recordings.protocol`).
+        order, pulses, presentations: how stimuli are presented (`animat.stimulation.protocol`).
         channels: of a made-up culture.
     """
 
@@ -120,10 +120,10 @@ class Simulators:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        from animat.neurons.conditions import conditions_named
-        from animat.neurons.series import check_allowed
         from animat.neurons.simulator import LARGEST_BINS
-        from animat.neurons.windows import check_window
+        from animat.responses.conditions import conditions_named
+        from animat.responses.series import check_allowed
+        from animat.responses.windows import check_window
 
         # All before anything is recorded: whoever corrects it later needs another folder.
         expect_choices("simulators", self)

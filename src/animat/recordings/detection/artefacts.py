@@ -10,7 +10,7 @@ Around a stimulus, three things are done to each channel, in this order:
    exponential is taken away; what is far off the fit (spikes) hardly counts in it. Nothing is blanked.
 
 Amplifiers recover in more ways than one exponential. What is left where they do is seen in the recording as spikes at
-one time after stimuli, and said there (`animat.neurons.timing_quality`).
+one time after stimuli, and said there (`animat.responses.quality.timing`).
 """
 
 from __future__ import annotations

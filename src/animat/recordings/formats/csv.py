@@ -25,7 +25,8 @@ from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
+from animat.tables import UNKNOWN
 
 SPIKE_COLUMNS = {
     "spike_time_s": ("spike_time_s", "time_s", "time"),

@@ -82,6 +82,12 @@ class Hdf5File:
         node = self.node(where)
         return sorted(node) if isinstance(node, h5py.Group) else []
 
+    @property
+    def held(self) -> str:
+        """The first names at its root, in words."""
+        names = self.names("/")
+        return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
+
     def has(self, where: str) -> bool:
         """Whether something stands at a place."""
         return self.node(where) is not None

@@ -39,11 +39,9 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
     with hdf5_file(path, "HDF5 recording") as file:
         found = format_of(file)
         if found is None:
-            names = file.names("/")
-            held = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
             raise InvalidFile(
-                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {held}); bring its columns as "
-                "NPZ or CSV"
+                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.held}); bring its "
+                "columns as NPZ or CSV"
             )
     if part is not None and found != "MaxWell":
         raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for one of {found}")

@@ -29,7 +29,8 @@ from animat.recordings.findings import Finding
 from animat.recordings.formats.choice import choose
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file, unavailable_filters
 from animat.recordings.formats.stimulus_text import stimulus_columns
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
+from animat.tables import UNKNOWN
 
 WHAT = "MaxWell recording"
 OLD_VERSION = 20160704

@@ -22,7 +22,9 @@ import numpy as np
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.formats.hdf5 import first_line
+from animat.recordings.recording import Recording
+from animat.tables import UNKNOWN
 
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
@@ -117,11 +119,11 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
     except ValueError as error:
         # numpy's only other ValueErrors are about damaged headers; both mean that the file cannot be read as it is.
         pickled = "Object arrays" in str(error)
-        what = "pickled objects, which are never read" if pickled else f"a damaged array ({_first_line(error)})"
+        what = "pickled objects, which are never read" if pickled else f"a damaged array ({first_line(error)})"
         raise InvalidFile(f"{path}: expected plain arrays of numbers or text, got {what}; save it anew") from error
     except (OSError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise InvalidFile(
-            f"{path}: expected a whole NPZ archive, but it is cut off or damaged ({_first_line(error)}); "
+            f"{path}: expected a whole NPZ archive, but it is cut off or damaged ({first_line(error)}); "
             "copy or save it again"
         ) from error
     return columns, {key: routing[key] for key in ROUTING if key in routing}, left_out
@@ -179,7 +181,3 @@ def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) ->
         raise UnusableData(f"channel_xy_um: expected shape (channels, 2) in micrometres, got {xy_um.shape}")
     at = {tuple(xy): e for xy, e in zip(electrode_xy_um.tolist(), electrode.tolist(), strict=True)}
     return np.array([at.get(tuple(xy), UNKNOWN) for xy in xy_um.tolist()])
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().partition("\n")[0] or type(error).__name__

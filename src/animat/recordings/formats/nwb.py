@@ -1,14 +1,5 @@
 """NWB, the recording's own format on disk: written with pynwb as whole columns, read with plain h5py.
 
-    /units                         one unit a channel, silent ones included: spike_times, obs_intervals, electrodes
-    /general/extracellular_ephys   /electrodes: label, electrode_id, rel_x, rel_y (um); one row a channel
-                                   (both are absent where a recording has no channel)
-    /stimulus/presentation/stimuli TimeIntervals, one row a pulse: start_time, frequency_hz, pattern, presentation,
-                                   electrode_ids (ragged: ids on the array, which need not be recorded electrodes;
-                                   absent where none is known)
-    /processing/ecephys            /animat_recording: one row, the scalars of `Recording` and its presentation;
-                                   /animat_provenance: one row a key (absent where there is none)
-
 NWB has fields of its own for who recorded what. They are filled from `Recording.provenance` where it has these
 keys, all optional: `recorded_at` (ISO 8601; UTC where it names no zone), `session_description`,
 `experiment_description`, `experimenter` (`Last, First`, several separated by semicolons), `lab`, `institution`,
@@ -31,19 +22,21 @@ from jaxtyping import Float64, Int64
 from animat.compilation import user_cache
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
+from animat.recordings.formats.nwb_layout import (
+    ELECTRODES_TABLE,
+    FORMAT_VERSION,
+    PROVENANCE_TABLE,
+    RECORDING_TABLE,
+    STIMULI_TABLE,
+    UNITS_TABLE,
+)
+from animat.recordings.formats.nwb_of_others import read_other_nwb
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
-from animat.recordings.protocol import Presentation
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 from animat.writing import written_whole
-
-FORMAT_VERSION = 1
-"""Of the tables above; written into every file, and a newer one is refused."""
-
-RECORDING_TABLE = "processing/ecephys/animat_recording"
-PROVENANCE_TABLE = "processing/ecephys/animat_provenance"
-UNITS_TABLE = "units"
-ELECTRODES_TABLE = "general/extracellular_ephys/electrodes"
-STIMULI_TABLE = "stimulus/presentation/stimuli"
 
 WHAT = "NWB recording"
 LARGEST_VALUES = 10_000_000
@@ -99,6 +92,11 @@ def write_nwb(
             raise disk.error or error from None
         if disk.error is not None:
             raise disk.error
+
+
+def recording_name(start_min: float) -> str:
+    """The file name of a recording that starts at a minute of the culture's clock."""
+    return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
 
 
 class _Disk(io.RawIOBase):
@@ -157,10 +155,8 @@ def is_nwb(file: Hdf5File) -> bool:
 def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Recording:
     """Read an open file; see `read_nwb`."""
     if not is_nwb(file):
-        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {_listed(file)})")
+        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
     if not file.has(RECORDING_TABLE):
-        from animat.recordings.formats.nwb_of_others import read_other_nwb
-
         return read_other_nwb(file, path, stimuli)
     if stimuli is not None:
         raise InvalidFile(f"{path}: expected no choice of stimuli for a file of animat's own, got {stimuli!r}")
@@ -245,8 +241,3 @@ def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
         electrodes=electrodes,
         presentation=file.read(f"{STIMULI_TABLE}/presentation"),
     )
-
-
-def _listed(file: Hdf5File) -> str:
-    names = file.names("/")
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"

@@ -20,7 +20,8 @@ from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_stimuli import read_stimuli
-from animat.recordings.recording import UNKNOWN, Recording
+from animat.recordings.recording import Recording
+from animat.tables import UNKNOWN
 
 UNITS = "units"
 ELECTRODES = "general/extracellular_ephys/electrodes"

@@ -17,8 +17,10 @@ from pynwb.file import Subject
 from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
-from animat.recordings.formats.nwb import FORMAT_VERSION
-from animat.recordings.recording import UNKNOWN, Channels, Recording, Stimuli
+from animat.recordings.formats.nwb_layout import FORMAT_VERSION
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.stimulus import Stimuli
+from animat.tables import UNKNOWN
 
 UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
 """NWB demands a date; a recording without `recorded_at` gets this one, which every reader sees to be none."""
@@ -41,7 +43,7 @@ _FILE_KEYS = ("experiment_description", "lab", "institution")
 
 
 def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> NWBFile:
-    """A recording as pynwb's object tree, with room for spikes; see `animat.recordings.formats.nwb` for its places.
+    """A recording as pynwb's object tree, with room for spikes; see `animat.recordings.formats.nwb_layout`.
 
     Args:
         recording: all but its spikes are taken.

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from animat.recordings.columns import Column
-from animat.recordings.recording import UNKNOWN
+from animat.tables import UNKNOWN
 
 LONGEST = 4096
 """Characters of a line; what is longer says nothing that is understood here."""

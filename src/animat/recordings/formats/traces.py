@@ -19,7 +19,8 @@ from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import is_old, parts, read_maxwell
 from animat.recordings.formats.nwb_of_others import read_other_nwb
 from animat.recordings.raw import Hdf5Traces
-from animat.recordings.recording import UNKNOWN, Channels, Recording
+from animat.recordings.recording import Channels, Recording
+from animat.tables import UNKNOWN
 
 OLD_ROWS = 1024
 OLD_LSB_V = 6.294e-6

@@ -1,0 +1,217 @@
+"""The command line: parses, calls, prints. What the commands do is in the modules that they call."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import io
+import itertools
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, cast, get_args
+
+import tyro
+from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+
+from animat.cli.convert import Convert
+from animat.cli.evaluate import Evaluate
+from animat.cli.inspect import Inspect
+from animat.cli.live import Live
+from animat.cli.record import Record
+from animat.cli.recover import Recover
+from animat.cli.reproduce import Reproduce
+from animat.cli.run import Run
+from animat.cli.study import StudyFile
+from animat.cli.train import Train
+from animat.ctrl_c import heard_everywhere
+from animat.errors import AnimatError, InvalidArgument, out_of_memory
+
+Command = (
+    Annotated[Record, subcommand("record")]
+    | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Convert, subcommand("convert")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Reproduce, subcommand("reproduce")]
+    | Annotated[StudyFile, subcommand("study")]
+    | Annotated[Run, subcommand("run")]
+    | Annotated[Live, subcommand("live")]
+    | Annotated[Recover, subcommand("recover")]
+)
+
+COMMANDS = tuple(command.__metadata__[0].name for command in get_args(Command))
+
+
+_LESS: dict[type, str] = {
+    Evaluate: "ask for fewer episodes (--episodes {episodes})",
+    Run: "ask for fewer episodes (--episodes {episodes})",
+    Live: "ask for fewer episodes (--episodes {episodes}) or policies (--policies {policies})",
+    Record: "ask for fewer presentations or pulses (--presentations, --pulses, or those of --protocol)",
+    Train: "ask for fewer bins (--bins), or give fewer recordings (--recordings)",
+    Inspect: "inspect fewer recordings at once",
+}
+"""What a command's memory grows with, and what was asked for."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
+    # Streams that were closed are None, which the parser and others do not expect: what is written goes nowhere.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    try:
+        try:
+            return _run(sys.argv[1:] if arguments is None else list(arguments))
+        finally:
+            # Here, where it can be caught, rather than as Python exits: help ends with SystemExit.
+            sys.stdout.flush()
+    except OSError as error:
+        is_closed = isinstance(error, BrokenPipeError)
+        # That of a file has its name, and that of a connection a type of its own.
+        if not is_closed and (type(error) is not OSError or error.filename is not None):
+            raise
+        # What is still to be written goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if is_closed:
+            return 141
+        print(f"animat: standard output: cannot be written: {error.strerror or error}", file=sys.stderr)
+        return 1
+
+
+def _run(given: list[str]) -> int:
+    if given == ["--version"]:
+        print(f"animat {importlib.metadata.version('animat')}")
+        return 0
+    try:
+        command = _parse(given)
+    except InvalidArgument as error:
+        print(f"animat: {error}", file=sys.stderr)
+        return 2
+    if "" not in sys.path:
+        # As for `python -m animat`: robots of one's own may lie in the working folder.
+        sys.path.append("")
+    try:
+        with heard_everywhere():
+            results = command.run()
+    except AnimatError as error:
+        print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+        _say_notes(error)
+        return 1
+    except KeyboardInterrupt as error:
+        kept = "" if isinstance(command, Inspect | Convert | Evaluate) else "; what was finished is kept"
+        again = "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile) else ""
+        print(f"animat: interrupted{kept}{again}", file=sys.stderr)
+        _say_notes(error)
+        return 130
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        words = out_of_memory(error)
+        if words is None:
+            raise
+        remedy = _LESS.get(type(command), "use a machine with more memory").format(**vars(command))
+        print(f"animat: {words}: {remedy}", file=sys.stderr)
+        return 1
+    if command.json:
+        print(json.dumps(_as_json(results)))
+    # Of several files, some of which could not be read or used, as was said on the way.
+    return 1 if results.get("unreadable") or results.get("unusable") else 0
+
+
+def _parse(
+    arguments: list[str],
+) -> Record | Inspect | Convert | Train | Evaluate | Reproduce | StudyFile | Run | Live | Recover:
+    """Read the command line; usage errors come in one line, not in a box."""
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {arguments[0]!r}")
+    if not arguments:
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; see animat --help")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                Command,
+                prog="animat",
+                description="Drive a robot with a living neuronal culture.",
+                args=arguments,
+                config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
+                registry=_options(),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        # A box with a title; where the terminal has no such letters, lines of dashes, one of them under the title.
+        lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()[1:]]
+        parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
+        what = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
+        raise InvalidArgument(f"{_told(what)}; see animat {' '.join(arguments[:1])} --help") from None
+
+
+def _options() -> ConstructorRegistry:
+    """Rules by which options are read and told: of one that need not be given, the help says what is done without."""
+    registry = ConstructorRegistry()
+    within = False
+
+    @registry.struct_rule
+    def rule(command: StructTypeInfo) -> StructConstructorSpec | None:
+        nonlocal within
+        if within or not dataclasses.is_dataclass(command.type):
+            return None
+        within = True  # What else would ask this rule again.
+        spec = ConstructorRegistry.get_struct_spec(command)
+        within = False
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        fields = (
+            dataclasses.replace(field, type=cast(Any, Annotated[field.type, arg(help_behavior_hint="")]))
+            if field.default is None or field.default == ()
+            else field
+            for field in spec.fields
+        )
+        return dataclasses.replace(spec, fields=tuple(fields))
+
+    return registry
+
+
+_WORDS = (
+    (
+        r"Error parsing (\S+): (?:no type matching INT .*? from|invalid literal .*? 10:) \[?('[^']*').*",
+        "whole number",
+    ),
+    (
+        r"Error parsing (\S+): (?:no type matching FLOAT .*? from|could not convert .*?:) \[?('[^']*').*",
+        "number",
+    ),
+)
+
+
+def _told(what: str) -> str:
+    """What the parser says, in the words of all other errors: the argument, what was expected, what came."""
+    if wrong := re.fullmatch(r"invalid choice (.+) for argument '(.+)'. Expected one of \((.+)\)\.", what):
+        # The parser lists them in any order.
+        choices = sorted(set(re.findall(r"'([^']+)'", wrong[3])) - {"None"})
+        return f"{wrong[2]}: expected one of {', '.join(choices)}, got {wrong[1]}"
+    for words, kind in _WORDS:
+        if wrong := re.fullmatch(words, what):
+            return f"{wrong[1]}: expected a {kind}, got {wrong[2]}"
+    return what
+
+
+def _say_notes(error: BaseException) -> None:
+    """What went wrong besides, such as a device that could not be switched off."""
+    for note in getattr(error, "__notes__", ()):
+        print(f"animat: {' '.join(note.split())}", file=sys.stderr)
+
+
+def _as_json(value: Any) -> Any:
+    """The same with null for numbers that JSON has no word for (NaN, infinite)."""
+    if isinstance(value, dict):
+        return {key: _as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_json(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,66 @@
+"""The command that evaluates policies on the simulator of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from animat.cli.responses import Fitting, policies_for, say_findings
+
+
+@dataclass(frozen=True)
+class Evaluate(Fitting):
+    """Run trained policies, and controls beside them, on the simulator of a recording, made as in their training."""
+
+    policies: Positional[Path] = Path("policies")
+    """A policy file or a folder of them"""
+    recordings: tuple[Path, ...] = ()
+    """Files or folders of recordings of one culture"""
+    at_min: float | None = None
+    """Minute on the culture's clock whose newest recording answers; default: the last recording"""
+    episodes: int = 100
+    """Episodes of each policy and control"""
+    robot: str | None = None
+    """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    drawn: bool = False
+    """Draw actions from the policy, as in training, instead of taking the most probable one"""
+    limit: bool = False
+    """Also compute the best return that any controller could get there, and scores; seconds, with memory minutes"""
+    seed: int = 1
+    """Decides every random draw"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Evaluate."""
+        from animat.compilation import keep_compilations
+        from animat.evaluation.rollouts import check_at_once
+        from animat.progress import Bar
+
+        policies = policies_for(self.robot, self.policies)
+        check_at_once("--episodes", self.episodes, len(policies))
+        through_neurons = any(policy.mapping is not None for policy in policies.values())
+        # On what they were trained on, unless asked otherwise.
+        trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
+        timeline = self.timeline(self.recordings, trained) if through_neurons else None
+
+        from animat.evaluation.table import evaluate
+
+        keep_compilations()
+        with Bar("evaluating") as progress:
+            evaluation = evaluate(
+                policies,
+                timeline,
+                at_min=self.at_min,
+                episodes=self.episodes,
+                seed=self.seed,
+                greedy=not self.drawn,
+                limit_resolution=1.0 if self.limit else None,
+                progress=progress,
+            )
+        say_findings(evaluation.findings)
+        print(evaluation.to_text())
+        return evaluation.to_dict()

@@ -1,0 +1,164 @@
+"""The command that looks into recordings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from animat.cli.responses import Responding, say_findings
+from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
+from animat.writing import expect_writable
+
+if TYPE_CHECKING:
+    from animat.progress import Progress
+    from animat.recordings.recording import Recording
+    from animat.recordings.response_table import ResponseTable
+    from animat.responses.conditions import Conditions
+    from animat.responses.inspection import Inspection
+    from animat.responses.responses import Responses
+
+
+@dataclass(frozen=True)
+class Inspect(Responding):
+    """Say what is in recordings, whether an Animat can be made of them, and what is wrong with them."""
+
+    recordings: Positional[tuple[Path, ...]] = ()
+    """Files, or folders of them: NWB, MaxWell, CL1, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv beside it)"""
+    stimuli: str | None = None
+    """Which of several things in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
+    part: str | None = None
+    """Which of several recordings in a MaxWell file, such as well000/rec0000"""
+    limit: str | None = None
+    """Also compute the best return that any controller could get with this robot, such as cartpole, before any
+    training"""
+    out: Path | None = None
+    """Folder for figures; default: none are drawn"""
+    format: Literal["png", "svg", "pdf"] = "png"
+    """Of the figures"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Inspect each file."""
+        from animat.progress import Bar
+        from animat.recordings.reading import list_recordings
+        from animat.report.inspection import figure_stem
+        from animat.responses.bursts import check_threshold
+        from animat.responses.conditions import conditions_named
+        from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+        from animat.robots.registry import robot_named
+
+        if self.out is not None:
+            expect_writable(self.out)
+        if self.limit is not None:
+            robot_named(self.limit)
+        by = None if self.conditions is None else conditions_named(self.conditions)
+        window_ms = self.window_ms or DEFAULT_WINDOW_MS
+        check_window(window_ms)
+        check_threshold(self.burst_threshold)
+        files = list_recordings(self.recordings)
+        # The figures of the series have a name of their own.
+        stems = ["series", *(figure_stem(file.name) for file in files)]
+        if self.out is not None and len(set(stems)) < len(stems):
+            alike = next(stem for stem in stems if stems.count(stem) > 1)
+            raise InvalidArgument(
+                f"--out: expected recordings of different names, got figures that would all be called {alike}-...; "
+                "inspect them apart, or rename one"
+            )
+        with Bar("inspecting") as progress:
+            return self._inspect(files, by, window_ms, progress)
+
+    def _inspect(
+        self, files: Sequence[Path], by: Conditions | None, window_ms: tuple[float, float], progress: Progress
+    ) -> dict[str, Any]:
+        from animat.recordings.reading import read_source
+        from animat.recordings.recording import Recording
+        from animat.report.inspection import draw_inspection, inspection_text
+        from animat.report.series import draw_series
+
+        inspected, series, unreadable = [], [], []
+        # Reading is one step of each file, drawing another, and the figures of the series are the last.
+        steps = 1 if self.out is None else 2
+        total = steps * len(files) + (self.out is not None)
+        for number, file in enumerate(files):
+            progress.update(steps * number, total, file.name)
+            try:
+                source = read_source(file, stimuli=self.stimuli, part=self.part)
+                inspection = _inspected(source, by, window_ms, self.burst_threshold, file)
+            except AnimatError as error:
+                if len(files) == 1:
+                    raise
+                # The others may be whole.
+                print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+                unreadable.append(str(file))
+                continue
+            print(inspection_text(inspection), end="\n\n")
+            inspected.append(inspection.to_dict())
+            if self.limit is not None:
+                progress.update(steps * number, total, f"{file.name}, best possible return")
+                inspected[-1]["limits"] = _limits(self.limit, inspection.responses)
+            if self.out is not None:
+                progress.update(steps * number + 1, total, f"{file.name}, figures")
+                figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
+                print(f"figures: {', '.join(figures)}\n")
+                inspected[-1]["figures"] = figures
+                series.append((source.start_min, file, inspection.responses))
+        unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
+        told: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
+        if self.out is not None and series:
+            progress.update(total - 1, total, "figures of the series")
+            first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
+            try:
+                drawn = draw_series(
+                    first if isinstance(first, Recording) else None, [one[2] for one in series], self.out, self.format
+                )
+            except Mismatch as unlike:
+                print(f"no figures of the series: {unlike}")
+            else:
+                if drawn:
+                    print(f"figures of the series: {', '.join(map(str, drawn))}")
+                told["figures"] = [str(figure) for figure in drawn]
+        if unreadable:
+            others = "; the others were" if inspected else ""
+            count = f"{len(unreadable)} of {len(files)} files could not be inspected"
+            print(f"animat: {count}, as said above{others}", file=sys.stderr)
+        return told
+
+
+def _inspected(
+    source: Recording | ResponseTable,
+    by: Conditions | None,
+    window_ms: tuple[float, float],
+    burst_threshold: float | None,
+    file: Path,
+) -> Inspection:
+    from animat.responses.inspection import inspect_recording
+
+    try:
+        return inspect_recording(source, by, window_ms, burst_threshold, file.name)
+    except (UnusableData, Mismatch) as error:
+        raise type(error)(f"{file}: {error}") from error
+
+
+def _limits(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
+    """What a culture could do with a robot, printed; None where that cannot be told."""
+    from animat.compilation import keep_compilations
+    from animat.evaluation.prospects import prospects
+    from animat.robots.registry import robot_named
+
+    keep_compilations()
+    try:
+        found = prospects(responses, robot_named(robot))
+    except (InvalidArgument, UnusableData) as error:
+        print(f"{robot}: no best possible return: {error}\n")
+        return None
+    for prospect in found:
+        print(prospect.to_text())
+        say_findings(prospect.best.findings())
+    print()
+    return [prospect.to_dict() for prospect in found]

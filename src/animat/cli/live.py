@@ -1,0 +1,151 @@
+"""The command that records, trains and runs on one culture while it lives."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from animat.cli.responses import say_findings
+from animat.cli.stimulating import Stimulating, expect_no_fault
+from animat.errors import InvalidArgument
+from animat.writing import alone_in
+
+if TYPE_CHECKING:
+    from animat.live.shadowing import Lived
+
+
+@dataclass(frozen=True)
+class Live(Stimulating):
+    """Parameter shadowing on one culture while it lives: record, train, refresh, then run in closed loop."""
+
+    robot: Positional[str] = "cartpole"
+    """The robot to drive: cartpole, navigation, or one of your own, such as my_package.robots:Rover"""
+    mapping: Literal["1-threshold", "9-thresholds", "linear"] = "9-thresholds"
+    """From responses to motor commands"""
+    policies: int = 4
+    """How many policies, each from its own random numbers"""
+    order: Literal["mixed", "blocked"] = "mixed"
+    """How recordings are presented; mixed is how a closed loop presents"""
+    pulses: int = 1
+    """Pulses a presentation, the last one read"""
+    presentations: int = 500
+    """Of each frequency in a recording"""
+    interval_min: float = 10.0
+    """Minutes of the culture's clock from one recording to the next"""
+    duration_min: float = 60.0
+    """Minutes of the culture's clock that training lasts"""
+    speed: float | None = None
+    """Minutes of the culture's clock in one of ours; default: 30 for a simulated culture, 1 for a living one"""
+    episodes: int = 5
+    """Of each policy in closed loop, at the end"""
+    controls: Literal["all", "random"] = "all"
+    """Run between the policies' episodes"""
+    percentiles: Literal["moving", "first"] = "moving"
+    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """memory: draw a response that was measured after a like past, the default but for recordings in blocks; histogram:
+    the paper's; empirical: draw any measured value"""
+    recordings: tuple[Path, ...] = ()
+    """For a replay: what it answers from"""
+    seed: int = 1
+    """Decides every random draw, but what the culture does and when simulators are swapped"""
+    out: Path = Path("live")
+    """Folder for recordings, policies, the session, and live.log"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Live."""
+        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
+        from animat.compilation import keep_compilations
+        from animat.cultures.budget import Account, Budget
+        from animat.cultures.kinds import culture_of, pulse_for
+        from animat.live.plan import Timetable, check_plan
+        from animat.live.shadowing import live
+        from animat.mapping import mapping_named
+        from animat.progress import Bar
+        from animat.recordings.reading import read_recordings
+        from animat.robots.registry import robot_named
+        from animat.stimulation.protocol import Protocol
+        from animat.training.specification import Training
+
+        simulated = self.culture in ("virtual", "replay")
+        if self.speed is not None and self.speed != 1 and not simulated:
+            raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
+        if (self.culture == "replay") != bool(self.recordings):
+            raise InvalidArgument(
+                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
+                f"{self.culture}: a live run records the culture itself"
+            )
+        default_speed = 30.0 if simulated else 1.0
+        timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
+        robot = robot_named(self.robot)
+        training = Training(
+            robot,
+            mapping_named(self.mapping),
+            policies=self.policies,
+            iterations=robot.paper_iterations,
+            seed=self.seed,
+            percentiles=self.percentiles,
+        )
+        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        protocol = Protocol(
+            order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
+        )
+        settings = {**self._of_the_loop(), "follow": self.thresholds == "follow"}
+        check_plan(training, protocol, self.out, timetable, self.episodes, settings)
+        keep_compilations()
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        seed = 1 if self.culture_seed is None else self.culture_seed
+        with (
+            ExitStack() as told,
+            alone_in(self.out),
+            polite_kill_as_ctrl_c(),
+            Bar("live") as progress,
+            culture_of(
+                self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
+            ) as culture,
+        ):
+            lived = live(
+                training,
+                culture,
+                replace(protocol, patterns=min(100, len(culture.patterns))),
+                self.out,
+                timetable=timetable,
+                episodes=self.episodes,
+                with_controls=self.controls == "all",
+                kind=self.simulator,
+                account=account,
+                progress=progress,
+                tell=partial(print, file=sys.stderr),
+                **settings,
+            )
+            # It is told even where the culture cannot be closed then.
+            told.callback(self._tell, lived)
+        return lived.to_dict()
+
+    def _tell(self, lived: Lived) -> None:
+        print(
+            f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
+            f"({lived.wall_s:.0f} s of ours); {lived.iterations:,} iterations of each policy, never stopped; "
+            f"{len(lived.swaps)} swaps of simulators:"
+        )
+        for swap in lived.swaps:
+            print(
+                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
+                f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
+            )
+        say_findings(lived.gap.findings)
+        print(lived.gap.to_text())
+        expect_no_fault(lived.gap.session, self.out)
+
+
+def _range(members: Sequence[int]) -> str:
+    return f"p{members[0]} to p{members[-1]}" if len(members) > 1 else f"p{members[0]}"

@@ -1,0 +1,165 @@
+"""The command that records a culture, whichever it is, at intervals."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from animat.errors import InvalidArgument
+from animat.writing import alone_in
+
+if TYPE_CHECKING:
+    from animat.progress import Progress
+    from animat.stimulation.protocol import Protocol
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record a culture: one NWB file a recording. Goes on where it stopped."""
+
+    culture: Literal["virtual", "made-up", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; made-up: responses of known distributions, no neurons; replay:
+    answers from recordings; cl1 and maxone: the devices"""
+    recordings: tuple[Path, ...] = ()
+    """For a replay: what it answers from"""
+    selection: Path | None = None
+    """For a maxone: the file of its electrodes"""
+    seed: int = 1
+    """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
+    paper: bool = False
+    """The paper's protocol: blocks of one frequency, 100 presentations of each, 15 recordings; default: what a closed
+    loop needs, frequencies mixed, 500 presentations of each, 2 recordings"""
+    sessions: int | None = None
+    """How many recordings; default: 2, with --paper 15"""
+    interval_min: float = 10.0
+    """Minutes from one recording to the next"""
+    order: Literal["blocked", "mixed"] | None = None
+    """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
+    pulses: int | None = None
+    """Pulses a presentation, the last one read; default: 1"""
+    presentations: int | None = None
+    """Presentations at each frequency; default: 500, with --paper 100"""
+    protocol: Path | None = None
+    """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too"""
+    out: Path = Path("recordings")
+    """Folder for the files"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Record."""
+        from animat.progress import Bar
+
+        if (self.culture == "replay") != bool(self.recordings):
+            raise InvalidArgument(
+                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
+                f"--culture {self.culture}"
+            )
+        if (self.culture == "maxone") != (self.selection is not None):
+            raise InvalidArgument(
+                f"--selection: expected a file of electrodes for a maxone and none for others, got {self.selection} "
+                f"for --culture {self.culture}"
+            )
+        # Before any device is powered.
+        if self.seed < 0:
+            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        asked = [f"--{name}" for name in ("order", "pulses", "presentations") if getattr(self, name) is not None]
+        asked += ["--paper"] if self.paper else []
+        if asked and self.protocol is not None:
+            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
+        if self.protocol is not None and self.culture != "made-up":
+            _say_too_fast(self._protocol())
+        with Bar("recording") as progress:
+            if self.culture == "made-up":
+                files = self._made_up(progress)
+            else:
+                files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
+        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
+        return {"recordings": [str(file) for file in files]}
+
+    def _made_up(self, progress: Progress) -> list[Path]:
+        from animat.recordings.made_up import write_made_up_series
+
+        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.presentations in (None, 100)
+        if not usual or self.protocol is not None:
+            raise InvalidArgument(
+                "--order, --pulses, --presentations, --protocol: made-up recordings are blocked, with one pulse and "
+                "100 presentations; --culture virtual takes others"
+            )
+        with alone_in(self.out):
+            return write_made_up_series(
+                self.seed, self.out, sessions=self._sessions, interval_min=self.interval_min, progress=progress
+            )
+
+    def _virtual(self, progress: Progress) -> list[Path]:
+        from animat.cultures.series import record_virtual_series
+        from animat.cultures.virtual import VirtualCulture
+
+        return record_virtual_series(
+            lambda: VirtualCulture(self.seed, progress=progress),
+            self._protocol(),
+            self.out,
+            sessions=self._sessions,
+            interval_min=self.interval_min,
+            progress=progress,
+        )
+
+    def _living(self, progress: Progress) -> list[Path]:
+        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
+        from animat.cultures.kinds import culture_of
+        from animat.cultures.living_series import record_in_held_folder
+        from animat.cultures.series import check_interval
+        from animat.recordings.reading import read_recordings
+
+        assert self.culture != "made-up"
+        # What can be refused is refused before a culture is opened, whose patterns are not known until then.
+        check_interval(self._protocol(), self._sessions, self.interval_min)
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        with (
+            # Held before a device is opened, which stops whatever another run has it do.
+            alone_in(self.out),
+            polite_kill_as_ctrl_c(),
+            culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
+        ):
+            protocol = self._protocol(len(culture.patterns))
+            settings = self._sessions, self.interval_min, self.seed
+            series = record_in_held_folder(culture, protocol, self.out, *settings, progress)
+        for minute in series.missed_min:
+            print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
+        return series.files
+
+    @property
+    def _sessions(self) -> int:
+        if self.sessions is not None:
+            return self.sessions
+        # Made-up recordings are the paper's.
+        return 15 if self.paper or self.culture == "made-up" else 2
+
+    def _protocol(self, patterns: int = 100) -> Protocol:
+        """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
+        from animat.cultures.kinds import pulse_for
+        from animat.stimulation.protocol import CLOSED_LOOP, PAPER, read_protocol
+
+        assert self.culture != "made-up"
+        # What a file leaves out is the paper's: it stands alone.
+        paper = self.paper or self.protocol is not None
+        usual = replace(PAPER if paper else CLOSED_LOOP, patterns=min(100, patterns), pulse=pulse_for(self.culture))
+        if self.protocol is not None:
+            return read_protocol(self.protocol, usual)
+        asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}
+        return replace(usual, **{name: value for name, value in asked.items() if value is not None})
+
+
+def _say_too_fast(protocol: Protocol) -> None:
+    """Warn of frequencies whose pulses come before the response to the one before is over."""
+    from animat.responses.windows import DEFAULT_WINDOW_MS
+
+    fast = [f"{hz:g} Hz" for hz in protocol.frequencies_hz if 1000 / hz < DEFAULT_WINDOW_MS[1]]
+    if fast:
+        print(
+            f"warning: at {', '.join(fast)} the next pulse comes before the response window ends at "
+            f"{DEFAULT_WINDOW_MS[1]:g} ms, so that responses hold its artefact: read them with a shorter --window-ms",
+            file=sys.stderr,
+        )

@@ -1,0 +1,116 @@
+"""What commands that read responses share: their options, and how findings are said."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from animat.errors import InvalidArgument, Mismatch
+from animat.recordings.findings import Finding, warnings_once
+
+if TYPE_CHECKING:
+    from animat.neurons.timeline import SimulatorTimeline
+    from animat.training.policy import Policy
+
+
+@dataclass(frozen=True)
+class Responding:
+    """How responses are read from recordings; the same in every command that reads them."""
+
+    conditions: str | None = None
+    """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, all; default: by frequency"""
+    window_ms: tuple[float, float] | None = None
+    """Start and end of the response window after a stimulus, in ms; default: 2 10"""
+    burst_threshold: float | None = None
+    """Share of active channels above which a response is a burst; 1 keeps all; default: where two groups part"""
+
+
+@dataclass(frozen=True)
+class Fitting(Responding):
+    """How a neuron simulator is made of responses."""
+
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """memory: draw a response that was measured after a like past, the default but for recordings in blocks; histogram:
+    the paper's; empirical: draw any measured value"""
+    bins: int | None = None
+    """Bins of a histogram; default: 20"""
+    range_hz: float | None = None
+    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
+    allow: tuple[str, ...] = ()
+    """Findings to go on in spite of, by name, such as dead-window"""
+
+    def timeline(self, recordings: Sequence[Path], trained: Policy | None = None) -> SimulatorTimeline:
+        """Read the recordings and fit a simulator to each: as those that a policy was trained on, unless asked."""
+        from animat.neurons.timeline import fit_timeline
+        from animat.recordings.reading import read_sources
+        from animat.responses.conditions import conditions_named
+        from animat.responses.series import extract_series
+        from animat.responses.windows import DEFAULT_WINDOW_MS
+
+        fitted = {} if trained is None else trained.fitted
+        fit = fit_as(fitted, self.simulator, self.bins, self.range_hz)
+        if not recordings:
+            raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
+        by = self.conditions or fitted.get("by")
+        series = extract_series(
+            read_sources(recordings),
+            None if by is None else conditions_named(by),
+            self.window_ms or (trained and trained.window_ms) or DEFAULT_WINDOW_MS,
+            burst_threshold=fitted.get("burst_threshold") if self.burst_threshold is None else self.burst_threshold,
+            allow=self.allow,
+        )
+        timeline = fit_timeline(series, **fit)
+        say_findings(timeline.findings)
+        return timeline
+
+
+def fit_as(trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None) -> dict[str, Any]:
+    """How simulators are made: as those that policies were trained on, unless another kind is asked for.
+
+    Whoever asks for bins asks for a histogram. A kind of None is what suits the recordings (`fit_timeline`).
+
+    Raises:
+        InvalidArgument: for bins of a kind that has none.
+    """
+    usual = {"kind": None, "bins": 20, "range_hz": None}
+    asked = {"kind": kind, "bins": bins, "range_hz": range_hz}
+    given = (asked,) if kind is not None else (trained, asked)
+    made = usual | {name: known[name] for known in given for name in usual if known.get(name) is not None}
+    for option, value in (("--bins", bins), ("--range-hz", range_hz)):
+        if value is None:
+            continue
+        made["kind"] = made["kind"] or "histogram"
+        if made["kind"] != "histogram":
+            raise InvalidArgument(
+                f"{option}: expected none, as a simulator of kind {made['kind']} has no bins; got {value:g}"
+            )
+    return made
+
+
+def say_findings(findings: Sequence[Finding]) -> None:
+    """Warnings go to standard error, so that they are seen and results stay readable; notes are for `inspect`.
+
+    What is found in several recordings is told once, where it is worst, with how many others there are.
+    """
+    for sentence in warnings_once(findings):
+        print(f"warning: {sentence}", file=sys.stderr)
+
+
+def policies_for(robot: str | None, path: Path) -> dict[str, Policy]:
+    """The policies of a file or a folder, and a robot of one's own imported for them.
+
+    Raises:
+        Mismatch: for policies of another robot than was named.
+    """
+    from animat.robots.registry import robot_class
+    from animat.training.policy import load_policies
+
+    expected = None if robot is None else robot_class(robot).name
+    policies = load_policies(path)
+    for name, policy in policies.items():
+        if expected not in (None, policy.robot.name):
+            raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
+    return policies

@@ -1,0 +1,250 @@
+"""The command that runs policies in closed loop on a culture."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from animat.cli.responses import fit_as, policies_for, say_findings
+from animat.cli.stimulating import Stimulating, expect_no_fault
+from animat.errors import InvalidArgument
+from animat.writing import alone_in
+
+if TYPE_CHECKING:
+    from animat.cultures.base import Culture
+    from animat.cultures.budget import Account
+    from animat.progress import Progress
+    from animat.reality_gap import Calibration, RealityGap
+    from animat.recordings.findings import Finding
+    from animat.recordings.recording import Recording
+    from animat.responses.conditions import Conditions
+    from animat.stimulation.pulse import Pulse
+    from animat.training.policy import Policy
+
+CALIBRATION_FILE = "calibration.nwb"
+"""What `run` records first where no recordings are given, in the session's folder."""
+
+
+@dataclass(frozen=True)
+class Run(Stimulating):
+    """Run policies in closed loop on a culture, with controls between them: predicted against lived return."""
+
+    policies: Positional[Path] = Path("policies")
+    """A policy file or a folder of them"""
+    robot: str | None = None
+    """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    recordings: tuple[Path, ...] = ()
+    """Recordings the policies were trained on: their percentiles and prediction; default: the culture is recorded"""
+    at_min: float | None = None
+    """Minute whose newest recording is taken; default: the last that the policies were trained on"""
+    state: Path | None = None
+    """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
+    episodes: int = 5
+    """Of each policy; of each control as many at most, and together no more than of policies, but 5 each"""
+    controls: Literal["all", "random"] = "all"
+    """all: random, constant, silent, shuffled and made by hand; random: only that one"""
+    pulses: int | None = None
+    """Pulses a presentation; default: as the policies' recordings had"""
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """That predicts, as for animat train; default: as the policies were trained"""
+    bins: int | None = None
+    """Bins of a histogram; default: as the policies were trained"""
+    range_hz: float | None = None
+    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: as the policies were trained"""
+    burst_threshold: float | None = None
+    """Share of active channels above which a response is a burst; 1: none is; default: as the policies were trained"""
+    allow: tuple[str, ...] = ()
+    """Findings on the recordings to go on in spite of, by name"""
+    real_time: bool = False
+    """Hold a simulated culture back to real time; a living one always runs in it"""
+    drawn: bool = False
+    """Draw actions from the policies, as in training, instead of taking the most probable one"""
+    seed: int = 1
+    """Decides every random draw, but what a living culture does"""
+    out: Path = Path("session")
+    """Folder for the session's log and recording"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Run."""
+        import numpy as np
+
+        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
+        from animat.closed_loop.loop import Loop
+        from animat.closed_loop.running import check_episodes
+        from animat.compilation import keep_compilations
+        from animat.cultures.budget import Account, Budget
+        from animat.mapping import N_PERCENTILES
+        from animat.neurons.simulator import check_binning
+        from animat.progress import Bar
+        from animat.reality_gap import check_conditions, check_policies, run_policies
+        from animat.recordings.reading import read_recordings
+
+        # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
+        check_episodes("--episodes", self.episodes)
+        if self.seed < 0:
+            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        policies = policies_for(self.robot, self.policies)
+        first = check_policies(policies)
+        fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
+        if fit["kind"] in ("histogram", None):
+            check_binning(fit["bins"], fit["range_hz"])
+        settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
+        Loop.of_policy(first, np.zeros(N_PERCENTILES), **settings)
+        account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
+        keep_compilations()
+        recordings = read_recordings(self.recordings) if self.recordings else []
+        calibration = None
+        if recordings:
+            calibration = self._calibration(recordings, first, self.at_min)
+            check_conditions(first, calibration)
+        with (
+            ExitStack() as told,
+            # Last, as it makes the folder.
+            _held_for_session(self.out, is_recording=not recordings),
+            polite_kill_as_ctrl_c(),
+            Bar("closed loop") as progress,
+            self._culture(recordings, progress) as culture,
+        ):
+            pulse, patterns, noticed = self._presenting(culture, recordings, calibration)
+            if calibration is None:
+                recording = self._record(culture, first, account, progress)
+                calibration = self._calibration([recording], first, recording.start_min)
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                self.out,
+                episodes=self.episodes,
+                with_controls=self.controls == "all",
+                greedy=not self.drawn,
+                follow=self.thresholds == "follow",
+                seed=self.seed,
+                account=account,
+                progress=progress,
+                tell=partial(print, file=sys.stderr),
+                noticed=noticed,
+                pulse=pulse,
+                patterns=patterns,
+                **settings,
+            )
+            # It is told even where the culture cannot be closed then.
+            told.callback(self._tell, gap)
+        return gap.to_dict()
+
+    def _tell(self, gap: RealityGap) -> None:
+        say_findings(gap.findings)
+        print(gap.to_text())
+        if gap.session.recording_file.is_file():
+            print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
+        expect_no_fault(gap.session, self.out)
+
+    def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
+        from animat.cultures.kinds import culture_of, recorded_culture
+
+        if self.culture == "replay" and not recordings:
+            raise InvalidArgument("--recordings: expected some for a replay to answer from, got none")
+        known = recorded_culture(self.culture, recordings, self.recordings)
+        state = self.state or (known.get("state") if self.culture_seed is None else None)
+        seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
+        culture = culture_of(
+            self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
+        )
+        if state is not None:
+            print(f"the culture goes on from {state}", file=sys.stderr)
+        return culture
+
+    def _presenting(
+        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration | None
+    ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
+        """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
+        from animat.cultures.kinds import pulse_for
+        from animat.cultures.same_culture import other_culture, other_patterns
+        from animat.stimulation.protocol import Protocol
+
+        if calibration is None:
+            return pulse_for(self.culture), None, ()
+        found = other_culture(recordings[0], calibration.start_min, culture), other_patterns(recordings[0], culture)
+        noticed = tuple(finding for finding in found if finding is not None)
+        told = recordings[0].provenance.get("protocol")
+        if told is None:
+            return pulse_for(self.culture), None, noticed
+        protocol = Protocol.from_json(told)
+        return protocol.pulse, min(protocol.patterns, len(culture.patterns)), noticed
+
+    def _record(self, culture: Culture, first: Policy, account: Account, progress: Progress) -> Recording:
+        """The culture as it is now, presented as the policies' recordings were."""
+        from animat.cultures.kinds import pulse_for
+        from animat.live.recording import record_within
+        from animat.recordings.formats.nwb import write_nwb
+        from animat.stimulation.protocol import CLOSED_LOOP, PAPER
+
+        presentation = first.presentation or CLOSED_LOOP.presentation
+        protocol = replace(
+            PAPER if presentation.order == "blocked" else CLOSED_LOOP,
+            frequencies_hz=tuple(condition.value for condition in first.conditions),
+            pulses=presentation.pulses,
+            patterns=min(100, len(culture.patterns)),
+            pulse=pulse_for(self.culture),
+        )
+        print("no recordings were given: the culture is recorded first", file=sys.stderr)
+        recording = record_within(account, culture, protocol, self.seed, progress)
+        write_nwb(recording, self.out / CALIBRATION_FILE)
+        return recording
+
+    def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:
+        from animat.reality_gap import Calibration
+        from animat.responses.series import extract_series
+        from animat.responses.windows import DEFAULT_WINDOW_MS
+
+        trained = first.fitted.get("burst_threshold")
+        series = extract_series(
+            recordings,
+            _frequencies(recordings, first),
+            window_ms=first.window_ms or DEFAULT_WINDOW_MS,
+            burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
+            allow=self.allow,
+        )
+        return Calibration.of_series(
+            series, first, at_min=at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
+        )
+
+
+@contextmanager
+def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
+    """Hold a folder that can take a new session; the error of one that cannot says what is there.
+
+    Where the culture `is_recording` first, a recording of a run that failed must not be there: each costs a living
+    culture some thousand pulses.
+    """
+    from animat.closed_loop.session import expect_no_file, expect_no_session
+
+    expect_no_file(folder, "the session")
+    with alone_in(folder):
+        expect_no_session(folder)
+        if is_recording and (there := folder / CALIBRATION_FILE).exists():
+            raise InvalidArgument(
+                f"{there}: the culture was recorded there already, for a session that did not begin; give "
+                f"`--recordings {there}` to run by that, or choose another folder"
+            )
+        yield
+
+
+def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions | None:
+    """The frequencies that policies pick from, which may be some of the recordings'; None where they are not."""
+    from animat.responses.conditions import ByFrequency
+
+    if not first.conditions or any(condition.unit != "Hz" for condition in first.conditions):
+        return None
+    picked = ByFrequency(tuple(condition.value for condition in first.conditions))
+    every = range(len(picked.values_hz))
+    # Where one lacks, the recordings' own conditions say better what is there instead.
+    return picked if all(set(every) <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None

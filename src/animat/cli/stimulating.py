@@ -1,0 +1,61 @@
+"""What commands that stimulate a culture share: their options, and how a session that broke off is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from animat.errors import InvalidFile, LoopEnded
+
+if TYPE_CHECKING:
+    from animat.closed_loop.session import Session
+
+
+@dataclass(frozen=True)
+class Stimulating:
+    """On which culture, and how much it may be stimulated; the same in every command that does."""
+
+    culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1 and maxone: the devices"""
+    selection: Path | None = None
+    """For a maxone: the file of its electrodes"""
+    culture_seed: int | None = None
+    """Which virtual culture, or which patterns of a CL1; default: those of the recordings, else 1"""
+    budget_pulses: int | None = None
+    """Most pulses in all, recordings included; default: no end, but the culture's limits"""
+    budget_per_electrode: int | None = None
+    """Most pulses on any one electrode"""
+    thresholds: Literal["follow", "held"] = "follow"
+    """The mapping's percentiles in closed loop: following the culture's newest responses, or held from the recording"""
+    on_burst: Literal["use", "repeat", "skip"] = "use"
+    """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
+    on_late: Literal["continue", "stop"] = "continue"
+    """A pulse that comes late: continue and log it, or stop"""
+    pause_s: float = 2.0
+    """Without stimulation before each episode"""
+    lead_in: int | None = None
+    """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
+    patience_s: float = 10.0
+    """How much longer than it should a culture may take to answer before the session is ended"""
+
+    def _of_the_loop(self) -> dict[str, Any]:
+        """Settings of the closed loop."""
+        return {
+            "on_burst": self.on_burst,
+            "on_late": self.on_late,
+            "pause_s": self.pause_s,
+            "lead_in": self.lead_in,
+            "patience_s": self.patience_s,
+        }
+
+
+def expect_no_fault(session: Session, folder: Path) -> None:
+    """Turn an ending before its time into an error, now that all is told and written."""
+    ending = session.ending
+    if ending.by == "person":
+        raise KeyboardInterrupt
+    if ending.by != "plan":
+        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
+    if not session.recording_file.is_file():
+        raise InvalidFile(ending.sentence)

@@ -1,0 +1,79 @@
+"""The command that runs a study of one's own from a TOML file."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    from animat.studies.specification import Study
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """A study of one's own from a TOML file: recordings, robots, conditions. Goes on where it stopped."""
+
+    specification: Positional[Path]
+    """The TOML file; animat reproduce leaves one to start from in its folder"""
+    workers: int | None = None
+    """Processes, each on its own core; default: one a core"""
+    out: Path = Path("study")
+    """Folder for everything; the report is report.html in it"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Run it."""
+        from animat.studies.toml import read_study
+
+        return run_and_tell(read_study(self.specification), self.specification.parent, self.out, self.workers)
+
+
+def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
+    """Run a study, whose files are named as seen from `base`, and print its comparisons."""
+    from animat.progress import Bar
+    from animat.studies.heuristic import not_outperforming
+    from animat.studies.places import read_table, table_file
+    from animat.studies.run import run_study
+
+    for body in study.robots:
+        for caveat in body.robot().caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+    cores = len(os.sched_getaffinity(0))
+    if workers is not None and workers > cores:
+        print(f"warning: --workers: {workers} were asked for; there is one a core, {cores}", file=sys.stderr)
+    began = time.monotonic()
+    with Bar("study") as progress:
+        ran = run_study(study, out, base=base, workers=workers, progress=progress)
+    comparisons = read_table(table_file(ran.folder, "comparisons"))
+    for row in comparisons:
+        paper = (
+            ""
+            if row["paper_p"] is None
+            else f"; the paper's p {row['paper_p']:.3g}, which implies U {row['paper_u']:g}"
+        )
+        print(
+            f"{row['robot']:11} {row['comparison']:28} {row['mean_first']:8.1f} {row['mean_second']:8.1f}  "
+            f"U {row['u']:<4g} p {row['p_normal']:<9.3g} {row['outcome']}{paper}"
+        )
+    beside = not_outperforming(ran.folder)
+    for sentence in beside:
+        print(sentence)
+    if ran.done_now:
+        print(f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s; report: {ran.report}")
+    else:
+        print(f"nothing to do: all {ran.jobs} jobs are done; report: {ran.report}")
+    return {
+        "folder": str(ran.folder),
+        "report": str(ran.report),
+        "jobs": ran.jobs,
+        "done_now_cpu_s": ran.done_now,
+        "comparisons": comparisons,
+        "not_outperforming_the_heuristic": beside,
+    }

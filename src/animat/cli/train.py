@@ -1,0 +1,171 @@
+"""The command that trains policies on recordings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from animat.cli.responses import Fitting, say_findings
+from animat.errors import InvalidArgument, UnusableData
+from animat.writing import expect_writable
+
+if TYPE_CHECKING:
+    from animat.neurons.timeline import SimulatorTimeline
+
+
+@dataclass(frozen=True)
+class Train(Fitting):
+    """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
+
+    robot: Positional[str] = "cartpole"
+    """The robot to drive: cartpole, navigation, or one of your own, such as my_package.robots:Rover"""
+    recordings: tuple[Path, ...] = ()
+    """Files or folders of recordings of one culture"""
+    paper: bool = False
+    """The paper's setting: 1-threshold, histogram, 10 policies, 60 minutes; default: what works in a closed loop"""
+    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] | None = None
+    """From responses to motor commands; none: the baseline without neurons; default: 9-thresholds, with --paper
+    1-threshold"""
+    policies: int | None = None
+    """How many policies, each from its own random numbers; default: 4, with --paper 10"""
+    iterations: int | None = None
+    """Training iterations of each; default: 400000 for cartpole, 250000 for others, with --paper twice as many"""
+    seed: int = 1
+    """Decides every random draw"""
+    shadowing: Literal["on", "off"] = "on"
+    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout"""
+    duration_min: float | None = None
+    """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
+    percentiles: Literal["moving", "first"] = "moving"
+    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    delivery: Literal["chosen", "shuffled"] = "chosen"
+    """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
+    parameters: tuple[str, ...] = ()
+    """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
+    workers: int | None = None
+    """Processes, each on its own core; default: one a core"""
+    out: Path = Path("policies")
+    """Folder for the policies"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Train."""
+        from animat.mapping import mapping_named
+        from animat.progress import Bar
+        from animat.robots.registry import robot_named
+        from animat.training.specification import Training
+
+        # What can be refused is refused before recordings are read, which can take a while.
+        if self.workers is not None and self.workers < 1:
+            raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
+        if not self.out.is_dir():
+            expect_writable(self.out)
+        robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
+        usual = _PAPER if self.paper else _USUAL
+        mapping = self.mapping or usual["mapping"]
+        training = Training(
+            robot=robot,
+            mapping=None if mapping == "none" else mapping_named(mapping),
+            policies=usual["policies"] if self.policies is None else self.policies,
+            iterations=usual["share"] * robot.paper_iterations // 100 if self.iterations is None else self.iterations,
+            seed=self.seed,
+            shadowing=self.shadowing == "on",
+            duration_min=usual["duration_min"] if self.duration_min is None else self.duration_min,
+            percentiles=self.percentiles,
+            delivery=self.delivery,
+            commands=robot.baseline_commands if mapping == "none" else None,
+        )
+        from animat.training.trainer import expect_folder_for, expect_trainable, is_finished, train
+
+        expect_trainable(training, is_saved=True)
+        expect_folder_for(training, self.out)
+        for caveat in robot.caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+        fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
+        timeline = None if mapping == "none" else fitting.timeline(self.recordings)
+
+        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.allow:
+            raise UnusableData(
+                "--conditions: expected two or more for an agent to choose from, got one "
+                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                "(to go on in spite of it: --allow one-condition)"
+            )
+        was_finished = is_finished(training, self.out)
+        if timeline is not None:
+            print(_control(timeline))
+        with Bar("training") as progress:
+            trained = train(
+                training,
+                timeline,
+                self.out,
+                workers=self.workers,
+                progress=progress,
+                sources=[str(path) for path in self.recordings],
+            )
+        if was_finished:
+            print(f"this training was finished before: its policies are in {self.out}, as they were")
+        from animat.evaluation.table import evaluate
+
+        first = next(iter(trained.values()))
+        until = None if timeline is None else first.trained_until_min(float(timeline.start_min[0]))
+        evaluation = evaluate(trained, timeline, at_min=until, controls=("random",))
+        say_findings(evaluation.findings)
+        policies, random = (row.to_dict() for row in evaluation.rows)
+        on = "" if evaluation.recorded_at_min is None else f" on the simulator at {evaluation.recorded_at_min:g} min"
+        error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
+        counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
+        mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{random['mean_return']:.1f}"
+        print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
+        return {
+            "policies": [str(self.out / f"{name}.safetensors") for name in trained],
+            "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
+            "random": random["mean_return"],
+            "recorded_at_min": evaluation.recorded_at_min,
+            "findings": [finding.to_dict() for finding in evaluation.findings],
+        }
+
+
+_USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
+"""What works in a closed loop; `share`: of the paper's iterations, in per cent."""
+_PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
+
+
+def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
+    numbers = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            numbers[name] = int(value) if value.lstrip("-").isdecimal() else float(value)
+        except ValueError:
+            raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
+    return numbers
+
+
+def _control(timeline: SimulatorTimeline) -> str:
+    """How much the conditions differ, which bounds what any controller can do."""
+    shares = timeline.fidelities[0].in_simulator
+    told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
+    said = next((f.sentence for f in timeline.findings if f.name == "difference"), None)
+    first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
+    return "\n".join([first, *([said] if said else []), *_memories(timeline)])
+
+
+def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
+    """What each simulator remembers, where they are of the kind that does."""
+    from animat.neurons.memory import NO_MEMORY, MemorySimulator
+
+    for start_min in timeline.start_min.tolist():
+        simulator = timeline.at(start_min)
+        if isinstance(simulator, MemorySimulator):
+            decay, weight, reach = memory = simulator.memory
+            told = (
+                f"{decay:.2g} of the past is left by each presentation, which weighs {weight:.2g} beside its answer; "
+                f"one of the n^{reach:.2g} responses with the nearest pasts is drawn"
+            )
+            yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

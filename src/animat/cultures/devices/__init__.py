@@ -1,0 +1,1 @@
+"""Cultures on devices: the CL1 through cl-sdk, the MaxOne through maxlab."""

@@ -1,0 +1,160 @@
+"""One delivery on a CL1: pulses run at frames of its clock, while a loop reads the spikes."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.cultures.pace import Pace
+from animat.errors import DeviceFailed
+from animat.stimulation.pulse import Pulse
+from animat.stimulation.stimulus import Stimulus
+
+FRAMES_PER_S = 25_000
+LEAD_US = 80
+"""The shortest time from a command to its pulse."""
+LEAD_FRAMES = LEAD_US * FRAMES_PER_S // 1_000_000
+AHEAD_FRAMES = 2_500
+"""Pulses are handed to the device up to 100 ms before their time: the computer may fall behind by as much, and no
+more than that has to be taken back when all is stopped."""
+
+Ran = tuple[int, int, Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], Float64[np.ndarray, " stimuli"]]
+
+
+class Delivery:
+    """Delivers stimuli through `Neurons.loop` and stim plans.
+
+    A plan runs at a frame, and its pulse comes one lead time later. Each is handed over within the loop, in the order
+    of time. When one cannot be in time, it and all after it are moved back together: times between pulses only grow.
+
+    Args:
+        cl: the SDK.
+        neurons: of the SDK, open.
+        pace: the limits on the device's clock.
+        ticks_per_s: of the loop.
+        margin_frames: least time from now to the run of a plan.
+        jitter: what the loop is told of jitter.
+        keep: called with frame and parameters of each pulse handed over.
+        lock: held while a pulse is handed over.
+    """
+
+    def __init__(
+        self,
+        cl: Any,
+        neurons: Any,
+        pace: Pace,
+        *,
+        ticks_per_s: int,
+        margin_frames: int,
+        jitter: dict[str, Any],
+        keep: Callable[[int, dict[str, Any]], None],
+        lock: AbstractContextManager[Any],
+    ) -> None:
+        self._cl, self._neurons, self._pace = cl, neurons, pace
+        self._ticks_per_s, self._margin_frames, self._jitter = ticks_per_s, margin_frames, jitter
+        self._keep, self._lock = keep, lock
+        self._designs: dict[Pulse, Any] = {}
+
+    def run(self, stimuli: Sequence[Stimulus], duration_s: float, *, since: int, is_halted: Callable[[], bool]) -> Ran:
+        """Deliver, and read until `duration_s` after the start, and as much longer as the stimuli began late.
+
+        Args:
+            stimuli: in the order of time.
+            duration_s: of reading, which starts when the loop does.
+            since: frame that times of stimuli count from: no later than the start.
+            is_halted: whether to hand over nothing more.
+
+        Returns:
+            First frame, frame after the last, frames and channels of the spikes, and the frame each stimulus began at.
+
+        Raises:
+            DeviceFailed: if it was stopped half way, or a pulse never came.
+        """
+        waiting, asked = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
+        handed: list[int] = []
+        frames, channels, reported = [], [], defaultdict[int, deque[int]](deque)
+        late, start, stop = 0, None, 0
+        for tick in self._neurons.loop(self._ticks_per_s, **self._jitter):
+            found = tick.analysis
+            if start is None:
+                start = int(found.start_timestamp)
+            stop = int(found.stop_timestamp)
+            frames += [spike.timestamp for spike in found.spikes]
+            channels += [spike.channel for spike in found.spikes]
+            for pulse in sorted(found.stims, key=lambda pulse: pulse.timestamp):
+                reported[pulse.channel].append(pulse.timestamp)
+            self._check_going(is_halted, len(handed), len(stimuli))
+            while waiting and asked[len(handed)] + late < stop + AHEAD_FRAMES:
+                # A stop from another thread comes before a hand-over, which then is none, or after, and takes it back.
+                with self._lock:
+                    self._check_going(is_halted, len(handed), len(stimuli))
+                    frame = self._hand_over(waiting.popleft(), asked[len(handed)] + late)
+                late = frame - asked[len(handed)]
+                handed.append(frame)
+            end = start + int(np.ceil(duration_s * FRAMES_PER_S)) + late
+            if not waiting and stop >= max(end, handed[-1] + 1 if handed else 0):
+                tick.loop.stop()
+        if start is None or waiting:
+            raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended before")
+        begun = [self._began(stimulus, frame, reported, start) for stimulus, frame in zip(stimuli, handed, strict=True)]
+        return start, stop, np.array(frames, np.int64), np.array(channels, np.int64), np.array(begun, np.float64)
+
+    @staticmethod
+    def _check_going(is_halted: Callable[[], bool], handed: int, of: int) -> None:
+        if of and is_halted():
+            raise DeviceFailed(
+                f"CL1: stopped while delivering: {handed} of {of} stimuli had been handed to the device, and what had "
+                "not begun was interrupted"
+            )
+
+    def _hand_over(self, stimulus: Stimulus, frame: int) -> int:
+        """Give one stimulus to the device, at a frame or as soon after it as can be; returns the frame."""
+        soonest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
+        alone = [replace(stimulus, time_s=0.0)]
+        frame = round(self._pace.soonest(alone, max(frame, soonest) / FRAMES_PER_S) * FRAMES_PER_S)
+        self._pace.count(alone, frame / FRAMES_PER_S)
+        plan = self._neurons.create_stim_plan()
+        plan.stim(self._cl.ChannelSet(*stimulus.electrodes), self._design(stimulus.pulse), lead_time_us=LEAD_US)
+        plan.run(at_timestamp=frame - LEAD_FRAMES)
+        self._keep(frame, _parameters(stimulus))
+        return frame
+
+    def _design(self, pulse: Pulse) -> Any:
+        if pulse not in self._designs:
+            numbers: list[float] = []
+            for phase in pulse.phases:
+                assert phase.amplitude_ua is not None
+                numbers += [round(phase.duration_us), float(phase.amplitude_ua)]
+            self._designs[pulse] = self._cl.StimDesign(*numbers)
+        return self._designs[pulse]
+
+    @staticmethod
+    def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], start: int) -> int:
+        """The frame at which the device says that a stimulus began on its first electrode; it must name all of them."""
+        began = []
+        for electrode in stimulus.electrodes:
+            while reported[electrode] and reported[electrode][0] < frame:
+                reported[electrode].popleft()
+            if not reported[electrode]:
+                raise DeviceFailed(
+                    f"CL1: expected a pulse on channel {electrode} {(frame - start) / FRAMES_PER_S:g} s into the "
+                    "delivery, got none: the device left it out"
+                )
+            began.append(reported[electrode].popleft())
+        return min(began)
+
+
+def _parameters(stimulus: Stimulus) -> dict[str, Any]:
+    """What the rig's own file does not keep of a stimulus."""
+    words: dict[str, Any] = {"electrodes": list(stimulus.electrodes), "presentation": stimulus.presentation}
+    if np.isfinite(stimulus.frequency_hz):
+        words["frequency_hz"] = stimulus.frequency_hz
+    if stimulus.pattern >= 0:
+        words["pattern"] = stimulus.pattern
+    return {**words, "phases": stimulus.pulse.to_list()}

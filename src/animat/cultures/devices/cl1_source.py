@@ -1,0 +1,290 @@
+"""The simulated tissue offered to the CL1's SDK as a source of data: any CL application runs on it as on a device.
+
+from animat.cultures.devices.cl1_source import use_simulated_culture
+use_simulated_culture(seed=1)          # before `cl.open()`; the SDK's simulator then reacts to stimuli
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int16
+
+from animat.cultures.devices.cl1_delivery import FRAMES_PER_S
+from animat.cultures.tissue import Pulse, Tissue, TissueParameters
+from animat.cultures.virtual import WARM_UP_S
+from animat.cultures.visibility import amplitudes_at_soma_uv
+from animat.errors import InvalidArgument
+from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION
+
+FACTORY = "animat.cultures.devices.cl1_source:simulated_culture"
+UV_PER_UNIT = 0.195
+BLOCK_FRAMES = 1024
+REAL_TIME_NEURONS = 200
+"""With as many, an application that stimulates on every spike at 1,000 ticks a second leaves 30 % of two cores free."""
+REAL_TIME_SHARE = 0.7
+"""Of real time, what computing may take."""
+TRIED_FRAMES, FRAMES_AT_ONCE = 2_500, 5
+"""How much is tried at opening, and in what pieces: as the SDK reads in real time."""
+SAMPLES = 75
+BEFORE = 25
+"""Samples of a spike that the SDK shows, and how many of them lie before its time."""
+
+
+class StimulusEvent(Protocol):
+    """What the SDK says of one pulse on one channel (`cl.sim.DataSourceStim`)."""
+
+    timestamp: int
+    channel: int
+    phase_durations_us: tuple[int, ...]
+    phase_currents_uA: tuple[float, ...]
+
+
+class Spike(Protocol):
+    """A spike for the SDK: frame, channel, waveform."""
+
+    timestamp: int
+    channel: int
+    samples: Float32[np.ndarray, " samples"]
+
+
+class SimulatedCL1:
+    """A tissue under the CL1's 8 x 8 electrodes, read in frames; knows nothing of the SDK.
+
+    A pulse acts with strength q / `charge_nc`, q being its largest cathodic charge, up to the 2 that the tissue
+    knows, at the first step of the tissue (0.2 ms, five frames) that does not begin before it. A channel sees every
+    neuron within `reach_um`. Frames hold noise and every spike from its trough on. All depends on seed, parameters and
+    pulses only, not on the pieces in which it is read: noise is drawn for whole blocks of frames.
+
+    Args:
+        seed: which culture.
+        neurons: of the tissue; with fewer than 1,200, each has fewer partners in proportion. More than the default may
+            be too many for real time, which opening says: the application then falls behind the SDK's buffer.
+        pitch_um: between electrodes, in the middle of the tissue. Assumed: the SDK does not say.
+        reach_um: of an electrode; assumed, and wider than a CMOS array's, as its electrodes are larger.
+        charge_nc: that makes a pulse of strength 1; assumed: what a bare current of 1 uA has in the SDK (160 us).
+        noise_uv: root mean square of the noise.
+
+    Raises:
+        InvalidArgument: for a setting that cannot be.
+    """
+
+    def __init__(
+        self,
+        seed: int = 1,
+        *,
+        neurons: int = REAL_TIME_NEURONS,
+        pitch_um: float = 200.0,
+        reach_um: float = 100.0,
+        charge_nc: float = 0.16,
+        noise_uv: float = 2.4,
+    ) -> None:
+        for name, value in (("pitch_um", pitch_um), ("reach_um", reach_um), ("charge_nc", charge_nc)):
+            if not 0 < value < 1e6:
+                raise InvalidArgument(f"{name}: expected above 0, got {value}")
+        parameters = TissueParameters()
+        share = min(1.0, neurons / parameters.neurons)
+        parameters = replace(
+            parameters,
+            neurons=neurons,
+            in_degree_e=max(1, round(parameters.in_degree_e * share)),
+            in_degree_i=max(1, round(parameters.in_degree_i * share)),
+        )
+        self._tissue = Tissue(seed, parameters)
+        self._seed, self._charge_nc, self._noise_units = seed, charge_nc, noise_uv / UV_PER_UNIT
+        self._step_frames = round(parameters.step_ms * 1e-3 * FRAMES_PER_S)
+        width_um, height_um = float(np.max(self._tissue.x_um)), float(np.max(self._tissue.y_um))
+        channel = np.arange(CHANNELS)
+        self.x_um = width_um / 2 + (channel // 8 - 3.5) * pitch_um
+        self.y_um = height_um / 2 + (channel % 8 - 3.5) * pitch_um
+        self._is_electrode = ~np.isin(channel, list(NO_STIMULATION))
+        self._sees = self._neurons_seen(reach_um)
+        amplitude_uv = amplitudes_at_soma_uv(np.random.default_rng([seed, 11]), len(self._tissue.x_um))
+        self._shapes = _waveform()[None, :] * amplitude_uv[:, None].astype(np.float32)
+        self._tissue.advance(WARM_UP_S)
+        # The first pulse on an electrode finds what it reaches, and compiles: the SDK waits for 100 ms and no longer.
+        before = self._tissue.snapshot()
+        self._tissue.advance(
+            0.01, [Pulse(self._tissue.now_s, self.x_um[c : c + 1], self.y_um[c : c + 1]) for c in channel.tolist()]
+        )
+        self._tissue.restore(before)
+        self._zero_frames = round(self._tissue.now_s * FRAMES_PER_S)
+        self._next = 0
+        self._pulses: list[Pulse] = []
+        self._held: list[tuple[int, int, int]] = []
+        self._sounding: list[tuple[int, int, int]] = []
+        self._block: tuple[int, Int16[np.ndarray, "frames channels"]] | None = None
+
+    def stimulate(self, events: Sequence[StimulusEvent]) -> None:
+        """Take note of pulses; those of one frame on several channels are one stimulus. What is late acts at once."""
+        strength: dict[tuple[int, float], list[int]] = {}
+        for event in events:
+            if 0 <= event.channel < CHANNELS and self._is_electrode[event.channel]:
+                charges = zip(event.phase_durations_us, event.phase_currents_uA, strict=True)
+                cathodic_nc = max([0.0, *(-us * ua / 1000 for us, ua in charges)])
+                if cathodic_nc > 0:
+                    key = (event.timestamp, min(2.0, cathodic_nc / self._charge_nc))
+                    strength.setdefault(key, []).append(event.channel)
+        for (frame, how), channels in sorted(strength.items()):
+            at_s = (self._zero_frames + max(0, frame)) / FRAMES_PER_S
+            self._pulses.append(Pulse(at_s, self.x_um[sorted(channels)], self.y_um[sorted(channels)], how))
+
+    def read(
+        self, from_frame: int, frame_count: int
+    ) -> tuple[Int16[np.ndarray, "frames channels"], list[tuple[int, int, Float32[np.ndarray, " samples"]]]]:
+        """Frames from `from_frame` on, and the spikes within, in the order of time: frame, channel, waveform.
+
+        Raises:
+            InvalidArgument: for frames that were read before.
+        """
+        if from_frame < self._next:
+            raise InvalidArgument(f"from_frame: expected {self._next} or later, as time only goes on, got {from_frame}")
+        to_frame = from_frame + frame_count
+        self._advance(to_frame)
+        # What was skipped was not looked at.
+        due = [spike for spike in self._held if from_frame <= spike[0] < to_frame]
+        self._held = [spike for spike in self._held if spike[0] >= to_frame]
+        sounding = [*(self._sounding if from_frame == self._next else ()), *due]
+        frames = self._noise(from_frame, frame_count)
+        if sounding:
+            signal = frames.astype(np.float32)
+            for frame, channel, neuron in sounding:
+                shape = self._shapes[neuron, BEFORE:] / np.float32(UV_PER_UNIT)
+                here = shape[max(0, from_frame - frame) : to_frame - frame]
+                first = max(0, frame - from_frame)
+                signal[first : first + len(here), channel] += here
+            frames = np.clip(np.rint(signal), -32768, 32767).astype(np.int16)
+        self._sounding = [spike for spike in sounding if spike[0] + SAMPLES - BEFORE > to_frame]
+        self._next = to_frame
+        return frames, [(frame, channel, self._shapes[neuron]) for frame, channel, neuron in due]
+
+    def share_of_real_time(self) -> float:
+        """What computing takes of real time, timed on a tenth of a second in pieces as the SDK reads them.
+
+        Afterwards the culture is where it was. Stimuli come on top, and what the application computes in its process.
+
+        Raises:
+            InvalidArgument: for a culture that was read.
+        """
+        if self._next:
+            raise InvalidArgument(f"expected a culture that was not read, got one that was read to frame {self._next}")
+        before, begun_s = self._tissue.snapshot(), time.perf_counter()
+        for frame in range(0, TRIED_FRAMES, FRAMES_AT_ONCE):
+            self.read(frame, FRAMES_AT_ONCE)
+        took_s = time.perf_counter() - begun_s
+        self._tissue.restore(before)
+        self._next, self._held, self._sounding = 0, [], []
+        return took_s / (TRIED_FRAMES / FRAMES_PER_S)
+
+    def too_large(self) -> str | None:
+        """What there is to say of a culture that real time may not carry; None of one that it does."""
+        neurons, share = len(self._sees), self.share_of_real_time()
+        if neurons <= REAL_TIME_NEURONS and share <= REAL_TIME_SHARE:
+            return None
+        return (
+            f"warning: a simulated culture of {neurons} neurons in real time: computing a second of it takes "
+            f"{share:.2f} s here, stimuli and the application not counted; {REAL_TIME_NEURONS} neurons leave 30 % of "
+            "two idle cores to spare: take fewer, or CL_SDK_ACCELERATED_TIME=1"
+        )
+
+    def _advance(self, to_frame: int) -> None:
+        """Step the tissue to the end of the step that the frames end within."""
+        target = -(-(self._zero_frames + to_frame) // self._step_frames) * self._step_frames
+        now = round(self._tissue.now_s * FRAMES_PER_S)
+        if target <= now:
+            return
+        now_s, end_s = now / FRAMES_PER_S, target / FRAMES_PER_S
+        due = [replace(pulse, time_s=max(pulse.time_s, now_s)) for pulse in self._pulses if pulse.time_s < end_s]
+        self._pulses = [pulse for pulse in self._pulses if pulse.time_s >= end_s]
+        spikes = self._tissue.advance(end_s - now_s, due)
+        for time_s, neuron in zip(spikes.time_s.tolist(), spikes.neuron.tolist(), strict=True):
+            frame = round(time_s * FRAMES_PER_S) - self._zero_frames
+            self._held += [(max(frame, self._next), channel, neuron) for channel in self._sees[neuron]]
+
+    def _neurons_seen(self, reach_um: float) -> list[list[int]]:
+        """The channels that see each neuron."""
+        x_um, y_um = self._tissue.x_um, self._tissue.y_um
+        near: Bool[np.ndarray, "neurons channels"] = (
+            np.hypot(x_um[:, None] - self.x_um, y_um[:, None] - self.y_um) <= reach_um
+        ) & self._is_electrode
+        return [np.flatnonzero(row).tolist() for row in near]
+
+    def _noise(self, from_frame: int, count: int) -> Int16[np.ndarray, "frames channels"]:
+        """Noise of these frames, drawn block by block so that it does not depend on how it is read."""
+        pieces, frame = [], from_frame
+        while frame < from_frame + count:
+            number, first = divmod(frame, BLOCK_FRAMES)
+            if self._block is None or self._block[0] != number:
+                rng = np.random.default_rng([self._seed, 15, number])
+                drawn = np.rint(self._noise_units * rng.standard_normal((BLOCK_FRAMES, CHANNELS), np.float32))
+                drawn[:, ~self._is_electrode] = 0
+                self._block = number, drawn.astype(np.int16)
+            taken = min(BLOCK_FRAMES - first, from_frame + count - frame)
+            pieces.append(self._block[1][first : first + taken])
+            frame += taken
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+
+
+def _waveform() -> Float64[np.ndarray, " samples"]:
+    """A spike of size 1, its trough at sample 25: a narrow trough and a wide peak half a millisecond after it."""
+    t_ms = (np.arange(SAMPLES) - BEFORE) / FRAMES_PER_S * 1e3
+    shape = -np.exp(-((t_ms / 0.09) ** 2) / 2) + 0.3 * np.exp(-(((t_ms - 0.45) / 0.35) ** 2) / 2) * (t_ms > 0)
+    return np.asarray(shape / -shape[BEFORE], dtype=np.float32)
+
+
+def _metadata() -> Any:
+    from cl.sim import SimulatorDataSourceMetadata
+
+    return SimulatorDataSourceMetadata(channel_count=CHANNELS, uV_per_sample_unit=UV_PER_UNIT, seekable=False)
+
+
+def simulated_culture(**settings: Any) -> Any:
+    """The factory that the SDK imports in its own process: a `cl.sim.SimulatorDataSource` of a `SimulatedCL1`."""
+    from cl.sim import DataSourceBatch, DataSourceSpike, SimulatorDataSource
+
+    class Source(SimulatorDataSource):  # type: ignore[misc]
+        """Opens a tissue in the simulator's process; it is made anew whenever the SDK opens it."""
+
+        def __init__(self) -> None:
+            self._culture: SimulatedCL1 | None = None
+
+        @property
+        def metadata(self) -> Any:
+            return _metadata()
+
+        def open(self) -> None:
+            self._culture = SimulatedCL1(**settings)
+            is_real_time = os.environ.get("CL_SDK_ACCELERATED_TIME") != "1"
+            if is_real_time and (told := self._culture.too_large()) is not None:
+                print(told, file=sys.stderr, flush=True)
+
+        def close(self) -> None:
+            self._culture = None
+
+        def on_stims(self, stims: Sequence[StimulusEvent]) -> None:
+            if self._culture is not None:
+                self._culture.stimulate(stims)
+
+        def read(self, from_timestamp: int, frame_count: int) -> Any:
+            assert self._culture is not None
+            frames, spikes = self._culture.read(from_timestamp, frame_count)
+            return DataSourceBatch(frames=frames, spikes=[DataSourceSpike(f, c, samples=w) for f, c, w in spikes])
+
+    return Source()
+
+
+def use_simulated_culture(**settings: Any) -> None:
+    """Let the SDK's simulator read from a simulated culture, from the next `cl.open()` on.
+
+    Args:
+        settings: of `SimulatedCL1`, as data for JSON.
+    """
+    import cl.sim
+
+    cl.sim.set_simulator_data_source(FACTORY, config=settings, metadata=_metadata())

@@ -1,0 +1,354 @@
+"""A culture on a MaxWell MaxOne, through the vendor's module `maxlab`, which comes with MaxLab Live."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Int64
+
+from animat.cultures.base import Culture
+from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
+from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
+from animat.cultures.devices.maxone_wiring import Wiring, wire
+from animat.cultures.failing import in_words
+from animat.cultures.history import History
+from animat.cultures.holding import of_the_machine
+from animat.cultures.observed import Observed, Spikes
+from animat.cultures.pace import Pace, from_zero
+from animat.cultures.safety import Admitted, Limits
+from animat.errors import AnimatError, DeviceFailed, InvalidArgument
+from animat.recordings.recording import Channels
+from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
+
+DAC_STEPS = 511
+"""Codes on either side of 0 V."""
+
+MAXONE_LIMITS = Limits(
+    kind="voltage",
+    amplitude=400.0,
+    phase_us=(SAMPLE_US, 1000.0),
+    charge_per_phase=200.0,
+    # In what the converter makes of it; what is left is rounding.
+    net_charge=1e-6,
+    net_charge_per_session=1e-3,
+    electrodes_at_once=32,
+    stimuli_per_electrode_s=100,
+    stimuli_per_s=200,
+    stimuli_per_session=1_000_000,
+    phases_per_pulse=4,
+    alternates=True,
+    phase_step_us=SAMPLE_US,
+    interval_us=10_000.0,
+    gap_us=1_000.0,
+)
+"""Ours, not the vendor's, whose converter would give 1.5 V: for a living culture, up to twice the paper's pulse.
+`amplitude_step` is the converter's, asked from the device when it is opened."""
+
+
+class MaxOneCulture(Culture):
+    """A culture on a MaxOne: electrodes as selected, one stimulation unit each, all driven by one converter.
+
+    Opening routes the array and refuses, by name, every stimulation electrode that was not routed, got no unit, or
+    shares one with another. Recording electrodes that were not routed are left out and counted. All units in use are
+    powered from opening to closing; a stimulus connects those of its electrodes, for as long as its pulse lasts.
+
+    Stimuli that follow each other within `sequence_s` are one sequence, in which times are exact (50 us), made anew
+    each time; one that is alone is kept on the device as a sequence of its pattern and pulse, and sent again. When a
+    sequence starts is the computer's doing: `stimulus_time_s` is estimated from the newest frame when the server had
+    taken it. `stop` takes the power from all units.
+
+    Never run on a device: `docs/hardware.md` says what was tested against what.
+
+    Args:
+        selection: electrodes to record, to stimulate, and the patterns.
+        stream: where spikes come from; None: the vendor's server, through ZeroMQ.
+        sequence_s: the longest time that one sequence spans.
+        settle: whether to wait as long as the vendor says after each step of opening.
+        limits: tighter limits than `MAXONE_LIMITS`.
+
+    Raises:
+        InvalidArgument: for a selection on another array, or without sites.
+    """
+
+    name: ClassVar[str] = "maxone"
+
+    def __init__(
+        self,
+        selection: Selection,
+        *,
+        stream: SpikeStream | None = None,
+        sequence_s: float = 1.0,
+        settle: bool = True,
+        limits: Limits | None = None,
+    ) -> None:
+        super().__init__(limits)
+        array = selection.array
+        if (array.columns, array.rows) != (220, 120):
+            raise InvalidArgument(f"selection: expected one on a MaxOne, got one on a {array.name}")
+        if not len(selection.recording) or not 1 <= len(selection.stimulation) <= array.stimulation_units:
+            raise InvalidArgument(
+                f"selection: expected recording sites and 1 to {array.stimulation_units} stimulation sites, got "
+                f"{len(selection.recording)} and {len(selection.stimulation)}"
+            )
+        if not 0 < sequence_s <= 60:
+            raise InvalidArgument(f"sequence_s: expected above 0 to 60 s, got {sequence_s}")
+        self.selection = selection
+        self._given_stream, self._sequence_s, self._settle = stream, sequence_s, settle
+        self._mx: ModuleType | None = None
+        self._stream: SpikeStream | None = None
+        self._wiring: Wiring | None = None
+        self._sequences: Sequences | None = None
+        self._pace: Pace | None = None
+        self._begun = History()
+        self._lsb_mv = 0.0
+        # The first frame, and the last one before it was closed.
+        self._zero_frame, self._last_frame = 0, -1
+        self._halted = threading.Event()
+        self.spikes_not_recorded = 0
+        """Spikes that the device reported on amplifiers that no recording electrode is routed to; left out."""
+
+    @property
+    def channels(self) -> Channels:
+        """The recording electrodes that were routed; a label is the amplifier's number."""
+        return self._wired().channels
+
+    @property
+    def not_routed(self) -> tuple[int, ...]:
+        """Recording electrodes that were asked for and not routed."""
+        return self._wired().not_routed
+
+    @property
+    def stimulation_electrodes(self) -> tuple[int, ...]:
+        """Those of the selection: all of them are connected, or the culture does not open."""
+        return tuple(self.selection.stimulation.tolist())
+
+    @property
+    def patterns(self) -> Int64[np.ndarray, "patterns size"]:
+        """Those of the selection."""
+        return self.selection.patterns
+
+    @property
+    def device(self) -> Path:
+        """The one that MaxLab Live's server on this machine has."""
+        return of_the_machine("maxone")
+
+    @property
+    def device_limits(self) -> Limits:
+        """`MAXONE_LIMITS` with the device's own step of voltage, once it is open."""
+        reach_mv = DAC_STEPS * self._lsb_mv or MAXONE_LIMITS.amplitude
+        return replace(MAXONE_LIMITS, amplitude=min(MAXONE_LIMITS.amplitude, reach_mv), amplitude_step=self._lsb_mv)
+
+    @property
+    def now_s(self) -> float:
+        """Time since it was first opened, by the newest frame that came."""
+        return (self._streaming().frame() - self._zero_frame) / FRAMES_PER_S
+
+    @property
+    def sampling_rate_hz(self) -> float:
+        """20 kHz."""
+        return float(FRAMES_PER_S)
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """How it was wired."""
+        wiring = self._wired()
+        units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
+        return {
+            # The words that recordings have: a series goes on only where they stay, whatever the module's name.
+            "source": "MaxOne by animat.cultures.maxone",
+            "dac_lsb_mv": str(self._lsb_mv),
+            "stimulation_units": units,
+            "not_routed": " ".join(map(str, wiring.not_routed)),
+            "stimulus_times": "estimated: the newest frame when the server had taken the sequence, and its delay",
+        }
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Spikes on amplifiers that read no electrode of the selection, and frames that were lost on the way here."""
+        lost = int(getattr(self._stream, "lost_frames", 0))
+        return {"spikes on amplifiers without an electrode": self.spikes_not_recorded, "frames lost on the way": lost}
+
+    def _open(self) -> None:
+        self._mx = mx = _vendor()
+        # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.
+        self._halted = threading.Event()
+        self.spikes_not_recorded = 0
+        try:
+            mx.initialize()
+            self._switch_power(True)
+            self._wait("waitInit")
+            self._lsb_mv = _step_mv(mx.query_DAC_lsb_mV())
+            self._wiring = wire(mx, self.selection, wait=self._wait)
+            self._sequences = Sequences(mx, self._wiring.unit_of, self._lsb_mv)
+            self._stream = self._given_stream or ZmqSpikes()
+            self._stream.start()
+        except AnimatError:
+            raise
+        except Exception as error:
+            raise DeviceFailed(
+                f"MaxOne: expected a device to open, got {in_words(error)}: is MaxLab Live's server running?"
+            ) from error
+        frame = self._stream.frame()
+        if self._last_frame < 0:
+            self._zero_frame = frame
+        elif frame < self._last_frame:
+            # Frames are counted anew: the clock goes on from where it was.
+            self._zero_frame += frame - self._last_frame
+        self._pace = Pace(self.limits, self.stimulation_electrodes, self._begun, frame / FRAMES_PER_S)
+
+    def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
+        try:
+            return self._sent(admitted, duration_s)
+        except BaseException as error:
+            # A sequence that is under way goes on by itself: without power nothing comes of it, nor of any later one.
+            try:
+                self.stop(f"a delivery was broken off by {in_words(error)}")
+            except DeviceFailed as failed:
+                error.add_note(f"and then: {failed}: see to it that it gives no more pulses")
+            raise
+
+    def _sent(self, admitted: Admitted, duration_s: float) -> Observed:
+        """Send sequences in time, and read the spikes meanwhile."""
+        stream, sequences, pace = self._streaming(), self._sequences, self._pace
+        assert sequences is not None and pace is not None
+        halted = self._halted
+        # Spikes are kept by the stream: it starts when stimuli were asked for, however long sequences take to make.
+        start, late = self._zero_frame + round(admitted.now_s * FRAMES_PER_S), 0
+        groups = _groups(admitted.stimuli, self._sequence_s)
+        made = [sequences.of(group) for group in groups]
+        begun: list[int] = []
+        for group, sequence in zip(groups, made, strict=True):
+            asked = start + round(group[0].time_s * FRAMES_PER_S) + late
+            relative = from_zero(group)
+            soonest = max(asked, stream.frame() + INITIAL_DELAY)
+            soonest = round(pace.soonest(relative, soonest / FRAMES_PER_S) * FRAMES_PER_S)
+            stream.wait(soonest - INITIAL_DELAY)
+            if halted.is_set():
+                raise DeviceFailed(
+                    f"MaxOne: stopped while delivering: {len(begun)} of {len(admitted.stimuli)} stimuli had been sent, "
+                    "and the units have no power"
+                )
+            sequence.send()
+            # The pulse waits for the initial delay from when the server took the command: about now.
+            first = stream.frame() + INITIAL_DELAY
+            pace.count(relative, first / FRAMES_PER_S)
+            offsets = [round(stimulus.time_s * FRAMES_PER_S) for stimulus in relative]
+            begun += [first + offset for offset in offsets]
+            late += first - asked
+            # Two sequences at once would drive the same converter.
+            stream.wait(begun[-1] + round(group[-1].pulse.duration_us / SAMPLE_US))
+        if halted.is_set() and admitted.stimuli:
+            raise DeviceFailed("MaxOne: stopped while delivering: the units have no power, so pulses may not have come")
+        stop = max(start + int(np.ceil(duration_s * FRAMES_PER_S)) + late, stream.frame() if duration_s else start)
+        stream.wait(stop)
+        frames, amplifiers = stream.take(start, stop)
+        if len(amplifiers) and not 0 <= amplifiers.min() <= amplifiers.max() < AMPLIFIERS:
+            strange = amplifiers[(amplifiers < 0) | (amplifiers >= AMPLIFIERS)][0]
+            raise DeviceFailed(f"MaxOne: expected spikes on amplifiers 0 to {AMPLIFIERS - 1}, got one on {strange}")
+        row = self._wired().row_of[amplifiers]
+        self.spikes_not_recorded += int(np.count_nonzero(row == UNKNOWN))
+        frames, row = frames[row != UNKNOWN], row[row != UNKNOWN]
+        order = np.lexsort((row, frames))
+        return Observed(
+            start_s=(start - self._zero_frame) / FRAMES_PER_S,
+            duration_s=(stop - start) / FRAMES_PER_S,
+            spikes=Spikes((frames[order] - start) / FRAMES_PER_S, row[order]),
+            stimulus_time_s=(np.array(begun, dtype=np.float64) - start) / FRAMES_PER_S,
+        )
+
+    def _rest(self, duration_s: float) -> None:
+        stream = self._streaming()
+        until = stream.frame() + int(np.ceil(duration_s * FRAMES_PER_S))
+        stream.wait(until)
+        stream.forget(until)
+
+    def _halt(self) -> None:
+        self._halted.set()
+        self._switch_power(False)
+
+    def _close(self) -> None:
+        self._halted.set()
+        mx, wiring = self._mx, self._wiring
+        # Whatever fails, all of the rest is tried; the last one is the first.
+        with ExitStack() as steps:
+            steps.callback(self._let_go)
+            if self._sequences is not None:
+                steps.callback(self._sequences.delete)
+            if mx is not None and wiring is not None:
+                for unit in wiring.unit_of.values():
+                    steps.callback(mx.send, mx.StimulationUnit(unit).power_up(False).connect(False))
+            steps.callback(self._switch_power, False)
+
+    def _let_go(self) -> None:
+        stream = self._stream
+        # What it was wired as stays readable; `device_limits` too, for the next opening.
+        self._mx = self._stream = self._sequences = self._pace = None
+        if stream is not None:
+            # A stream that heard nothing has none.
+            self._last_frame = stream.frame() if stream.frame() >= 0 else self._last_frame
+            stream.stop()
+
+    def _switch_power(self, on: bool) -> None:
+        """Of all stimulation units, where there is a device."""
+        mx = self._mx
+        if mx is not None and (reply := mx.send(mx.Core().enable_stimulation_power(on))) != "Ok":
+            raise DeviceFailed(
+                f"MaxOne: expected stimulation power to be switched {'on' if on else 'off'}, got {reply!r}"
+            )
+
+    def _wait(self, what: str) -> None:
+        """As long as the vendor says, by the name it has in `maxlab.Timing`."""
+        if self._settle and self._mx is not None:
+            time.sleep(float(getattr(getattr(self._mx, "Timing", None), what, 5.0)))
+
+    def _wired(self) -> Wiring:
+        if self._wiring is None:
+            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
+        return self._wiring
+
+    def _streaming(self) -> SpikeStream:
+        if self._stream is None:
+            raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
+        return self._stream
+
+
+def _vendor() -> ModuleType:
+    try:
+        return import_module("maxlab")
+    except ImportError as error:
+        raise DeviceFailed(
+            "maxlab: expected the vendor's Python module, got none: it comes with MaxLab Live (MaxWell Biosystems), "
+            "and no package index has it; run where it is installed"
+        ) from error
+
+
+def _step_mv(told: Any) -> float:
+    try:
+        lsb_mv = float(told)
+    except (TypeError, ValueError):
+        lsb_mv = np.nan
+    if not 0.01 <= lsb_mv <= 100:
+        raise DeviceFailed(f"MaxOne: expected the converter's step in mV, got {told!r}: is the device connected?")
+    return lsb_mv
+
+
+def _groups(stimuli: Sequence[Stimulus], sequence_s: float) -> list[list[Stimulus]]:
+    """Stimuli that one sequence holds, in the order of time."""
+    groups: list[list[Stimulus]] = []
+    for stimulus in stimuli:
+        if groups and stimulus.time_s - groups[-1][0].time_s < sequence_s:
+            groups[-1].append(stimulus)
+        else:
+            groups.append([stimulus])
+    return groups

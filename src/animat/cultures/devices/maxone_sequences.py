@@ -1,0 +1,118 @@
+"""Stimuli as sequences of a MaxOne's commands: units connected, converter codes, delays in samples."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from animat.cultures.limits import steps_of
+from animat.stimulation.pulse import Pulse
+from animat.stimulation.stimulus import Stimulus
+
+FRAMES_PER_S = 20_000
+SAMPLE_US = 50.0
+INITIAL_DELAY = 100
+"""Samples (5 ms) before the first command of a sequence, in which all of it arrives: its times are then exact."""
+ZERO_CODE = 512
+WELL = 0
+EVENT_TYPE = 1
+MOST_KEPT = 1000
+
+
+def dac_code(amplitude_mv: float, lsb_mv: float) -> int:
+    """The converter's 10-bit code of a voltage: 512 is 0 V, and less is *positive*, as the units invert.
+
+    code = 512 - round(V / lsb)
+    """
+    return ZERO_CODE - steps_of(amplitude_mv, lsb_mv)
+
+
+class Sequences:
+    """Makes sequences of stimuli, and keeps one on the device for each pattern and pulse that came alone.
+
+    Trains are not put together from kept sequences: times between two sequences are the computer's, and not exact.
+
+    Args:
+        mx: the vendor's module.
+        unit_of: unit of each stimulation electrode.
+        lsb_mv: the converter's step.
+    """
+
+    def __init__(self, mx: Any, unit_of: Mapping[int, int], lsb_mv: float) -> None:
+        self._mx, self._unit_of, self._lsb_mv = mx, unit_of, lsb_mv
+        self._kept: dict[tuple[tuple[int, ...], Pulse], Any] = {}
+        self._passing: list[Any] = []
+        self._made = 0
+        self._event = 0
+
+    def of(self, stimuli: Sequence[Stimulus]) -> Any:
+        """A sequence that delivers these stimuli, the first one `INITIAL_DELAY` samples after it was sent."""
+        if len(stimuli) > 1:
+            # Gone from the device when nothing refers to it any more: one delivery back nothing of it is under way.
+            self._passing = self._passing[-100:]
+            sequence = self._new(persistent=False)
+            self._append_all(sequence, stimuli)
+            self._passing.append(sequence)
+            return sequence
+        stimulus = stimuli[0]
+        key = stimulus.electrodes, stimulus.pulse
+        if key not in self._kept:
+            if len(self._kept) >= MOST_KEPT:
+                self.delete()
+            self._kept[key] = self._new(persistent=True)
+            self._append_all(self._kept[key], stimuli)
+        return self._kept[key]
+
+    def delete(self) -> None:
+        """Take all of them off the device."""
+        for sequence in self._kept.values():
+            # The vendor's module removes a sequence with its object, unless it was told to keep it.
+            sequence.persistent = False
+        self._kept.clear()
+        self._passing.clear()
+
+    def _new(self, *, persistent: bool) -> Any:
+        self._made += 1
+        return self._mx.Sequence(f"animat_{self._made}", initial_delay=INITIAL_DELAY, persistent=persistent)
+
+    def _append_all(self, sequence: Any, stimuli: Sequence[Stimulus]) -> None:
+        at, first = 0, stimuli[0].time_s
+        for stimulus in stimuli:
+            begins = round((stimulus.time_s - first) * FRAMES_PER_S)
+            if begins > at:
+                sequence.append(self._mx.DelaySamples(begins - at))
+            at = begins + self._append(sequence, stimulus, is_kept=len(stimuli) == 1)
+
+    def _append(self, sequence: Any, stimulus: Stimulus, *, is_kept: bool) -> int:
+        """One stimulus; returns the samples it lasts."""
+        mx, units = self._mx, [self._unit_of[electrode] for electrode in stimulus.electrodes]
+        self._event += 1
+        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_words(stimulus, is_kept=is_kept))))
+        for unit in units:
+            sequence.append(mx.StimulationUnit(unit).power_up(True).connect(True).set_voltage_mode().dac_source(0))
+        lasted = 0
+        for phase in stimulus.pulse.phases:
+            assert phase.amplitude_mv is not None
+            samples = round(phase.duration_us / SAMPLE_US)
+            sequence.append(mx.DAC(0, dac_code(phase.amplitude_mv, self._lsb_mv)))
+            sequence.append(mx.DelaySamples(samples))
+            lasted += samples
+        sequence.append(mx.DAC(0, ZERO_CODE))
+        for unit in units:
+            sequence.append(mx.StimulationUnit(unit).power_up(True).connect(False).set_voltage_mode().dac_source(0))
+        return lasted
+
+
+def _words(stimulus: Stimulus, *, is_kept: bool) -> dict[str, Any]:
+    """What the device's file is told of a stimulus; a sequence that is kept cannot know when it will be used."""
+    words: dict[str, Any] = {"electrodes": list(stimulus.electrodes)}
+    if stimulus.pattern >= 0:
+        words["pattern"] = stimulus.pattern
+    if not is_kept:
+        words["presentation"] = stimulus.presentation
+        if np.isfinite(stimulus.frequency_hz):
+            words["frequency_hz"] = stimulus.frequency_hz
+    return words

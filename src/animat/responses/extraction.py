@@ -1,0 +1,170 @@
+"""From a recording, or a table of responses without times of spikes, to its responses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import Mismatch, UnusableData
+from animat.recordings.findings import Finding
+from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
+from animat.responses.bursts import BurstSeparation, separate_bursts
+from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
+from animat.responses.quality.responses import findings_on, findings_without_times
+from animat.responses.responses import Presented, Responses
+from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
+
+SILENCE_S = 1.0
+"""So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""
+
+
+def responses_of(
+    source: Recording | ResponseTable,
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    burst_threshold: float | None = None,
+) -> Responses:
+    """The responses of a recording (`extract_responses`) or of a table (`responses_of_table`)."""
+    if isinstance(source, Recording):
+        return extract_responses(source, by, window_ms, burst_threshold)
+    return responses_of_table(source, by, window_ms, burst_threshold)
+
+
+def extract_responses(
+    recording: Recording,
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    burst_threshold: float | None = None,
+) -> Responses:
+    """The response to the last pulse of every presentation that has a condition.
+
+        x = S / (T N)
+
+    with S the spikes from window_ms[0] up to, not including, window_ms[1] after the pulse (see
+    `animat.responses.windows.count_spikes` for the edges), T the length of the window and N the number of channels.
+
+    Presentations without a condition, and ones whose window runs past the end of the recording, are left out and
+    counted in `findings`, where also everything else is said that makes the responses doubtful.
+
+    Args:
+        recording: the spikes and stimuli.
+        by: what makes a condition; by frequency where it is known, else all in one.
+        window_ms: start and end of the window after the pulse.
+        burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
+
+    Raises:
+        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        UnusableData: for a recording without channels.
+
+    Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
+        only where it finds two groups).
+    """
+    check_window(window_ms)
+    if not len(recording.channels):
+        raise UnusableData("channels: expected at least one, got a recording without any; x is a mean over channels")
+    stimuli = recording.stimuli
+    # An end that is the last stimulus' or spike's own time is rounded like them.
+    inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
+    presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
+    # Those without a condition are read too: they are what came before others.
+    rate_hz, active_ratio = read_windows(recording, stimuli.time_s[presented], window_ms)
+    responses, assignment, bursts = _sorted(recording, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))
+
+
+def responses_of_table(
+    table: ResponseTable,
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    burst_threshold: float | None = None,
+) -> Responses:
+    """The response to the last pulse of every presentation that has a condition, of a table of counts or rates.
+
+        x = mean over channels of count / T, or of the rate;  active: channels with a count or rate above 0
+
+    Args:
+        table: what each channel did after each stimulus.
+        by: what makes a condition; by frequency where it is known, else all in one.
+        window_ms: the window that was counted in, where the table does not say; one that it says goes before the
+            default one.
+        burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
+
+    Raises:
+        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        Mismatch: for another window than the table's.
+        UnusableData: for a table without channels, or conditions by interval where it has no times.
+    """
+    check_window(window_ms)
+    if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
+        raise Mismatch(
+            f"window_ms: expected {table.window_ms[0]:g} to {table.window_ms[1]:g}, in which the table's spikes were "
+            f"counted, got {window_ms[0]:g} to {window_ms[1]:g}; leave the window out"
+        )
+    if not len(table.channels):
+        raise UnusableData("channels: expected at least one, got a table without any; x is a mean over channels")
+    if isinstance(by, ByInterval) and not table.has_times:
+        raise UnusableData("conditions: expected others than intervals, as the table has no times of stimuli")
+    assumed = () if table.window_ms is not None else (_assumed(window_ms),)
+    window_ms = table.window_ms or window_ms
+    scale = 1.0 if table.kind == "rate_hz" else 1 / ((window_ms[1] - window_ms[0]) * 1e-3)
+    presented = np.flatnonzero(table.stimuli.is_last_of_presentation)
+    rate_hz = table.values[presented].mean(axis=1) * scale
+    active_ratio = np.mean(table.values[presented] > 0, axis=1)
+    responses, assignment, bursts = _sorted(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    found = findings_without_times(responses, table.stimuli, assignment, bursts)
+    return replace(responses, findings=(*assumed, *found))
+
+
+def _sorted(
+    source: Recording | ResponseTable,
+    by: Conditions | None,
+    window_ms: tuple[float, float],
+    burst_threshold: float | None,
+    presented: Int64[np.ndarray, " presentations"],
+    rate_hz: Float64[np.ndarray, " presentations"],
+    active_ratio: Float64[np.ndarray, " presentations"],
+) -> tuple[Responses, Assignment, BurstSeparation]:
+    """What was read after the last pulses, by condition and apart from bursts; with how it was sorted."""
+    stimuli, n_channels = source.stimuli, len(source.channels)
+    by = by or default_conditions(stimuli)
+    assignment = by.assign(stimuli)
+    condition = assignment.condition[presented]
+    chosen = condition != NO_CONDITION
+    bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
+    has_times = isinstance(source, Recording) or source.has_times
+    # Between the pulses of a presentation there is no silence, however long it lasts. Rows without times follow each
+    # other, and nothing is known of what was before the first.
+    silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
+    is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
+    responses = Responses(
+        condition=condition[chosen],
+        rate_hz=rate_hz[chosen],
+        active_ratio=active_ratio[chosen],
+        is_burst=bursts.is_burst,
+        conditions=assignment.conditions,
+        window_ms=window_ms,
+        n_channels=n_channels,
+        threshold=bursts.threshold,
+        separability=bursts.separability,
+        presentation=source.presentation,
+        start_min=source.start_min,
+        time_s=stimuli.time_s[presented[chosen]] if has_times else None,
+        presented=Presented(condition, rate_hz, active_ratio > bursts.threshold, is_rested),
+        place=np.flatnonzero(chosen),
+        by=str(by),
+        burst_threshold=burst_threshold,
+    )
+    return responses, assignment, bursts
+
+
+def _assumed(window_ms: tuple[float, float]) -> Finding:
+    return Finding(
+        "window-assumed",
+        "warning",
+        f"the table does not say in which window its spikes were counted: {window_ms[0]:g} to {window_ms[1]:g} ms "
+        "after the stimulus are assumed, in which a closed loop would count them; say it with --window-ms, or in "
+        "the file",
+    )

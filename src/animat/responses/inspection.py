@@ -1,0 +1,263 @@
+"""What is in a recording, whether it can be used, and what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from animat.brief import briefly
+from animat.recordings.findings import Finding
+from animat.recordings.noticed import noticed
+from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
+from animat.responses.conditions import Conditions, default_conditions
+from animat.responses.extraction import extract_responses, responses_of_table
+from animat.responses.network_bursts import NetworkBursts, find_network_bursts
+from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
+from animat.responses.responses import Responses
+from animat.responses.windows import DEFAULT_WINDOW_MS, count_spikes
+
+Verdict = Literal["usable", "usable with care", "not usable"]
+
+
+@dataclass(frozen=True)
+class ConditionSummary:
+    """The responses to one condition in a few numbers.
+
+    Attributes:
+        label: the condition.
+        n_responses: all responses, bursts included.
+        n_non_burst: responses that are no bursts; the other numbers are theirs.
+        median_rate_hz: median of x, NaN without responses.
+        share_above_median: P(x >= P50), P50 the median of all conditions together; NaN without responses.
+    """
+
+    label: str
+    n_responses: int
+    n_non_burst: int
+    median_rate_hz: float
+    share_above_median: float
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What was found in one recording.
+
+    Attributes:
+        name: of the recording, such as its file.
+        n_spikes, n_channels, n_stimuli: what the recording holds; stimuli are pulses. Of a table of rates the number of
+            spikes is not known, and None.
+        n_presentations: presentations; a response is read after the last pulse of each.
+        presentation: how stimuli were presented, in words; None where it is not known.
+        start_min: start on the culture's clock.
+        duration_s: length of the recording; NaN where it is not known.
+        by: the conditions in their text form.
+        by_default: whether the conditions were chosen here, as none were asked for.
+        mean_spikes_per_stimulus: spikes in the window, over all presentations whose window lies in the recording,
+            with or without a condition, bursts included; NaN without any.
+        spontaneous_rate_hz: per channel, before stimuli; NaN where stimuli leave no quiet time. Without any stimulus,
+            over the whole recording.
+        response: when the culture answers; None where no answer was found.
+        responses: what would be learned from.
+        findings: everything noticed, the gravest first.
+        network_bursts: of a recording without stimuli; None for others, whose responses are separated instead.
+    """
+
+    __repr__ = briefly
+
+    name: str
+    n_spikes: int | None
+    n_channels: int
+    n_stimuli: int
+    n_presentations: int
+    presentation: str | None
+    start_min: float
+    duration_s: float
+    by: str
+    by_default: bool
+    mean_spikes_per_stimulus: float
+    spontaneous_rate_hz: float
+    response: ResponseTime | None
+    responses: Responses
+    findings: tuple[Finding, ...]
+    network_bursts: NetworkBursts | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Not usable if a finding says to refuse, usable with care if one warns, else usable."""
+        severities = {finding.severity for finding in self.findings}
+        if "refuse" in severities:
+            return "not usable"
+        return "usable with care" if "warning" in severities else "usable"
+
+    @property
+    def conditions(self) -> tuple[ConditionSummary, ...]:
+        """The conditions in the order of their index."""
+        shares = self.responses.shares_above_median()
+        summaries = []
+        for i, condition in enumerate(self.responses.conditions):
+            rates_hz = self.responses.rates_of(i)
+            median_hz = float(np.median(rates_hz)) if len(rates_hz) else math.nan
+            n = int(np.count_nonzero(self.responses.condition == i))
+            summaries.append(ConditionSummary(condition.label, n, len(rates_hz), median_hz, float(shares[i])))
+        return tuple(summaries)
+
+    @property
+    def n_bursts(self) -> int:
+        """Responses set apart as bursts."""
+        return int(np.count_nonzero(self.responses.is_burst))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data for JSON; what is not known is None."""
+        responses = self.responses
+        return {
+            "name": self.name,
+            "verdict": self.verdict,
+            "spikes": self.n_spikes,
+            "channels": self.n_channels,
+            "stimuli": self.n_stimuli,
+            "presentations": self.n_presentations,
+            "presentation": self.presentation,
+            "start_min": self.start_min,
+            "duration_s": _known(self.duration_s),
+            "window_ms": list(responses.window_ms),
+            "mean_spikes_per_stimulus": _known(self.mean_spikes_per_stimulus),
+            "spontaneous_rate_hz": _known(self.spontaneous_rate_hz),
+            "response_ms": [self.response.start_ms, self.response.end_ms] if self.response else None,
+            "by": self.by,
+            "by_default": self.by_default,
+            "responses": len(responses),
+            "median_rate_hz": _known(responses.median_rate_hz),
+            "burst_threshold": _known(responses.threshold),
+            "burst_separability": _known(responses.separability),
+            "bursts": self.n_bursts,
+            "network_bursts": None
+            if self.network_bursts is None
+            else {
+                "bursts": len(self.network_bursts),
+                "median_s": _known(self.network_bursts.median_s),
+                "share_of_spikes": _known(self.network_bursts.share),
+            },
+            "conditions": [
+                {
+                    "label": c.label,
+                    "responses": c.n_responses,
+                    "non_burst": c.n_non_burst,
+                    "median_rate_hz": _known(c.median_rate_hz),
+                    "share_above_median": _known(c.share_above_median),
+                }
+                for c in self.conditions
+            ],
+            "findings": [
+                {**finding.to_dict(), "value": None if finding.value is None else _known(finding.value)}
+                for finding in self.findings
+            ],
+        }
+
+
+def inspect_recording(
+    recording: Recording | ResponseTable,
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    burst_threshold: float | None = None,
+    name: str | None = None,
+) -> Inspection:
+    """Look at a recording as training would use it, and say what is in it and what is wrong with it.
+
+    Args:
+        recording: the recording, or a table of responses.
+        by: what makes a condition; by frequency where it is known, else all stimuli in one.
+        window_ms: start and end of the window that responses are read in, after the pulse.
+        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
+        name: what to call it; by default the source in its provenance.
+
+    Raises:
+        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        UnusableData: for a recording without channels.
+        Mismatch: for another window than the one of a table.
+    """
+    if isinstance(recording, ResponseTable):
+        return _of_table(recording, by, window_ms, burst_threshold, name)
+    chosen = by or default_conditions(recording.stimuli)
+    responses = extract_responses(recording, chosen, window_ms, burst_threshold)
+    read = recording.stimuli.is_last_of_presentation
+    times_s = recording.stimuli.time_s[read]
+    times_s = times_s[times_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9]
+    spikes = count_spikes(recording, times_s + window_ms[0] * 1e-3, times_s + window_ms[1] * 1e-3)
+    rate_hz, _ = spontaneous_rate(recording, after_ms=window_ms[1])
+    rate_hz, bursts = rate_hz / len(recording.channels), None
+    if not len(recording.stimuli):
+        bursts = find_network_bursts(recording)
+        exposure_s = recording.duration_s * len(recording.channels)
+        rate_hz = len(recording.spike_times_s) / exposure_s if exposure_s else math.nan
+    return Inspection(
+        name=name or recording.provenance.get("source", "recording"),
+        n_spikes=len(recording.spike_times_s),
+        n_channels=len(recording.channels),
+        n_stimuli=len(recording.stimuli),
+        n_presentations=int(np.count_nonzero(read)),
+        presentation=None if recording.presentation is None else str(recording.presentation),
+        start_min=recording.start_min,
+        duration_s=recording.duration_s,
+        by=str(chosen),
+        by_default=by is None,
+        mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
+        spontaneous_rate_hz=rate_hz,
+        response=find_response(recording),
+        responses=responses,
+        findings=_gravest_first(recording, responses),
+        network_bursts=bursts,
+    )
+
+
+def _of_table(
+    table: ResponseTable,
+    by: Conditions | None,
+    window_ms: tuple[float, float],
+    burst_threshold: float | None,
+    name: str | None,
+) -> Inspection:
+    """The same of a table of responses; what takes times of spikes is not known."""
+    chosen = by or default_conditions(table.stimuli)
+    responses = responses_of_table(table, chosen, window_ms, burst_threshold)
+    read = table.stimuli.is_last_of_presentation
+    width_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3
+    spikes = table.values[read].sum(axis=1) * (1.0 if table.kind == "count" else width_s)
+    times_s = table.stimuli.time_s
+    return Inspection(
+        name=name or table.provenance.get("source", "table"),
+        n_spikes=int(table.values.sum()) if table.kind == "count" else None,
+        n_channels=len(table.channels),
+        n_stimuli=len(table.stimuli),
+        n_presentations=int(np.count_nonzero(read)),
+        presentation=None if table.presentation is None else str(table.presentation),
+        start_min=table.start_min,
+        duration_s=float(np.ptp(times_s)) if table.has_times and len(times_s) else math.nan,
+        by=str(chosen),
+        by_default=by is None,
+        mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
+        spontaneous_rate_hz=math.nan,
+        response=None,
+        responses=responses,
+        findings=_gravest_first(table, responses),
+    )
+
+
+def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> tuple[Finding, ...]:
+    """What was noticed in the recording and in its responses.
+
+    Of one name, what the latter say, which is more; but of stimuli that are missing the file knows more.
+    """
+    in_responses = [f for f in responses.findings if f.name != "no-stimuli"]
+    names = {finding.name for finding in in_responses}
+    findings = {f.name + f.sentence: f for f in in_responses}
+    findings |= {f.name + f.sentence: f for f in noticed(source) if f.name not in names}
+    gravity = {"refuse": 0, "warning": 1, "note": 2}
+    return tuple(sorted(findings.values(), key=lambda finding: gravity[finding.severity]))
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

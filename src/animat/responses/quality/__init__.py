@@ -1,0 +1,1 @@
+"""What makes responses doubtful: the findings, apart from the extraction."""

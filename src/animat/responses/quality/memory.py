@@ -1,0 +1,63 @@
+"""Whether what a culture answers depends on what it answered just before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from animat.recordings.findings import Finding
+from animat.responses.responses import Responses
+
+CERTAIN = 4.0
+"""Standard errors that the difference must be away from none."""
+STRETCH = 250
+"""Responses in a stretch of the recording, which has a median of its own: a drift is no memory."""
+
+
+def memory_findings(responses: Responses) -> Iterator[Finding]:
+    """A finding on the culture's memory from one response to the next (`memory`), if there is some.
+
+    For each condition in each stretch of the recording, how often its non-burst responses pass the stretch's median
+    after a response that did, p1, and after one that did not, p0. The difference is averaged over all of these with the
+    weights w = n1 n0 / (n1 + n0), so that neither what differs between conditions nor what drifts is taken for memory.
+    Its standard error is sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0): that of independent
+    responses.
+
+    Args:
+        responses: in the order of time.
+
+    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
+    """
+    last_hz, is_burst = responses.last_hz, responses.is_burst
+    tables = []
+    for stretch in np.array_split(np.arange(len(responses)), max(1, len(responses) // STRETCH)):
+        usable = stretch[~is_burst[stretch] & ~np.isnan(last_hz[stretch])]
+        if not len(usable):
+            continue
+        median_hz = np.median(responses.rate_hz[usable])
+        for condition in range(len(responses.conditions)):
+            chosen = usable[responses.condition[usable] == condition]
+            passes, after = responses.rate_hz[chosen] >= median_hz, last_hz[chosen] >= median_hz
+            n1 = int(np.count_nonzero(after))
+            if 0 < n1 < len(chosen):
+                tables.append((n1, len(chosen) - n1, float(passes[after].mean()), float(passes[~after].mean())))
+    if not tables:
+        return
+    n1s, n0s, p1, p0 = (np.array(column, np.float64) for column in zip(*tables, strict=True))
+    weights = n1s * n0s / (n1s + n0s)
+    pooled = (n1s * p1 + n0s * p0) / (n1s + n0s)
+    error = math.sqrt(float(np.sum(weights * pooled * (1 - pooled)))) / float(weights.sum())
+    after_one, after_none = (float(np.average(p, weights=weights)) for p in (p1, p0))
+    if abs(after_one - after_none) <= CERTAIN * error:
+        return
+    blocked = responses.presentation is not None and responses.presentation.order == "blocked"
+    yield Finding(
+        "memory",
+        "note",
+        f"the culture remembers: after a response that passes the median {100 * after_one:.0f} % of the next ones do, "
+        f"after one that does not {100 * after_none:.0f} %, conditions apart; histograms know nothing of it, the "
+        f"memory simulator does{', of recordings with --order mixed' if blocked else ''}",
+        after_one - after_none,
+    )

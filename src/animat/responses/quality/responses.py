@@ -1,0 +1,333 @@
+"""What makes responses doubtful: every finding on a recording's responses, with what it means and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool
+
+from animat.recordings.findings import Finding
+from animat.recordings.recording import Recording
+from animat.responses.bursts import BurstSeparation
+from animat.responses.conditions import NO_CONDITION, Assignment
+from animat.responses.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
+from animat.responses.quality.drift import drift_findings
+from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.timing import artefact_findings
+from animat.responses.responses import Responses
+from animat.stimulation.stimulus import Stimuli
+
+FEW_SAMPLES = 30
+"""Below this many non-burst responses of a condition, its distribution is little more than a guess."""
+MANY_BURSTS = 0.25
+SMALL_DIFFERENCE = 0.1
+"""Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
+LITTLE_DIFFERENCE = 0.2
+"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200 (docs/evaluation)."""
+
+_WINDOW_PARTS = 8
+
+
+def findings_on(
+    responses: Responses,
+    recording: Recording,
+    assignment: Assignment,
+    bursts: BurstSeparation,
+    inside: Bool[np.ndarray, " stimuli"],
+) -> tuple[Finding, ...]:
+    """Everything there is to say about how far responses can be trusted.
+
+    Args:
+        responses: the responses.
+        recording: what they come from.
+        assignment: the condition of every pulse.
+        bursts: the burst separation.
+        inside: whether a pulse's window ends within the recording, shape (stimuli,).
+    """
+    if not len(recording.stimuli):
+        return (
+            Finding(
+                "no-stimuli",
+                "refuse",
+                "the recording holds no stimuli, so there is no response to learn from: "
+                "give the stimuli's times with the spikes",
+                0.0,
+            ),
+        )
+    return (
+        *_left_out(recording, assignment, inside),
+        *_timing(responses, recording, assignment),
+        *artefact_findings(recording, responses.window_ms),
+        *_without_times(responses, bursts),
+    )
+
+
+def findings_without_times(
+    responses: Responses, stimuli: Stimuli, assignment: Assignment, bursts: BurstSeparation
+) -> tuple[Finding, ...]:
+    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told.
+
+    Args:
+        responses: the responses.
+        stimuli: what they are responses to.
+        assignment: the condition of every stimulus.
+        bursts: the burst separation.
+    """
+    return (
+        *_without_condition(stimuli, assignment),
+        Finding(
+            "spike-times-unknown",
+            "warning",
+            "the table has no times of spikes, so it cannot be told whether its window holds the response, an artefact "
+            "or a blank, nor how the culture fires without stimuli",
+        ),
+        *_without_times(responses, bursts),
+    )
+
+
+def _without_times(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
+    """What is told by the responses alone."""
+    yield from _conditions(responses)
+    yield from _bursts(responses, bursts)
+    yield from _difference(responses)
+    yield from drift_findings(responses)
+    yield from memory_findings(responses)
+
+
+def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndarray, " stimuli"]) -> Iterator[Finding]:
+    yield from _without_condition(recording.stimuli, assignment)
+    read = recording.stimuli.is_last_of_presentation
+    n_read = int(np.count_nonzero(read))
+    late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
+    if late:
+        yield Finding(
+            "window-past-end",
+            "note" if late < 0.05 * n_read else "warning",
+            f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out",
+            float(late),
+        )
+
+
+def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Finding]:
+    read = stimuli.is_last_of_presentation
+    n_read = int(np.count_nonzero(read))
+    without = int(np.count_nonzero(read & (assignment.condition == NO_CONDITION)))
+    if without == n_read:
+        yield Finding(
+            "no-condition",
+            "refuse",
+            f"none of the {n_read} stimuli belongs to a condition: choose other conditions "
+            "(by frequency, interval, electrode or pattern)",
+            float(without),
+        )
+    elif without:
+        yield Finding(
+            "no-condition",
+            "note",
+            f"{without} of {n_read} stimuli belong to no condition and are left out",
+            float(without),
+        )
+
+
+def _timing(responses: Responses, recording: Recording, assignment: Assignment) -> Iterator[Finding]:
+    start_ms, end_ms = responses.window_ms
+    stimuli = recording.stimuli
+    read = stimuli.is_last_of_presentation
+    gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
+    # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
+    overlapping = int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6)))
+    if overlapping:
+        yield Finding(
+            "stimuli-too-close",
+            "warning",
+            f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
+            f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window",
+            float(overlapping),
+        )
+    rate_hz, quiet_s = spontaneous_rate(recording, after_ms=end_ms)
+    response = find_response(recording)
+    parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
+    if quiet_s * 1e3 < 10 * (end_ms - start_ms) and parts.count.any():
+        yield Finding(
+            "window-not-tested",
+            "note",
+            "stimuli follow each other too fast to see how the culture fires without them (no 100 ms of quiet before a "
+            "stimulus), so it is not known whether the window holds a response",
+        )
+        return
+    spikes = _without_artefact(parts)
+    per_stimulus = 0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * (1 - 1 / _WINDOW_PARTS)
+    expected = per_stimulus * parts.n_stimuli
+    elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
+    if spikes <= expected:
+        yield Finding(
+            "dead-window",
+            "refuse",
+            f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes a "
+            f"stimulus (without an eighth at its start, where an artefact may be) against {per_stimulus:.2f} in as "
+            f"much time before the stimulus"
+            + (
+                f"; the response is at {response.start_ms:g} to {response.end_ms:g} ms: "
+                f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
+                if response
+                else "; no response was found elsewhere either: these stimuli do not make the culture fire"
+            ),
+            spikes / expected if expected else 0.0,
+        )
+        return
+    yield from _dead_conditions(responses, recording, assignment, per_stimulus)
+    if response and elsewhere:
+        yield Finding(
+            "response-elsewhere",
+            "warning",
+            f"the response is at {response.start_ms:g} to {response.end_ms:g} ms after a stimulus, outside the window "
+            f"from {start_ms:g} to {end_ms:g} ms: use --window-ms {response.start_ms:g} {response.end_ms:g}",
+            response.start_ms,
+        )
+    elif response:
+        yield Finding(
+            "response-time",
+            "note",
+            f"the culture fires above its spontaneous rate from {response.start_ms:g} to {response.end_ms:g} ms after "
+            f"a stimulus; the window is {start_ms:g} to {end_ms:g} ms",
+            response.start_ms,
+        )
+
+
+def _without_artefact(parts: PostStimulusHistogram) -> int:
+    """Spikes in the window; an artefact that reaches into it, in the busier of its first two parts, is no response."""
+    return int(parts.count.sum() - parts.count[:2].max())
+
+
+def _dead_conditions(
+    responses: Responses, recording: Recording, assignment: Assignment, per_stimulus: float
+) -> Iterator[Finding]:
+    """Conditions whose window is dead though that of all together is not."""
+    start_ms, end_ms = responses.window_ms
+    dead, worst = [], math.inf
+    for i, condition in enumerate(assignment.conditions if len(assignment.conditions) > 1 else ()):
+        of = recording.stimuli.is_last_of_presentation & (assignment.condition == i)
+        parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS, of)
+        if parts.n_stimuli and _without_artefact(parts) <= per_stimulus * parts.n_stimuli:
+            spikes = _without_artefact(parts) / parts.n_stimuli
+            later = find_response(recording, stimuli=of)
+            at = f"; its response is at {later.start_ms:g} to {later.end_ms:g} ms" if later else ""
+            dead.append(f"{condition.label} ({spikes:.2f}{at})")
+            worst = min(worst, spikes)
+    if dead:
+        listed = ", ".join(dead[:8]) + (f" and {len(dead) - 8} more" if len(dead) > 8 else "")
+        yield Finding(
+            "dead-condition",
+            "warning",
+            f"after stimuli of some conditions the window from {start_ms:g} to {end_ms:g} ms holds no more spikes than "
+            f"as much time before a stimulus, {per_stimulus:.2f} (without an eighth at its start): {listed}; what is "
+            "in it is no response: leave them out, or use a window that suits all",
+            worst,
+        )
+
+
+def _conditions(responses: Responses) -> Iterator[Finding]:
+    for i, condition in enumerate(responses.conditions):
+        n_all = int(np.count_nonzero(responses.condition == i))
+        n = len(responses.rates_of(i))
+        if not n:
+            what = (
+                "no stimulus" if not n_all else f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
+            )
+            yield Finding(
+                "empty-condition",
+                "refuse",
+                f"condition {condition.label}: {what}; leave it out or choose other conditions",
+                0.0,
+            )
+        elif n < FEW_SAMPLES:
+            yield Finding(
+                "few-samples",
+                "warning",
+                f"condition {condition.label}: {n} non-burst responses; a distribution takes {FEW_SAMPLES} or more",
+                float(n),
+            )
+
+
+def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
+    n_bursts = int(np.count_nonzero(responses.is_burst))
+    values = f"separability {bursts.separability:.2f}, valley {bursts.valley:.2f}"
+    if not n_bursts:
+        if not math.isnan(bursts.rejected):
+            above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
+            yield Finding(
+                "bursts-not-separable",
+                "note",
+                f"no response is set apart as a burst, as the ratios of active channels do not form two groups: Otsu's "
+                f"threshold, {bursts.rejected:.3f}, would part {above} of {len(responses)} responses from the others "
+                f"({values})",
+                bursts.separability,
+            )
+        return
+    share = n_bursts / len(responses)
+    dropped = f"{n_bursts} of {len(responses)} responses ({100 * share:.1f} %) are set apart as bursts"
+    if share > MANY_BURSTS:
+        yield Finding(
+            "many-bursts",
+            "warning",
+            f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest stimuli that "
+            "failed: look at the panels of burst separation, and use --burst-threshold 1 to keep all",
+            share,
+        )
+    else:
+        yield Finding(
+            "bursts",
+            "note",
+            f"{dropped} (above {responses.threshold:.3f} of the channels active; {values})",
+            share,
+        )
+
+
+def _difference(responses: Responses) -> Iterator[Finding]:
+    shares = responses.shares_above_median()
+    # A share of three responses says nothing: conditions with few samples count only where there are no others.
+    n = np.array([len(responses.rates_of(i)) for i in range(len(shares))])
+    enough = n >= FEW_SAMPLES if np.count_nonzero(n >= FEW_SAMPLES) >= 2 else n > 0
+    known = [(c.label, float(p)) for c, p, ok in zip(responses.conditions, shares, enough, strict=True) if ok]
+    if len(known) < 2:
+        if len(responses.conditions) == 1:
+            yield Finding(
+                "one-condition",
+                "warning",
+                "there is one condition only, so an agent has nothing to choose: to train, sort the stimuli by "
+                "frequency, interval, electrode or pattern",
+                1.0,
+            )
+        return
+    lowest, highest = min(known, key=lambda item: item[1]), max(known, key=lambda item: item[1])
+    spread = highest[1] - lowest[1]
+    listed = ", ".join(f"{p:.2f} for {label}" for label, p in known[:8]) + (", ..." if len(known) > 8 else "")
+    reach = (
+        f"with one threshold the choice moves the mean command from {2 * lowest[1] - 1:+.2f} to "
+        f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
+    )
+    if spread < SMALL_DIFFERENCE:
+        yield Finding(
+            "no-difference",
+            "warning",
+            f"the conditions hardly differ: P(x >= P50) is {listed}; {reach}, the rest is chance, so no policy can "
+            "steer a robot much better than at random: stimulate in ways that differ more",
+            spread,
+        )
+    elif spread < LITTLE_DIFFERENCE:
+        yield Finding(
+            "little-difference",
+            "warning",
+            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
+            "a robot can hardly be steered: --limit cartpole tells how far; stimulate in ways that differ more",
+            spread,
+        )
+    else:
+        yield Finding(
+            "difference",
+            "note",
+            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance",
+            spread,
+        )

@@ -1,0 +1,179 @@
+"""What the moments around a stimulus tell of its artefact: spikes that are none, and stretches that were blanked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from animat.recordings.findings import Finding
+from animat.recordings.recording import Recording
+from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
+
+BIN_MS = 0.5
+SPAN_MS = (-10.0, 20.0)
+LOOKED_AT_MS = (-2.0, 10.0)
+"""Where an artefact is looked for; a response that is sharper than one comes later."""
+ARTEFACT_UNTIL_MS = 2.0
+"""An artefact begins before this."""
+TIMES = 5.0
+"""As many spikes as elsewhere, and more, are an artefact; as few, and fewer, were blanked."""
+AFTERWARDS = 6
+"""Bins after an artefact that tell whether a response follows."""
+TIMES_RESPONSE = 2.0
+LEFT_OUT, LEFT_OUT_SHARE = 2, 0.02
+"""Stimuli with the most spikes in the artefact's largest bin, without which it must still be one: a burst may have
+happened to fall there."""
+ENOUGH = 10.0
+"""Spikes expected without a blank, to tell one."""
+
+
+def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
+    """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
+
+    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around
+    the largest one before 2 ms in which b is above five times both the spontaneous rate and the median of b from 3
+    to 20 ms after, above twice the upper quartile of the latter, which is the response where there is one, and, if
+    the culture goes on firing afterwards or rises again, above a third of the largest bin. Where the bins rise from
+    there to twice as much without a valley, the response begins early and there is no artefact; nor where the
+    largest bin is not above all that without the two stimuli, or the fiftieth of them, that have the most spikes in
+    it. The blank is the run of bins around 0, without the artefact, in which b is below a fifth of the spontaneous
+    rate; it is looked for where 10 spikes or more would be in it.
+
+    Args:
+        recording: with stimuli.
+        window_ms: of the responses.
+    """
+    stimuli = recording.stimuli
+    read = stimuli.is_last_of_presentation
+    if not read.any():
+        return
+    gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
+    before_ms = 1e3 * np.concatenate([[np.inf], np.diff(stimuli.time_s)])
+    # Bins must not hold what belongs to a neighbouring pulse.
+    apart = read & (gap_ms >= SPAN_MS[1]) & (before_ms >= -SPAN_MS[0] + SPAN_MS[1])
+    chosen = apart if int(apart.sum()) >= min(20, int(read.sum())) else read
+    histogram = post_stimulus_histogram(recording, *SPAN_MS, BIN_MS, chosen)
+    centre_ms = histogram.edges_ms[:-1] + BIN_MS / 2
+    count = histogram.count.astype(np.float64)
+    rate_hz, quiet_s = spontaneous_rate(recording)
+    spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * histogram.n_stimuli
+    later = count[centre_ms > 3.0]
+    usual = max(spontaneous, float(np.median(later)), 1.0)
+    # Responses can begin before 2 ms: what is no sharper than the response later on is one.
+    usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
+    times_s = stimuli.time_s[chosen]
+    artefact = _artefact(centre_ms, count, usual, max(spontaneous, 1.0), recording.spike_times_s, times_s)
+    if artefact is not None:
+        yield _artefact_finding(centre_ms, count, artefact, usual, recording, histogram.n_stimuli, window_ms)
+    if quiet_s > 0 and spontaneous > 0:
+        yield from _blank(centre_ms, count, artefact, spontaneous, window_ms)
+
+
+def _artefact(
+    centre_ms: Float64[np.ndarray, " bins"],
+    count: Float64[np.ndarray, " bins"],
+    usual: float,
+    spontaneous: float,
+    spike_times_s: Float64[np.ndarray, " spikes"],
+    stimulus_s: Float64[np.ndarray, " stimuli"],
+) -> tuple[int, int] | None:
+    """First and last bin of the artefact; None where there is none."""
+    above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
+    early = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
+    for largest in early[np.argsort(-count[early], kind="stable")].tolist():
+        first, last = _run(above, largest)
+        height, after = count[largest], count[largest : last + 1]
+        top, low = int(np.argmax(after)), np.flatnonzero(after < height / 3)
+        if after[top] >= TIMES_RESPONSE * height and after[: top + 1].min() >= height / 2:
+            # Artefacts are largest first: this is how a response begins.
+            continue
+        rises_again = len(low) > 0 and after[low[0] :].max() >= height / 2
+        edges_s = stimulus_s[:, None] + 1e-3 * (centre_ms[largest] + np.array([-0.5, 0.5]) * BIN_MS)
+        of_each = np.sort(np.diff(np.searchsorted(spike_times_s, edges_s), axis=1)[:, 0])
+        left_out = max(LEFT_OUT, round(LEFT_OUT_SHARE * len(of_each)))
+        if of_each[: max(len(of_each) - left_out, 0)].sum() <= TIMES * usual:
+            continue
+        if rises_again or np.mean(count[last + 1 : last + 1 + AFTERWARDS]) > spontaneous:
+            # A response may follow at once: the artefact ends where its spikes are a third as many as at its height.
+            first, last = _run(above & (count >= height / 3), largest)
+        return first, last
+    return None
+
+
+def _run(flags: Bool[np.ndarray, " bins"], start: int) -> tuple[int, int]:
+    """First and last of the flags that are set around one, over gaps of one."""
+    first = last = start
+    while first > 0 and flags[max(first - 2, 0) : first].any():
+        first -= 1
+    while last + 1 < len(flags) and flags[last + 1 : last + 3].any():
+        last += 1
+    return first, last
+
+
+def _artefact_finding(
+    centre_ms: Float64[np.ndarray, " bins"],
+    count: Float64[np.ndarray, " bins"],
+    artefact: tuple[int, int],
+    usual: float,
+    recording: Recording,
+    n_stimuli: int,
+    window_ms: tuple[float, float],
+) -> Finding:
+    first, last = artefact
+    from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
+    spikes = float(count[first : last + 1].sum())
+    reaches = to_ms > window_ms[0] + 1e-9
+    remedy = (
+        f"the window begins at {window_ms[0]:g} ms, inside it: begin it at {to_ms:g} ms or later (--window-ms)"
+        if reaches
+        else f"the window from {window_ms[0]:g} ms on does not hold them"
+    )
+    return Finding(
+        "artefact-spikes",
+        "warning" if reaches else "note",
+        f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
+        f"{count[first : last + 1].max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
+        f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
+        f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
+        spikes / n_stimuli,
+    )
+
+
+def _blank(
+    centre_ms: Float64[np.ndarray, " bins"],
+    count: Float64[np.ndarray, " bins"],
+    artefact: tuple[int, int] | None,
+    spontaneous: float,
+    window_ms: tuple[float, float],
+) -> Iterator[Finding]:
+    is_blank = count < spontaneous / TIMES
+    if artefact is not None:
+        is_blank[artefact[0] : artefact[1] + 1] = True
+    zero = int(np.searchsorted(centre_ms, 0.0))
+    if not is_blank[zero]:
+        return
+    first = last = zero
+    while first > 0 and is_blank[first - 1]:
+        first -= 1
+    while last + 1 < len(is_blank) and is_blank[last + 1]:
+        last += 1
+    silent = last - first + 1 - (0 if artefact is None else artefact[1] - artefact[0] + 1)
+    from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
+    if silent * spontaneous < ENOUGH or last == len(is_blank) - 1:
+        return
+    lost = (min(to_ms, window_ms[1]) - window_ms[0]) / (window_ms[1] - window_ms[0])
+    found = f"from {from_ms:g} to {to_ms:g} ms around a stimulus next to nothing was recorded (blanked, or saturated)"
+    if lost <= 1e-9:
+        yield Finding("blanked-window", "note", f"{found}; the window from {window_ms[0]:g} ms on is after it", 0.0)
+        return
+    remedy = f"use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else "use a window after it"
+    yield Finding(
+        "blanked-window",
+        "note" if lost <= 0.15 else "warning",
+        f"{found}: {100 * min(lost, 1):.0f} % of the window from {window_ms[0]:g} to {window_ms[1]:g} ms is lost, and "
+        f"rates are too low by as much: {remedy}",
+        min(lost, 1.0),
+    )

@@ -1,0 +1,198 @@
+"""The culture's responses: what a stimulus of each condition makes it do, one row a stimulus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from animat.brief import briefly
+from animat.errors import Mismatch
+from animat.recordings.findings import Finding
+from animat.responses.conditions import NO_CONDITION, Condition
+from animat.stimulation.protocol import Presentation
+
+
+@dataclass(frozen=True, eq=False)
+class Presented:
+    """All presentations of a recording, in the order of time: what a culture may remember when it answers.
+
+    Attributes:
+        condition: index of each, `NO_CONDITION` where it has none, shape (presentations,).
+        rate_hz: x of each, shape (presentations,).
+        is_burst: whether the response was one, shape (presentations,).
+        is_rested: whether there was no pulse in the `SILENCE_S` before it, shape (presentations,).
+    """
+
+    __repr__ = briefly
+
+    condition: Int64[np.ndarray, " presentations"]
+    rate_hz: Float64[np.ndarray, " presentations"]
+    is_burst: Bool[np.ndarray, " presentations"]
+    is_rested: Bool[np.ndarray, " presentations"]
+
+    def __post_init__(self) -> None:
+        for name in ("condition", "rate_hz", "is_burst", "is_rested"):
+            array = np.array(getattr(self, name))
+            if array.shape != (len(self.condition),):
+                raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Responses to the stimuli of one recording, in the order of time. Arrays are read-only.
+
+    Attributes:
+        condition: index into `conditions`, shape (responses,).
+        rate_hz: x, spikes in the window per second and channel, shape (responses,).
+        active_ratio: share of channels with at least one spike in the window, shape (responses,).
+        is_burst: whether `active_ratio` is above `threshold`, shape (responses,).
+        conditions: what the agent can choose from, in the order of their index.
+        window_ms: start and end of the window, after the last pulse of each presentation.
+        n_channels: channels that x is a mean over.
+        threshold: of the active ratio, by Otsu's method unless it was given; 1 where that separates nothing, NaN
+            without responses.
+        separability: between-class over total variance of the active ratio, of Otsu's classes or of those that a given
+            threshold makes; NaN where that leaves one (see `animat.responses.bursts`).
+        presentation: how stimuli were presented, None where it is not known.
+        start_min: start of the recording on the culture's clock, in minutes.
+        findings: what was noticed about them.
+        time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
+            responses that come from elsewhere.
+        presented: all presentations of the recording, also those without a condition; None: these responses are all,
+            one soon after the other (see `presentations`).
+        place: where among them each response is, shape (responses,).
+        by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None where it is not known.
+        burst_threshold: the threshold that was given in place of Otsu's; None: none was.
+
+    Raises:
+        Mismatch: for columns of different lengths, or a condition that is not in the list.
+    """
+
+    __repr__ = briefly
+
+    condition: Int64[np.ndarray, " responses"]
+    rate_hz: Float64[np.ndarray, " responses"]
+    active_ratio: Float64[np.ndarray, " responses"]
+    is_burst: Bool[np.ndarray, " responses"]
+    conditions: tuple[Condition, ...]
+    window_ms: tuple[float, float]
+    n_channels: int
+    threshold: float
+    separability: float
+    presentation: Presentation | None = None
+    start_min: float = 0.0
+    findings: tuple[Finding, ...] = ()
+    time_s: Float64[np.ndarray, " responses"] | None = None
+    presented: Presented | None = None
+    place: Int64[np.ndarray, " responses"] | None = None
+    by: str | None = None
+    burst_threshold: float | None = None
+
+    def __post_init__(self) -> None:
+        columns: dict[str, Any] = {
+            "condition": np.int64,
+            "rate_hz": np.float64,
+            "active_ratio": np.float64,
+            "is_burst": np.bool_,
+        }
+        optional = {"time_s": np.float64, "place": np.int64}
+        columns |= {name: dtype for name, dtype in optional.items() if getattr(self, name) is not None}
+        for name, dtype in columns.items():
+            array = np.array(getattr(self, name), dtype=dtype)
+            if array.shape != (len(self),):
+                raise Mismatch(f"responses.{name}: expected {len(self)} values, one a response, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        self._check_places()
+        if len(self) and not (self.condition.min() >= 0 and self.condition.max() < len(self.conditions)):
+            raise Mismatch(
+                f"responses.condition: expected indices of {len(self.conditions)} conditions, "
+                f"got {self.condition.min()} to {self.condition.max()}"
+            )
+
+    def _check_places(self) -> None:
+        if self.presented is None or self.place is None:
+            if (self.presented is None) != (self.place is None):
+                raise Mismatch("responses.presented, responses.place: expected both or neither, got one")
+            return
+        n = len(self.presented.condition)
+        if len(self) and not (self.place.min() >= 0 and self.place.max() < n):
+            raise Mismatch(
+                f"responses.place: expected rows from 0 to {n - 1}, got {self.place.min()} to {self.place.max()}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.condition)
+
+    @property
+    def presentations(self) -> tuple[Presented, Int64[np.ndarray, " responses"]]:
+        """All presentations of the recording in the order of time, and where among them each response is."""
+        if self.presented is not None and self.place is not None:
+            return self.presented, self.place
+        every = Presented(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
+        return every, np.arange(len(self))
+
+    @property
+    def last_hz(self) -> Float64[np.ndarray, " responses"]:
+        """x of the response before each one, Hz: 0 after silence, NaN after a burst."""
+        presented, place = self.presentations
+        before_hz = np.concatenate([[0.0], np.where(presented.is_burst, np.nan, presented.rate_hz)])[:-1]
+        return np.asarray(np.where(presented.is_rested, 0.0, before_hz)[place])
+
+    @property
+    def non_burst_rate_hz(self) -> Float64[np.ndarray, " non_bursts"]:
+        """x of the non-burst responses of all conditions together, in Hz."""
+        return np.asarray(self.rate_hz[~self.is_burst])
+
+    @property
+    def median_rate_hz(self) -> float:
+        """P50: the median of the non-burst responses of all conditions together, in Hz; NaN without any."""
+        rates_hz = self.non_burst_rate_hz
+        return float(np.median(rates_hz)) if len(rates_hz) else float("nan")
+
+    def rates_of(self, condition: int) -> Float64[np.ndarray, " non_bursts"]:
+        """x of the non-burst responses of one condition, in Hz."""
+        return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
+
+    def redrawn(self, rng: np.random.Generator) -> Responses:
+        """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
+
+        Each keeps what was presented before it. Bursts are left out, and a condition without other responses stays
+        without.
+        """
+        rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
+        drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
+        return replace(self._rows(drawn), findings=())
+
+    def only(self, conditions: Sequence[int]) -> Responses:
+        """The responses to some conditions, by index; what was presented before them is kept."""
+        index = np.full(len(self.conditions) + 1, NO_CONDITION)
+        index[list(conditions)] = np.arange(len(conditions))
+        kept = self._rows(np.flatnonzero(index[self.condition] != NO_CONDITION))
+        presented, _ = kept.presentations
+        return replace(
+            kept,
+            condition=index[kept.condition],
+            conditions=tuple(self.conditions[i] for i in conditions),
+            # No condition is the last index, -1, and stays none.
+            presented=replace(presented, condition=index[presented.condition]),
+        )
+
+    def _rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
+        """Some of the responses; what was presented before them is kept."""
+        presented, place = self.presentations
+        columns = {name: getattr(self, name)[rows] for name in ("condition", "rate_hz", "active_ratio", "is_burst")}
+        time_s = None if self.time_s is None else self.time_s[rows]
+        return replace(self, **columns, time_s=time_s, presented=presented, place=place[rows])
+
+    def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
+        """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""
+        median_hz = self.median_rate_hz
+        rates_hz = (self.rates_of(i) for i in range(len(self.conditions)))
+        return np.array([np.mean(x >= median_hz) if len(x) else np.nan for x in rates_hz], dtype=np.float64)

@@ -1,0 +1,76 @@
+"""From the recordings of one culture to their responses, with what makes training on them pointless refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from animat.errors import InvalidArgument, UnusableData
+from animat.recordings.noticed import noticed
+from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
+from animat.responses.conditions import Conditions
+from animat.responses.extraction import responses_of
+from animat.responses.responses import Responses
+from animat.responses.windows import DEFAULT_WINDOW_MS
+
+REFUSING = (
+    "no-stimuli",
+    "no-spikes",
+    "no-condition",
+    "one-condition",
+    "empty-condition",
+    "dead-window",
+    "times-not-in-seconds",
+    "more-stimuli-than-spikes",
+    "simultaneous-stimuli",
+)
+"""Names of the findings that make training pointless; a user may go on in spite of them."""
+
+
+def extract_series(
+    recordings: Sequence[Recording | ResponseTable],
+    by: Conditions | None = None,
+    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    *,
+    burst_threshold: float | None = None,
+    allow: Sequence[str] = (),
+) -> list[Responses]:
+    """Extract the responses of recordings that are to be learned from.
+
+    Args:
+        recordings: of one culture; tables of responses too.
+        by: what makes a condition; None: by frequency where it is known, else all in one.
+        window_ms: start and end of the window after the pulse.
+        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
+        allow: names of findings (`"dead-window"`) to go on in spite of.
+
+    Raises:
+        UnusableData: if a finding says that learning from a recording makes no sense, and is not in `allow`.
+        InvalidArgument: for a name in `allow` of no finding that refuses.
+    """
+    check_allowed(allow)
+    series = []
+    for recording in recordings:
+        try:
+            responses = responses_of(recording, by, window_ms, burst_threshold)
+        except UnusableData as error:
+            raise UnusableData(f"the recording at {recording.start_min:g} min: {error}") from error
+        for finding in (*noticed(recording), *responses.findings):
+            if finding.severity == "refuse" and finding.name not in allow:
+                raise UnusableData(
+                    f"the recording at {recording.start_min:g} min: {finding.sentence} (to go on in spite of it: "
+                    f"--allow {finding.name}, or in a study simulators.allow)"
+                )
+        series.append(responses)
+    return series
+
+
+def check_allowed(names: Sequence[str]) -> None:
+    """Raise unless all are names of findings that refuse: a misspelt one would be asked for in vain.
+
+    Raises:
+        InvalidArgument: naming the first that is not.
+    """
+    for name in names:
+        if name not in REFUSING:
+            raise InvalidArgument(f"allow: expected findings among {', '.join(REFUSING)}, got {name!r}")

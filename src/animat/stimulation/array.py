@@ -1,0 +1,93 @@
+"""An array of electrodes on a rectangular grid: electrode numbers, positions, and the blocks that it is scanned in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import InvalidArgument, shown
+
+_MOST = 1_000_000
+
+
+@dataclass(frozen=True)
+class ElectrodeArray:
+    """A grid of electrodes numbered row by row: electrode = row x columns + column, from 0.
+
+    Attributes:
+        name: what it is called.
+        columns, rows: of the grid.
+        pitch_um: distance between neighbours, in both directions.
+        channels: electrodes that can be recorded at once.
+        stimulation_units: electrodes that can be stimulated at once.
+
+    Raises:
+        InvalidArgument: for counts that are no whole numbers above 0, or a distance that is none.
+    """
+
+    name: str
+    columns: int
+    rows: int
+    pitch_um: float
+    channels: int
+    stimulation_units: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise InvalidArgument(f"array.name: expected text, got {shown(self.name)}")
+        for name in ("columns", "rows", "channels", "stimulation_units"):
+            count: Any = getattr(self, name)
+            if not isinstance(count, int | np.integer) or isinstance(count, bool) or not 1 <= count <= _MOST:
+                raise InvalidArgument(f"array.{name}: expected a whole number from 1 to {_MOST:,}, got {shown(count)}")
+        pitch_um: Any = self.pitch_um
+        if not isinstance(pitch_um, int | float) or not 0 < pitch_um <= _MOST:
+            raise InvalidArgument(f"array.pitch_um: expected a distance above 0 um, got {shown(pitch_um)}")
+
+    def __len__(self) -> int:
+        return self.columns * self.rows
+
+    def position_um(
+        self, electrode: Int64[np.ndarray, " electrodes"] | int
+    ) -> tuple[Float64[np.ndarray, " electrodes"], Float64[np.ndarray, " electrodes"]]:
+        """x and y of electrodes, in micrometres from electrode 0.
+
+        Raises:
+            InvalidArgument: for a number that is not on the array.
+        """
+        electrode = np.atleast_1d(np.asarray(electrode, dtype=np.int64))
+        outside = (electrode < 0) | (electrode >= len(self))
+        if np.any(outside):
+            raise InvalidArgument(
+                f"electrode: expected numbers from 0 to {len(self) - 1} on the {self.name}, got {electrode[outside][0]}"
+            )
+        return (electrode % self.columns) * self.pitch_um, (electrode // self.columns) * self.pitch_um
+
+    def distance_um(
+        self, electrodes: Int64[np.ndarray, " electrodes"] | int, others: Int64[np.ndarray, " others"] | int
+    ) -> Float64[np.ndarray, "electrodes others"]:
+        """The distance of every electrode to every other one given."""
+        x_um, y_um = self.position_um(electrodes)
+        other_x_um, other_y_um = self.position_um(others)
+        return np.asarray(np.hypot(x_um[:, None] - other_x_um[None, :], y_um[:, None] - other_y_um[None, :]))
+
+    def scan_blocks(self, size: int | None = None) -> list[Int64[np.ndarray, " electrodes"]]:
+        """All electrodes, in order, in as few blocks as can be recorded one after the other.
+
+        Args:
+            size: electrodes of a block; by default as many as can be recorded at once.
+
+        Raises:
+            InvalidArgument: for a block that is empty or larger than what can be recorded at once.
+        """
+        size = self.channels if size is None else size
+        if not 1 <= size <= self.channels:
+            raise InvalidArgument(f"size: expected 1 to {self.channels} electrodes a block, got {size}")
+        blocks = -(-len(self) // size)
+        return [np.asarray(block) for block in np.array_split(np.arange(len(self), dtype=np.int64), blocks)]
+
+
+MAXONE = ElectrodeArray("MaxOne", columns=220, rows=120, pitch_um=17.5, channels=1024, stimulation_units=32)
+"""26,400 electrodes in 3.85 x 2.10 mm (method, section 1)."""

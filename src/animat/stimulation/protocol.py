@@ -1,0 +1,226 @@
+"""How stimuli are presented: what must be the same when a culture is recorded and when a robot is driven by it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.plain_file import read_plain_text
+from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+
+Order = Literal["blocked", "mixed"]
+
+_MOST_PULSES = 10_000_000
+_LONGEST_S = 86_400
+_LONGEST_RECORDING_S = 7 * 86_400
+_MOST_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class Presentation:
+    """The order of the stimulus frequencies and the pulses of one presentation; it travels with the data.
+
+    A culture has a memory: at 80 Hz it answers otherwise in a block of 80 Hz than between other frequencies. So a
+    simulator, and a policy trained on it, holds for the presentation that it was recorded with.
+
+    Attributes:
+        order: `"blocked"`, all stimuli of a frequency together (the paper), or `"mixed"`, a frequency drawn at random
+            for each presentation (as a closed loop presents them).
+        pulses: pulses 1/f apart in one presentation; the response is read after the last one (the paper: 1).
+
+    Raises:
+        InvalidArgument: for another order, or fewer pulses than one.
+    """
+
+    order: Order
+    pulses: int = 1
+
+    def __post_init__(self) -> None:
+        if self.order not in get_args(Order):
+            raise InvalidArgument(f"order: expected 'blocked' or 'mixed', got {shown(self.order)}")
+        pulses: Any = self.pulses
+        if not isinstance(pulses, int | np.integer) or isinstance(pulses, bool):
+            raise InvalidArgument(f"pulses: expected a whole number, got {shown(pulses)}")
+        if pulses < 1:
+            raise InvalidArgument(f"pulses: expected at least 1 pulse a presentation, got {shown(pulses)}")
+        if pulses > _MOST_PULSES:
+            raise InvalidArgument(f"pulses: expected at most {_MOST_PULSES:,} in a recording, got {shown(pulses)}")
+
+    def __str__(self) -> str:
+        return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} a presentation"
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is done in one recording; with patterns and a seed it becomes a `Schedule` (`animat.stimulation.schedule`).
+
+    Every pulse comes 1/f after the one before it, f being the frequency of its own presentation, and the response is
+    read after the last pulse of a presentation. The defaults are the paper's: five frequencies as blocks in random
+    order, each of 100 patterns once at each, one pulse a presentation.
+
+    Attributes:
+        frequencies_hz: the conditions, each once.
+        order: `"blocked"` or `"mixed"`: the frequencies' presentations shuffled together, as a closed loop meets them.
+        pulses: of one presentation, with different patterns where there are enough.
+        patterns: how many of the culture's patterns are used, the first ones; 1 repeats one pattern.
+        presentations: at each frequency; each pattern is read equally often, in random order.
+        setup_s: before each block (mixed: before the one block), the time that setting up takes. Nothing is recorded
+            meanwhile, and the recording's clock leaves it out.
+        pause_s: recorded without stimuli before each block.
+        tail_s: recorded after the last pulse of each block.
+        pulse: what every electrode delivers.
+
+    Raises:
+        InvalidArgument: naming the attribute, what was expected and what came.
+
+    Source: the paper's methods; 38.75 s of stimulation in about 120 s with set-up.
+    """
+
+    frequencies_hz: tuple[float, ...] = (5.0, 10.0, 20.0, 40.0, 80.0)
+    order: Order = "blocked"
+    pulses: int = 1
+    patterns: int = 100
+    presentations: int = 100
+    setup_s: float = 14.0
+    pause_s: float = 2.0
+    tail_s: float = 0.1
+    pulse: Pulse = PUBLISHED_PULSE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frequencies_hz", tuple(float(f) for f in self.frequencies_hz))
+        if not self.frequencies_hz or not all(0 < f <= 10_000 for f in self.frequencies_hz):
+            raise InvalidArgument(f"frequencies_hz: expected some, above 0 Hz to 10 kHz, got {self.frequencies_hz}")
+        if len(set(self.frequencies_hz)) < len(self.frequencies_hz):
+            raise InvalidArgument(f"frequencies_hz: expected each once, got {self.frequencies_hz}")
+        for name in ("patterns", "presentations"):
+            if not 1 <= getattr(self, name) <= 1_000_000:
+                raise InvalidArgument(f"{name}: expected 1 to 1,000,000, got {shown(getattr(self, name))}")
+        for name in ("setup_s", "pause_s", "tail_s"):
+            if not 0 <= getattr(self, name) <= _LONGEST_S:
+                raise InvalidArgument(
+                    f"{name}: expected seconds from 0 to a day ({_LONGEST_S}), got {getattr(self, name)}"
+                )
+            # A series knows its own protocol by its text, in which 14 is not 14.0.
+            object.__setattr__(self, name, float(getattr(self, name)))
+        # The order and the number of pulses are checked there.
+        _ = self.presentation
+        pulses = len(self.frequencies_hz) * self.presentations * self.pulses
+        if pulses > _MOST_PULSES:
+            raise InvalidArgument(
+                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x presentations x pulses), got "
+                f"{pulses:,}"
+            )
+
+        stimulated_s = sum(self.presentations * self.pulses / f for f in self.frequencies_hz)
+        if stimulated_s > _LONGEST_RECORDING_S:
+            raise InvalidArgument(
+                f"frequencies_hz: expected stimuli of at most a week ({_LONGEST_RECORDING_S:,} s) in a recording, got "
+                f"{stimulated_s:.3g} s"
+            )
+
+    @property
+    def presentation(self) -> Presentation:
+        """The part of it that must be the same when a robot is driven."""
+        return Presentation(self.order, self.pulses)
+
+    def to_json(self) -> str:
+        """As one line of JSON, the way it travels in a recording's provenance under `"protocol"`."""
+        data = {each.name: getattr(self, each.name) for each in fields(self)}
+        return json.dumps({**data, "pulse": self.pulse.to_list()})
+
+    @staticmethod
+    def from_json(text: str, defaults: Protocol | None = None) -> Protocol:
+        """From what `to_json` gave.
+
+        Args:
+            text: an object of JSON whose keys are the attributes.
+            defaults: what a key that is left out stands for; None: the defaults above, and the pulse must be given.
+
+        Raises:
+            InvalidArgument: for anything else, naming the key, what was expected and what came.
+        """
+        try:
+            data = json.loads(text, object_pairs_hook=_each_once)
+        except (ValueError, RecursionError) as error:
+            if isinstance(error, InvalidArgument):
+                raise
+            if isinstance(error, json.JSONDecodeError):
+                raise InvalidArgument(
+                    f"protocol: expected JSON, got a mistake in line {error.lineno}, column {error.colno} ({error.msg})"
+                ) from error
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}") from error
+        if not isinstance(data, dict):
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
+        known = [each.name for each in fields(Protocol)]
+        for name in data:
+            if name not in known:
+                raise InvalidArgument(f"protocol: expected settings among {', '.join(known)}, got {name!r}")
+        if defaults is None and "pulse" not in data:
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
+        return replace(defaults or PAPER, **{name: _setting(name, value) for name, value in data.items()})
+
+
+def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
+    """Read a protocol from a file of JSON, as `Protocol.to_json` writes it.
+
+    Args:
+        path: of the file.
+        defaults: what a key that is left out stands for; None: the defaults of `Protocol`.
+
+    Raises:
+        InvalidFile: naming the file, the key, what was expected and what came.
+    """
+    try:
+        return Protocol.from_json(read_plain_text(path, _MOST_BYTES), defaults or PAPER)
+    except InvalidArgument as error:
+        raise InvalidFile(f"{path}: {error}") from error
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; of a key that stands there twice, one value would be dropped in silence."""
+    data: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in data:
+            raise InvalidArgument(f"{name}: expected once, got it twice")
+        data[name] = value
+    return data
+
+
+def _setting(name: str, value: Any) -> Any:
+    """A value of JSON as its attribute is; what it may be beyond its type is checked where a `Protocol` is made."""
+    if name == "frequencies_hz":
+        if not isinstance(value, list):
+            raise InvalidArgument(f"{name}: expected a list of numbers, got {value!r}")
+        return tuple(_number(name, each) for each in value)
+    if name == "pulse":
+        if not isinstance(value, list) or not all(isinstance(phase, dict) for phase in value):
+            raise InvalidArgument(f"{name}: expected a list of phases with duration_us and an amplitude, got {value!r}")
+        return Pulse.from_list([{key: _number(f"pulse.{key}", x) for key, x in phase.items()} for phase in value])
+    if name in ("patterns", "presentations", "pulses"):
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise InvalidArgument(f"{name}: expected a whole number, got {value!r}")
+        return value
+    return value if name == "order" else _number(name, value)
+
+
+def _number(name: str, value: Any) -> float:
+    # As a float always, as it is in a `Protocol`: a series knows its own by its text.
+    try:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+    except OverflowError:
+        pass
+    raise InvalidArgument(f"{name}: expected a number, got {str(value)[:40]!r}")
+
+
+PAPER = Protocol()
+"""The paper's recording."""
+
+CLOSED_LOOP = Protocol(order="mixed", presentations=500)
+"""What a closed loop needs: frequencies mixed at random, one pulse a presentation, and so many of each that a simulator
+with memory finds responses with a like past."""

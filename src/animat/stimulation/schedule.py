@@ -1,0 +1,166 @@
+"""A protocol made definite: which pattern is pulsed when, from a seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import InvalidArgument
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.stimulus import Stimuli, Stimulus
+from animat.tables import UNKNOWN
+
+TICK_S = 50e-6
+"""Stimuli start on a grid of 50 us, a sample at 20 kHz: what stimulation hardware can time exactly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A stretch of stimulation without a break.
+
+    Attributes:
+        setup_s: passes before it, unrecorded.
+        duration_s: recorded.
+        stimuli: their times counted from the block's recorded start; presentations numbered through all blocks.
+    """
+
+    setup_s: float
+    duration_s: float
+    stimuli: Stimuli
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """All stimuli of one recording, block by block.
+
+    Attributes:
+        protocol: that it follows.
+        seed: that decided every draw.
+        blocks: in the order of time.
+    """
+
+    protocol: Protocol
+    seed: int
+    blocks: tuple[Block, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes, set-up included."""
+        return sum(block.setup_s + block.duration_s for block in self.blocks)
+
+    @property
+    def recorded_s(self) -> float:
+        """How much of that is recorded."""
+        return sum(block.duration_s for block in self.blocks)
+
+    def __len__(self) -> int:
+        return sum(len(block.stimuli) for block in self.blocks)
+
+    def deliveries(self, block: Block) -> list[Stimulus]:
+        """The stimuli of a block as they are delivered."""
+        return stimuli_of(block.stimuli, self.protocol)
+
+
+def make_schedule(protocol: Protocol, patterns: Int64[np.ndarray, "patterns size"], seed: int) -> Schedule:
+    """Draw the order of frequencies and patterns of one recording.
+
+    Args:
+        protocol: what to do.
+        patterns: the culture's patterns, electrodes of each, padded with -1.
+        seed: zero or more.
+
+    Raises:
+        InvalidArgument: if the culture has fewer patterns than the protocol uses, or for a negative seed.
+    """
+    if protocol.patterns > len(patterns):
+        raise InvalidArgument(
+            f"patterns: expected at most the {len(patterns)} that the culture's electrode selection has, got "
+            f"{protocol.patterns}: select more, or use fewer"
+        )
+    if seed < 0:
+        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    rng = np.random.default_rng([seed, 7])
+    n_frequencies, each = len(protocol.frequencies_hz), protocol.presentations
+    if protocol.order == "blocked":
+        orders = [np.full(each, frequency) for frequency in rng.permutation(n_frequencies)]
+    else:
+        orders = [rng.permutation(np.repeat(np.arange(n_frequencies), each))]
+    read = [_balanced(rng, protocol.patterns, each) for _ in range(n_frequencies)]
+    taken = [0] * n_frequencies
+    blocks, presentation = [], 0
+    for order in orders:
+        pattern = np.empty((len(order), protocol.pulses), dtype=np.int64)
+        for row, frequency in enumerate(order):
+            pattern[row] = _train(rng, protocol, int(read[frequency][taken[frequency]]))
+            taken[frequency] += 1
+        frequency_hz = np.repeat(np.array(protocol.frequencies_hz)[order], protocol.pulses)
+        number = np.repeat(np.arange(presentation, presentation + len(order)), protocol.pulses)
+        presentation += len(order)
+        blocks.append(_block(protocol, frequency_hz, patterns[pattern.ravel()], pattern.ravel(), number))
+    return Schedule(protocol, seed, tuple(blocks))
+
+
+def stimuli_of(stimuli: Stimuli, protocol: Protocol) -> list[Stimulus]:
+    """Rows of a stimulus table as they are delivered."""
+    rows = zip(
+        stimuli.time_s.tolist(),
+        stimuli.electrodes.tolist(),
+        stimuli.frequency_hz.tolist(),
+        stimuli.pattern.tolist(),
+        stimuli.presentation.tolist(),
+        strict=True,
+    )
+    return [
+        Stimulus(time_s, tuple(e for e in electrodes if e != UNKNOWN), protocol.pulse, frequency_hz, pattern, number)
+        for time_s, electrodes, frequency_hz, pattern, number in rows
+    ]
+
+
+def on_ticks(time_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
+    """Times moved to the grid of `TICK_S`."""
+    # A division by a whole number is rounded once; a product with 50e-6 would be off by the error of that number.
+    return np.asarray(np.rint(time_s / TICK_S) / round(1 / TICK_S))
+
+
+def _block(
+    protocol: Protocol,
+    frequency_hz: Float64[np.ndarray, " pulses"],
+    electrodes: Int64[np.ndarray, "pulses size"],
+    pattern: Int64[np.ndarray, " pulses"],
+    presentation: Int64[np.ndarray, " pulses"],
+) -> Block:
+    since_s = 1 / frequency_hz
+    since_s[0] = protocol.pause_s
+    time_s = on_ticks(np.cumsum(since_s))
+    end_s = on_ticks(time_s[-1:] + protocol.tail_s)[0]
+    return Block(
+        setup_s=protocol.setup_s,
+        duration_s=float(end_s),
+        stimuli=Stimuli(
+            time_s=time_s,
+            frequency_hz=frequency_hz,
+            pattern=pattern,
+            electrodes=electrodes,
+            presentation=presentation,
+        ),
+    )
+
+
+def _balanced(rng: np.random.Generator, patterns: int, presentations: int) -> Int64[np.ndarray, " presentations"]:
+    """Each pattern as often as the others, one round after the other, each round in random order."""
+    rounds = -(-presentations // patterns)
+    return np.concatenate([rng.permutation(patterns) for _ in range(rounds)])[:presentations]
+
+
+def _train(rng: np.random.Generator, protocol: Protocol, last: int) -> Int64[np.ndarray, " pulses"]:
+    """The patterns of a presentation's pulses: different ones, as long as there are; the last one is given."""
+    before = protocol.pulses - 1
+    if protocol.patterns == 1:
+        return np.full(protocol.pulses, last)
+    others = np.delete(np.arange(protocol.patterns), last)
+    drawn: list[int] = []
+    while len(drawn) < before:
+        drawn.extend(rng.permutation(others)[: before - len(drawn)].tolist())
+    return np.array([*drawn, last], dtype=np.int64)

@@ -1,0 +1,270 @@
+"""Which electrodes record, which stimulate, and in which patterns: chosen from a scan, kept as a value."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.brief import briefly
+from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.plain_file import read_plain_text
+from animat.stimulation.array import ElectrodeArray
+from animat.stimulation.patterns import draw_patterns
+from animat.stimulation.scan import ScannedActivity
+from animat.writing import written_whole
+
+FORMAT = "animat electrode selection 1"
+_MOST_BYTES = 2**24
+
+
+@dataclass(frozen=True)
+class SelectionRule:
+    """What is asked of a selection; the defaults are the paper's where it gives them.
+
+    Attributes:
+        recording_sites: at most this many channels.
+        signal_to_noise: the least an electrode must have to be recorded.
+        spacing_um: an electrode is left out if a neighbour within this distance has a better signal-to-noise ratio, so
+            that a neuron is not counted on every electrode around it; 0 leaves none out.
+        stimulation_sites: exactly this many.
+        patterns, pattern_size, pattern_spacing_um: see `draw_patterns`.
+    """
+
+    recording_sites: int = 1024
+    signal_to_noise: float = 6.0
+    spacing_um: float = 18.0
+    stimulation_sites: int = 32
+    patterns: int = 100
+    pattern_size: int = 5
+    pattern_spacing_um: float = 100.0
+
+    def __post_init__(self) -> None:
+        value: Any
+        for name, value in vars(self).items():
+            if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not math.isfinite(value):
+                raise InvalidArgument(f"rule.{name}: expected a finite number, got {shown(value)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Recording sites, stimulation sites and patterns on an array: to save, to plot, and to give to hardware.
+
+    Attributes:
+        array: what the electrode numbers refer to.
+        recording: electrodes that are recorded, channel by channel, shape (channels,).
+        stimulation: electrodes that stimulate, shape (sites,).
+        patterns: electrodes pulsed together, all of them stimulation sites, shape (patterns, size).
+        rule: what was asked for.
+        seed: that decided the patterns.
+        scanned: electrodes that were scanned.
+        passed: electrodes that passed the threshold and the spacing.
+    """
+
+    __repr__ = briefly
+
+    array: ElectrodeArray
+    recording: Int64[np.ndarray, " channels"]
+    stimulation: Int64[np.ndarray, " sites"]
+    patterns: Int64[np.ndarray, "patterns size"]
+    rule: SelectionRule = field(default_factory=SelectionRule)
+    seed: int = 0
+    scanned: int = 0
+    passed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, dimensions in (("recording", 1), ("stimulation", 1), ("patterns", 2)):
+            values = np.array(getattr(self, name), dtype=np.int64)
+            if values.ndim != dimensions:
+                raise InvalidArgument(f"selection.{name}: expected {dimensions} dimensions, got {values.shape}")
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+            if values.size:
+                self.array.position_um(values.ravel())
+        for name in ("recording", "stimulation"):
+            electrodes = getattr(self, name)
+            if len(np.unique(electrodes)) != len(electrodes):
+                raise InvalidArgument(f"selection.{name}: expected each electrode once, got some twice or more")
+        strange = self.patterns[~np.isin(self.patterns, self.stimulation)]
+        if strange.size:
+            raise InvalidArgument(f"selection.patterns: expected stimulation sites only, got electrode {strange[0]}")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Selection) and self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        return hash(json.dumps(self.to_dict()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As data for JSON."""
+        return {
+            "format": FORMAT,
+            "array": dict(vars(self.array)),
+            "rule": dict(vars(self.rule)),
+            "seed": self.seed,
+            "scanned": self.scanned,
+            "passed": self.passed,
+            "stimulation": self.stimulation.tolist(),
+            "patterns": self.patterns.tolist(),
+            "recording": self.recording.tolist(),
+        }
+
+    @staticmethod
+    def from_dict(data: dict[str, Any]) -> Selection:
+        """From what `to_dict` gave.
+
+        Raises:
+            InvalidArgument: for anything else.
+        """
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            found = data.get("format") if isinstance(data, dict) else type(data).__name__
+            raise InvalidArgument(f"selection: expected {FORMAT!r}, got {found!r}")
+        try:
+            return Selection(
+                array=ElectrodeArray(**data["array"]),
+                recording=_electrodes(data["recording"], 1),
+                stimulation=_electrodes(data["stimulation"], 1),
+                patterns=_electrodes(data["patterns"], 2),
+                rule=SelectionRule(**data["rule"]),
+                seed=_whole(data["seed"]),
+                scanned=_whole(data["scanned"]),
+                passed=_whole(data["passed"]),
+            )
+        except InvalidArgument:
+            raise
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise InvalidArgument(
+                f"selection: expected what Selection.to_dict writes, got {shown(error, 200)}"
+            ) from error
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write as JSON; the file is complete or absent."""
+        with written_whole(path) as beside:
+            beside.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Selection:
+        """Read what `save` wrote.
+
+        Raises:
+            InvalidFile: if the file is missing, damaged, or something else.
+        """
+        try:
+            return Selection.from_dict(json.loads(read_plain_text(path, _MOST_BYTES)))
+        except (ValueError, RecursionError) as error:
+            # Text that is no JSON and data that is no selection both raise a ValueError.
+            said = str(error).partition(";")[0]
+            raise InvalidFile(f"{path}: expected an electrode selection in JSON: {said}") from error
+
+
+def _electrodes(data: Any, dimensions: int) -> Int64[np.ndarray, "..."]:
+    """Numbers of electrodes as JSON holds them: a list of them, or of lists as long as each other."""
+    values = np.array(data) if data else np.empty((0,) * dimensions, np.int64)
+    # A part of a number, or a text of one, would be made whole in silence.
+    if not isinstance(data, list) or values.dtype.kind != "i":
+        raise InvalidArgument(f"selection: expected whole numbers of electrodes, got {shown(data)}")
+    return values.astype(np.int64)
+
+
+def _whole(data: Any) -> int:
+    if not isinstance(data, int) or isinstance(data, bool) or not 0 <= data < 2**63:
+        raise InvalidArgument(f"selection: expected a whole number, got {shown(data)}")
+    return data
+
+
+def select_electrodes(
+    array: ElectrodeArray, scan: ScannedActivity, rule: SelectionRule | None = None, *, seed: int = 0
+) -> Selection:
+    """Choose recording sites, stimulation sites and patterns from a scan.
+
+    Recording sites: of the electrodes whose signal-to-noise ratio reaches the threshold and is the best within
+    `spacing_um`, those with the highest rate. Stimulation sites: of the recording sites, those with the highest
+    product of spike amplitude and excitatory score, since stimulation is most reliable where the spike is largest.
+
+    Args:
+        array: that was scanned.
+        scan: its spontaneous activity.
+        rule: what is asked for.
+        seed: decides the patterns.
+
+    Raises:
+        InvalidArgument: for what cannot be had, with what to relax.
+
+    Source: the paper's methods; the spacing and the score are ours (it says "by spike shape and amplitude").
+    """
+    rule = rule or SelectionRule()
+    if not 1 <= rule.recording_sites <= array.channels:
+        raise InvalidArgument(
+            f"recording_sites: expected 1 to {array.channels} on the {array.name}, got {rule.recording_sites}"
+        )
+    if not 1 <= rule.stimulation_sites <= array.stimulation_units:
+        raise InvalidArgument(
+            f"stimulation_sites: expected 1 to {array.stimulation_units} on the {array.name}, "
+            f"got {rule.stimulation_sites}"
+        )
+    ratio = scan.signal_to_noise
+    passed = np.flatnonzero((ratio >= rule.signal_to_noise) & (scan.rate_hz > 0))
+    if rule.spacing_um > 0 and len(passed):
+        passed = passed[_is_best_nearby(array, scan.electrode[passed], ratio[passed], rule.spacing_um)]
+    if len(passed) < rule.stimulation_sites:
+        best = f"; the best ratio is {ratio.max():.1f}" if len(ratio) else ""
+        raise InvalidArgument(
+            f"stimulation_sites: expected {rule.stimulation_sites} among the recording sites, but only {len(passed)} "
+            f"of {len(scan)} electrodes pass a signal-to-noise ratio of {rule.signal_to_noise:g}{best}: lower the "
+            "ratio or the spacing, scan for longer, or ask for fewer sites"
+        )
+    # Ties are broken by the electrode's number, so that one scan gives one selection.
+    recording = passed[np.lexsort((scan.electrode[passed], -scan.rate_hz[passed]))][: rule.recording_sites]
+    if len(recording) < rule.stimulation_sites:
+        raise InvalidArgument(
+            f"stimulation_sites: expected at most as many as recording sites ({len(recording)}), "
+            f"got {rule.stimulation_sites}"
+        )
+    worth = (scan.amplitude_uv * scan.excitatory_score)[recording]
+    stimulation = recording[np.lexsort((scan.electrode[recording], -worth))][: rule.stimulation_sites]
+    electrodes = np.sort(scan.electrode[stimulation])
+    return Selection(
+        array=array,
+        recording=np.sort(scan.electrode[recording]),
+        stimulation=electrodes,
+        patterns=draw_patterns(
+            array,
+            electrodes,
+            seed=seed,
+            patterns=rule.patterns,
+            size=rule.pattern_size,
+            spacing_um=rule.pattern_spacing_um,
+        ),
+        rule=rule,
+        seed=seed,
+        scanned=len(scan),
+        passed=len(passed),
+    )
+
+
+def _is_best_nearby(
+    array: ElectrodeArray,
+    electrode: Int64[np.ndarray, " electrodes"],
+    ratio: Float64[np.ndarray, " electrodes"],
+    spacing_um: float,
+) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Whether no electrode within the spacing has a higher ratio; of two equal ones the first number stays."""
+    column, row = electrode % array.columns, electrode // array.columns
+    grid = np.full((array.rows, array.columns), -np.inf)
+    grid[row, column] = ratio
+    reach = int(spacing_um / array.pitch_um)
+    padded = np.pad(grid, reach, constant_values=-np.inf)
+    is_best = np.ones(len(electrode), dtype=bool)
+    for up in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            if (up, right) == (0, 0) or array.pitch_um * np.hypot(up, right) > spacing_um:
+                continue
+            neighbour = padded[row + reach + up, column + reach + right]
+            comes_first = (up, right) < (0, 0)
+            is_best &= (neighbour <= ratio) if not comes_first else (neighbour < ratio)
+    return is_best

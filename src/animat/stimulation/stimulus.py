@@ -1,0 +1,137 @@
+"""What is delivered to a culture: a pulse on electrodes at a time, and the table of many."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.brief import briefly
+from animat.errors import InvalidArgument, UnusableData
+from animat.stimulation.plain import number, seconds, whole_number
+from animat.stimulation.pulse import Pulse
+from animat.tables import FASTEST_HZ, expect_rising_times, freeze
+
+
+@dataclass(frozen=True)
+class Stimulus:
+    """One pulse on one or several electrodes at once.
+
+    What is given is copied as Python's own numbers: electrodes may be a list or an array of whole numbers.
+
+    Attributes:
+        time_s: its start, counted from the start of the delivery that it is part of; float64 or a whole number.
+        electrodes: numbers on the array.
+        pulse: what each electrode delivers.
+        frequency_hz: the frequency it is presented at, NaN where it has none.
+        pattern: index of the pattern that the electrodes make, -1 where they make none.
+        presentation: number of the presentation it belongs to.
+
+    Raises:
+        InvalidArgument: for numbers of another type, a time in float32 among them, or what is no pulse.
+    """
+
+    time_s: float
+    electrodes: tuple[int, ...]
+    pulse: Pulse
+    frequency_hz: float = math.nan
+    pattern: int = -1
+    presentation: int = 0
+
+    def __post_init__(self) -> None:
+        # A closed loop makes five an action: what is plain already is left as it is.
+        if type(self.time_s) is not float:
+            object.__setattr__(self, "time_s", seconds("time_s", self.time_s))
+        if type(self.electrodes) is not tuple or not _ONLY_INT.issuperset(map(type, self.electrodes)):
+            object.__setattr__(self, "electrodes", _plain_electrodes(self.electrodes))
+        if type(self.pulse) is not Pulse:
+            if not isinstance(self.pulse, Pulse):
+                raise InvalidArgument(f"pulse: expected a Pulse, got {type(self.pulse).__name__}")
+            object.__setattr__(self, "pulse", Pulse(self.pulse.phases))
+        if type(self.frequency_hz) is not float:
+            object.__setattr__(self, "frequency_hz", number("frequency_hz", self.frequency_hz))
+        for name in ("pattern", "presentation"):
+            if type(value := getattr(self, name)) is not int:
+                object.__setattr__(self, name, whole_number(name, value))
+
+
+def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
+    """Stimuli that cannot change, in a tuple of their own; one of a subclass as the `Stimulus` its attributes make.
+
+    Raises:
+        InvalidArgument: for what is no stimulus.
+    """
+    if not isinstance(stimuli, Iterable):
+        raise InvalidArgument(f"stimuli: expected several Stimulus, got {type(stimuli).__name__}")
+    return tuple([stimulus if type(stimulus) is Stimulus else _plain_stimulus(stimulus) for stimulus in stimuli])
+
+
+_ONLY_INT = frozenset({int})
+
+
+def _plain_electrodes(electrodes: Any) -> tuple[int, ...]:
+    try:
+        given = tuple(electrodes)
+    except TypeError as error:
+        raise InvalidArgument(f"electrodes: expected several, got {type(electrodes).__name__}") from error
+    return tuple(whole_number("electrodes", electrode) for electrode in given)
+
+
+def _plain_stimulus(stimulus: Any) -> Stimulus:
+    if not isinstance(stimulus, Stimulus):
+        raise InvalidArgument(f"stimuli: expected Stimulus, got {type(stimulus).__name__}")
+    return Stimulus(**{each.name: getattr(stimulus, each.name) for each in fields(Stimulus)})
+
+
+@dataclass(frozen=True, eq=False)
+class Stimuli:
+    """The table of stimulation pulses, one row a pulse, in the order of time.
+
+    Attributes:
+        time_s: start of each pulse on the recording's clock, shape (stimuli,).
+        frequency_hz: the stimulus frequency it was presented at, NaN where it is not known, shape (stimuli,).
+        pattern: index of the stimulation pattern, `UNKNOWN` where it is not known, shape (stimuli,).
+        electrodes: electrodes pulsed together, padded with `UNKNOWN`, shape (stimuli, electrodes).
+        presentation: number of the presentation each pulse belongs to; a response is read after the last pulse of a
+            presentation, shape (stimuli,).
+    """
+
+    __repr__ = briefly
+
+    time_s: Float64[np.ndarray, " stimuli"]
+    frequency_hz: Float64[np.ndarray, " stimuli"]
+    pattern: Int64[np.ndarray, " stimuli"]
+    electrodes: Int64[np.ndarray, "stimuli electrodes"]
+    presentation: Int64[np.ndarray, " stimuli"]
+
+    def __post_init__(self) -> None:
+        kinds = {"time_s": np.float64, "frequency_hz": np.float64, "pattern": np.int64, "presentation": np.int64}
+        freeze(self, "the stimulus table", **kinds, electrodes=np.int64)
+        if self.electrodes.ndim != 2:
+            raise UnusableData(
+                f"stimuli.electrodes: expected shape (stimuli, electrodes), padded with -1, got {self.electrodes.shape}"
+            )
+        expect_rising_times("stimuli.time_s", self.time_s)
+        known = self.frequency_hz[~np.isnan(self.frequency_hz)]
+        wrong = (known <= 0) | (known > FASTEST_HZ)
+        if np.any(wrong):
+            raise UnusableData(
+                f"stimuli.frequency_hz: expected positive frequencies up to {FASTEST_HZ:g} Hz, or NaN, got "
+                f"{known[wrong][0]:g}"
+            )
+        if np.any(np.diff(self.presentation) < 0):
+            raise UnusableData("stimuli.presentation: expected numbers that do not fall as time goes on")
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def is_last_of_presentation(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether a pulse is the last one of its presentation, the one whose response is read; shape (stimuli,)."""
+        last = np.ones(len(self), dtype=bool)
+        last[:-1] = self.presentation[1:] != self.presentation[:-1]
+        return last

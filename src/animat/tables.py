@@ -1,0 +1,59 @@
+"""Tables of what was measured: columns as read-only arrays of one length, and times that can be times."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.errors import UnusableData
+
+UNKNOWN = -1
+"""Stands for an unknown electrode or pattern, and pads `Stimuli.electrodes`."""
+
+CENTURY_S = 100 * 365.25 * 24 * 3600
+FASTEST_HZ = 1e9
+"""No time of a recording is farther from 0 than the one, and no rate or frequency above the other."""
+
+
+def freeze(table: object, name: str, **dtypes: Any) -> None:
+    """Turn the named attributes into read-only arrays of these types and of one length."""
+    length = None
+    for attribute, dtype in dtypes.items():
+        array = np.array(getattr(table, attribute), dtype=dtype)
+        if array.ndim == 0 or (length is not None and len(array) != length):
+            raise UnusableData(
+                f"{attribute}: expected {length if length is not None else 'a column of'} values in {name}, "
+                f"got shape {array.shape}"
+            )
+        length = len(array)
+        array.setflags(write=False)
+        object.__setattr__(table, attribute, array)
+
+
+def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
+    """Refuse times that are not finite, or not within a century.
+
+    Raises:
+        UnusableData: by the name of the column.
+    """
+    bad = np.count_nonzero(~np.isfinite(times_s))
+    if bad:
+        raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
+    far = np.abs(times_s) > CENTURY_S
+    if np.any(far):
+        raise UnusableData(
+            f"{name}: expected times in seconds, within a century, got {times_s[far][0]:g}; are they in seconds?"
+        )
+
+
+def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
+    """Refuse also times that fall.
+
+    Raises:
+        UnusableData: by the name of the column.
+    """
+    expect_times(name, times_s)
+    if np.any(np.diff(times_s) < 0):
+        raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
