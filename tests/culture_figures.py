@@ -254,7 +254,7 @@ def main(seeds: list[int]) -> None:
     line("figure", "bound", [f"seed {f.seed}" for f in rows])
     print("|---" * (2 + len(rows)) + "|")
     line("spontaneous rate, Hz a channel", "0.3-4", [f"{f.channel_rate_hz:.2f}" for f in rows])
-    line("network bursts a minute (100-800 ms)", "2-15", [f"{f.bursts_per_min:.1f}" for f in rows])
+    line("network bursts a minute (100-800 ms), first two minutes", "2-15", [f"{f.bursts_per_min:.1f}" for f in rows])
     line("their mean duration, ms", "100-800", [f"{f.burst_ms:.0f}" for f in rows])
     line("medians at 5, 10, 20, 40, 80 Hz", "seed means rise", [hz(f.medians_hz) for f in rows])
     line("80/5 ratio", "1.6-3", [f"{f.ratio:.2f}" for f in rows])
