@@ -468,19 +468,19 @@ def test_inspect_refuses_its_options_before_the_files(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "status", "words"),
     [
-        (["train", "cartpole", "--policies", "many"], ["--policies", "many", "animat train --help"]),
-        (["train", "unicycle"], ["unicycle"]),
-        (["train", "cartpole", "--polices", "3"], ["--polices"]),
-        (["trian"], ["trian", "train, evaluate"]),
-        ([], ["record, inspect"]),
+        (["train", "cartpole", "--policies", "many"], 2, ["--policies", "many", "animat train --help"]),
+        (["train", "unicycle"], 1, ["robot: expected one of cartpole, navigation, got 'unicycle'", "module:Class"]),
+        (["train", "cartpole", "--polices", "3"], 2, ["--polices"]),
+        (["trian"], 2, ["trian", "train, evaluate"]),
+        ([], 2, ["record, inspect"]),
     ],
 )
 def test_usage_errors_come_in_one_line(
-    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+    arguments: list[str], status: int, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(arguments) == 2
+    assert main(arguments) == status
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert all(word in lines[0] for word in words)

@@ -64,7 +64,7 @@ def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
 )
 def test_selections_made_by_hand_are_one_line(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
     (tmp_path / "s.json").write_text(json.dumps(SELECTION))
-    assert len(Selection.load(tmp_path / "s.json").channels) == 3
+    assert len(Selection.load(tmp_path / "s.json").recording) == 3
     (tmp_path / "s.json").write_text(json.dumps(SELECTION | changed))
     with pytest.raises(InvalidFile, match=words):
         Selection.load(tmp_path / "s.json")

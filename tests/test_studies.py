@@ -272,11 +272,14 @@ def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Pa
     if damage == "fewer spikes":
         recording = read_recording(file)
         kept = np.arange(len(recording.spike_times_s)) % 3 > 0
-        replace(
-            recording,
-            spike_times_s=recording.spike_times_s[kept],
-            spike_channels=recording.spike_channels[kept],
-        ).save(file)
+        write_nwb(
+            replace(
+                recording,
+                spike_times_s=recording.spike_times_s[kept],
+                spike_channels=recording.spike_channels[kept],
+            ),
+            file,
+        )
     elif damage == "garbage":
         file.write_bytes(b"garbage")
     else:
