@@ -1,4 +1,4 @@
-"""The spontaneous activity of a bare tissue over hours, by the detector that real cultures are read with.
+"""The spontaneous activity of a bare tissue over hours.
 
 A network burst: the spikes of all neurons, in bins of 25 ms, pass four times their mean over ten minutes; stretches
 less than 100 ms apart are one; at least 20 % of the active channels (above 0.02 Hz) take part. Written in plain NumPy,
@@ -79,7 +79,9 @@ def window(time_s: np.ndarray, neuron: np.ndarray, first_min: int, seen: np.ndar
     start_s, end_s, share, leader = bursts_of(time_s, neuron, from_s, to_s, seen)
     if len(start_s) < 3:
         nan = float("nan")
-        return Spontaneous(first_min, len(neuron) / 600 / seen.shape[1], len(start_s) / 10, *6 * [nan])
+        return Spontaneous(
+            first_min, len(neuron) / (to_s - from_s) / seen.shape[1], len(start_s) / WINDOW_MIN, *6 * [nan]
+        )
     between_s = np.diff(start_s)
     leads = np.sort(np.unique(leader[leader >= 0], return_counts=True)[1])[::-1]
     return Spontaneous(

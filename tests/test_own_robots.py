@@ -16,10 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from animat.animat import Animat
+from animat.closed_loop.contenders import HandMadeRule
 from animat.errors import InvalidArgument
+from animat.evaluation.hand_made import HandMade
 from animat.mapping import Linear, Mapping, Thresholds, check_mapping
 from animat.robots import Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
+from animat.robots.grid import no_grid
 from animat.robots.registry import robot_named
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -209,3 +213,28 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
 def test_mappings_that_give_no_commands_are_named(command: Callable[[Any], Any], words: str) -> None:
     with pytest.raises(InvalidArgument, match=f"^Push.command: {words}"):
         train(training("cartpole", Push(command)), timeline_of(), None)
+
+
+@pytest.mark.parametrize("wanted", [float("nan"), 1.5])
+def test_a_heuristic_s_command_is_one(wanted: float) -> None:
+    robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
+    with pytest.raises(InvalidArgument, match=f"Changed.heuristic: expected commands from -1 to 1, got {wanted:g}"):
+        check_robot(robot)
+
+
+@pytest.mark.parametrize(("wanted", "nearest"), [(0.15, 1), (0.3, 2), (-1.0, 0)])
+def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: float, nearest: int) -> None:
+    robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
+    means = (-0.4, 0.1, 0.4)
+    assert HandMadeRule(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
+    environment = Animat(robot, Thresholds(1), 3)
+    rule = HandMade(jnp.arange(3), jnp.asarray(means, jnp.float32))
+    assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros(1)).tolist() == [nearest]
+
+
+def test_a_grid_that_fails_is_none_with_a_reason() -> None:
+    def broken(self: Any) -> Any:
+        return 1 / 0
+
+    said = "slider.value_grid: expected a Grid, got ZeroDivisionError: division by zero"
+    assert no_grid(slider(value_grid=broken)) == said

@@ -22,7 +22,17 @@ from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.recordings.made_up import write_made_up_series
-from animat.robots import ROBOTS, Cartpole, Navigation, Robot, register_robot, registry, robot_named, robot_to_dict
+from animat.robots import (
+    ROBOTS,
+    Cartpole,
+    Navigation,
+    Robot,
+    register_robot,
+    registry,
+    robot_from_dict,
+    robot_named,
+    robot_to_dict,
+)
 from animat.robots.capabilities import WITHOUT, lacking
 from animat.studies.run import run_study
 from animat.studies.specification import Body, Source, Study
@@ -124,7 +134,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     told = json.loads(said.splitlines()[-1])
     assert "made by hand" not in {row["name"] for row in told["rows"]}
     assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
-    assert "no best possible return: robot: rover has no method `value_grid`" in said
+    assert "no best possible return: rover has no method `value_grid`" in said
 
 
 @pytest.mark.oracle
@@ -173,6 +183,20 @@ if __name__ == "__main__":
     assert ran.stdout.splitlines() == ["imported", "Mine(gain_m=0.1, episode_limit=20)"], ran.stderr
     mine = {"name": "mine", "parameters": {"gain_m": 0.1, "episode_limit": 20}, "import": "my_script:Mine"}
     assert robot_to_dict(robot_named("my_script:Mine")) == mine
+
+
+def test_parameters_that_are_tuples_come_back_from_json(package: Path) -> None:
+    at = written(package, ("gain_m: float = 0.1", "gain_m: float = 0.1\n    walls: tuple = ((1, 2), (3, 4))"))
+    robot = robot_named(at)
+    again = robot_from_dict(json.loads(json.dumps(robot_to_dict(robot))))
+    assert again == robot and hash(again) == hash(robot)
+
+
+@pytest.mark.parametrize("place", ["x" * 100_000, "my_package:\x1b[2J", "no colon", 5])
+def test_a_file_that_lies_about_where_a_robot_is_from_gets_a_short_line(place: Any) -> None:
+    with pytest.raises(InvalidArgument) as raised:
+        robot_from_dict({"name": "nobody", "parameters": {}, "import": place})
+    assert len(str(raised.value)) < 300 and "\x1b" not in str(raised.value)
 
 
 def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> None:
@@ -259,7 +283,7 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
         return env.render  # type: ignore[return-value]
 
     assert drawing("np.full((height_px, 9, 3), len(earlier), np.uint8)")().shape == (360, 9, 3)
-    with pytest.raises(InvalidArgument, match=r"rover.draw: expected uint8 of shape .*got shape \(9, 9\)"):
+    with pytest.raises(InvalidArgument, match=r"rover.draw: expected uint8 of shape .*got float64 of shape \(9, 9\)"):
         drawing("np.zeros((9, 9))")()
 
 

@@ -731,6 +731,7 @@ COMPARED = (
         ("policies = 2.5", "policies: expected a whole number, got 2.5"),
         ("polices = 2", "polices: no such setting at the top"),
         ("policies = ", "expected TOML"),
+        ("# nothing yet", "expected the settings of a study, got none"),
         ("seed = true", "seed: expected a whole number, got True"),
         ("conditions = []", "conditions: expected at least one"),
         ("robots = 'cartpole'", "robots: expected a list"),

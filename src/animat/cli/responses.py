@@ -105,7 +105,8 @@ def policies_for(robot: str | None, path: Path) -> dict[str, Policy]:
     Raises:
         Mismatch: for policies of another robot than was named.
     """
-    from animat.robots.registry import robot_class
+    from animat.robots.checking import check_robot
+    from animat.robots.registry import is_ours, robot_class
     from animat.training.policy import load_policies
 
     expected = None if robot is None else robot_class(robot).name
@@ -113,4 +114,6 @@ def policies_for(robot: str | None, path: Path) -> dict[str, Policy]:
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
             raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
+        if not is_ours(policy.robot):
+            check_robot(policy.robot)
     return policies

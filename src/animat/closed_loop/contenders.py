@@ -152,7 +152,13 @@ def controls(
         found.append(Contender("silent", "no pulse; the culture's own activity is read", who, "silent"))
         found.append(Contender("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
     if means is not None:
-        found.append(Contender("made by hand", "a rule without learning", HandMadeRule(robot, tuple(means))))
+        found.append(
+            Contender(
+                "made by hand",
+                "no learning: the stimulus nearest to the command of the robot's heuristic",
+                HandMadeRule(robot, tuple(means)),
+            )
+        )
     return found
 
 

@@ -15,6 +15,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
+from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels
 from animat.stimulation.array import MAXONE
@@ -215,6 +216,7 @@ class VirtualCulture(Culture):
 
         if self.is_open:
             raise InvalidArgument("culture: expected a closed one to restore, got one that is open")
+        path = expect_plain_file(path)
         tissue, visibility = self._grown()
         state = read_state(path, self.settings, tissue)
         # Only now: a culture that could not be restored is what it was.

@@ -59,7 +59,15 @@ def controls_of(
         controls.append(Control(f"constant {label}", "this one always", environment, simulator, constant))
     if hasattr(environment.robot, "heuristic"):
         rule = hand_made(environment, simulator)
-        controls.append(Control("made by hand", "a rule without learning", environment, simulator, rule))
+        controls.append(
+            Control(
+                "made by hand",
+                "no learning: the stimulus nearest to the command of the robot's heuristic",
+                environment,
+                simulator,
+                rule,
+            )
+        )
     if policies is not None and isinstance(environment, Animat) and simulator is not None:
         silent, shuffled = silenced(simulator), replace(environment, delivery="shuffled")
         controls += [

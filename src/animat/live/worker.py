@@ -35,13 +35,13 @@ def main() -> int:
     exchange: Exchange
     folder: Path
     keep_s: float
-    group, exchange, folder, keep_s = pickle.load(sys.stdin.buffer)
-    register_robot(type(group.training.robot))
 
     def tell(**words: Any) -> None:
         print(json.dumps({"members": group.members, **words}), file=told, flush=True)
 
     try:
+        group, exchange, folder, keep_s = pickle.load(sys.stdin.buffer)
+        register_robot(type(group.training.robot))
         swaps: list[dict[str, Any]] = []
         # The policies tell what they were trained on, the last of it known only in the end.
         group = replace(group, provenance={**group.provenance, "swaps": swaps})

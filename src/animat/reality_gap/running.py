@@ -148,7 +148,7 @@ def run_policies(
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
-        findings += (Finding("no-limit", "note", f"no best possible return: {why_not}"),)
+        findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no best possible return: {why_not}")),)
     else:
         limit = _meanwhile(lambda: best_return(environment, simulator, resolution=LIMIT_RESOLUTION, episodes=0).value)
     predicted = predict(

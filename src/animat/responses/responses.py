@@ -24,7 +24,7 @@ class Presented:
         condition: index of each, `NO_CONDITION` where it has none, shape (presentations,).
         rate_hz: x of each, shape (presentations,).
         is_burst: whether the response was one, shape (presentations,).
-        is_rested: whether there was no pulse in the `SILENCE_S` before it, shape (presentations,).
+        is_rested: whether there was no pulse in the second before it, shape (presentations,).
     """
 
     __repr__ = briefly

@@ -35,7 +35,7 @@ def check_robot(robot: Robot[Any]) -> None:
         state = _tried(f"{name}.reset", robot.reset, key)
         seen = _tried(f"{name}.observe", robot.observe, state)
         _expect_shape(f"{name}.observe", seen, (observations,), "one number for each of `quantities`")
-        told = [(state, seen, jnp.float32(0.0))]
+        told, wanted = [(state, seen, jnp.float32(0.0))], []
         # Commands at both ends and in the middle.
         for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
             uniforms = jnp.full(noise, 0.5, jnp.float32)
@@ -49,15 +49,20 @@ def check_robot(robot: Robot[Any]) -> None:
             seen = _tried(f"{name}.observe", robot.observe, after)
             told.append((after, seen, jnp.asarray(reward, jnp.float32)))
             if heuristic is not None:
-                _expect_shape(f"{name}.heuristic", _tried(f"{name}.heuristic", heuristic, seen), (), "a command")
-        return told
+                command = _tried(f"{name}.heuristic", heuristic, seen)
+                _expect_shape(f"{name}.heuristic", command, (), "a command")
+                wanted.append(jnp.asarray(command, jnp.float32))
+        return told, wanted
 
     # Under jit: what a step may not do there is seen here, and it is compiled once.
     try:
-        told = jax.device_get(jax.jit(episode)(jax.random.key(0)))
+        told, commands = jax.device_get(jax.jit(episode)(jax.random.key(0)))
     except InvalidArgument as error:
         # JAX has put a note of its own to it.
         raise InvalidArgument(str(error)) from error.__cause__
+    if not all(abs(command) <= 1 for command in commands):
+        got = ", ".join(f"{command:g}" for command in commands)
+        raise InvalidArgument(f"{name}.heuristic: expected commands from -1 to 1, got {got}")
     for state, seen, reward in told:
         for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
             if not all(np.all(np.isfinite(value)) for value in values):

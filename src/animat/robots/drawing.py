@@ -55,9 +55,11 @@ def draw_robot(
         InvalidArgument: for a robot that has no such method, or one that gives no picture.
     """
     drawn = capability(robot, "draw")(np.asarray(observation, np.float64), command, earlier, height_px)
-    if (shape := np.shape(drawn))[2:] != (3,) or np.asarray(drawn).dtype != np.uint8:
-        raise InvalidArgument(f"{robot.name}.draw: expected uint8 of shape (height, width, 3), got shape {shape}")
-    return drawn  # type: ignore[no-any-return]
+    picture = np.asarray(drawn)
+    if picture.shape[2:] != (3,) or picture.dtype != np.uint8:
+        got = f"{picture.dtype} of shape {picture.shape}"
+        raise InvalidArgument(f"{robot.name}.draw: expected uint8 of shape (height, width, 3), got {got}")
+    return picture
 
 
 class Canvas:

@@ -193,7 +193,17 @@ def grid_for(robot: Robot[Any]) -> Grid:
     Raises:
         InvalidArgument: for a robot that has none, or has none with its parameters.
     """
-    grid = capability(robot, "value_grid")()
+    make = capability(robot, "value_grid")
+    try:
+        grid = make()
+    except InvalidArgument:
+        raise
+    except Exception as error:
+        # Anything may go wrong in somebody else's robot.
+        said = (str(error).strip().splitlines() or ["no more is known"])[0]
+        raise InvalidArgument(
+            f"{robot.name}.value_grid: expected a Grid, got {type(error).__name__}: {said}"
+        ) from error
     if not isinstance(grid, Grid):
         raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {shown(grid)}")
     return grid

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copyreg
 import dataclasses
 import importlib
+import json
 import re
 import sys
 from collections.abc import Mapping
@@ -22,6 +23,7 @@ ENTRY_POINTS = "animat.robots"
 """The group in which an installed package announces its robots, `rover = "my_package.robots:Rover"`."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}")
+_PLACE = re.compile(r"[\w.]{1,200}:[\w.<>]{1,200}")
 _IN_MEMORY = "train in memory: train(training, timeline, None)"
 
 _registered: dict[str, type[Robot[Any]]] = {}
@@ -130,14 +132,16 @@ def robot_from_dict(data: Mapping[str, Any]) -> Robot[Any]:
         or not isinstance(data["parameters"], Mapping)
         or ":" in str(data["name"])
     ):
-        raise InvalidArgument(f'robot: expected {{"name": ..., "parameters": {{...}}}}, got {data!r}')
+        raise InvalidArgument(f'robot: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
+    if "import" in data and not _PLACE.fullmatch(str(data["import"])):
+        raise InvalidArgument(f"robot: expected to be imported from module:Class, got {shown(data['import'])}")
     if "import" in data and _kind_named(data["name"]) is None:
         place = str(data["import"])
         raise InvalidArgument(
             f"robot: expected one that is registered, got {shown(data['name'])}: import {place.partition(':')[0]} "
             f"first (on the command line: --robot {place})"
         )
-    return robot_named(data["name"], **data["parameters"])
+    return robot_named(data["name"], **{name: _frozen(value) for name, value in data["parameters"].items()})
 
 
 def expect_loadable_robot(robot: Robot[Any], *, in_workers: bool = False) -> None:
@@ -151,7 +155,10 @@ def expect_loadable_robot(robot: Robot[Any], *, in_workers: bool = False) -> Non
         InvalidArgument: for one that is not registered, or that no worker could import.
     """
     kind = type(robot)
-    if _registered.get(robot.name) is not kind or robot_from_dict(robot_to_dict(robot)) != robot:
+    if (
+        _registered.get(robot.name) is not kind
+        or robot_from_dict(json.loads(json.dumps(robot_to_dict(robot)))) != robot
+    ):
         raise InvalidArgument(
             f"robot: expected one that is registered, as a policy's file names its robot, got {kind.__name__}, which "
             f"is not: write @animat.register_robot above its class, or {_IN_MEMORY}"
@@ -185,6 +192,8 @@ def _imported(place: str) -> type[Robot[Any]]:
     module, _, name = place.partition(":")
     try:
         found = getattr(importlib.import_module(module), name)
+    except InvalidArgument:
+        raise
     except (Exception, SystemExit) as error:
         # Anything may go wrong in somebody else's module.
         raise InvalidArgument(f"robot: expected {place} to be importable, got {_said(error)}") from error
@@ -201,6 +210,11 @@ def _remade(place: str, parameters: dict[str, Any]) -> Robot[Any]:
     except InvalidArgument as error:
         hint = "what a script does belongs under `if __name__ == '__main__':`, as worker processes import it"
         raise InvalidArgument(f"{error}; {hint}") from error
+
+
+def _frozen(value: Any) -> Any:
+    """What was a tuple before it was JSON: a robot's parameters can be hashed, and lists cannot."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def _said(error: BaseException) -> str:

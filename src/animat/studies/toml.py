@@ -40,6 +40,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         # Also a number of more digits than Python reads.
         said = str(error).partition(";")[0]
         raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error
+    if not data:
+        raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
     try:
         return _read(Study, data, "")
     except InvalidArgument as error:

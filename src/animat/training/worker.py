@@ -64,7 +64,7 @@ def start_worker(module: str, core: int, stdin: IO[bytes] | int) -> subprocess.P
         bufsize=0,
         process_group=0,
         # A script's own folder, or the working one: robots may lie there.
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if isinstance(p, str))},
     )
 
 
