@@ -36,17 +36,6 @@ class Spontaneous(NamedTuple):
     led_share: float
     """Share of bursts that one of the ten most frequent leaders, of all channels, begins."""
 
-    def missed(self) -> list[str]:
-        """What is outside its bounds, in words."""
-        bounds = {
-            "1-10 bursts a minute": 1 <= self.bursts_per_min <= 10,
-            "variation of intervals 0.3-1.5": 0.3 <= self.interval_cv <= 1.5,
-            "150-800 ms": 150 <= self.burst_ms <= 800,
-            "mean participation 0.5-0.9": 0.5 <= self.participation <= 0.9,
-            "0.5-2 Hz a neuron": 0.5 <= self.rate_hz <= 2,
-        }
-        return [f"{name} at {self.first_min} min" for name, held in bounds.items() if not held]
-
 
 def bursts_of(
     time_s: np.ndarray, neuron: np.ndarray, from_s: float, to_s: float, seen: np.ndarray
@@ -112,16 +101,15 @@ def main(seeds: list[int]) -> None:
     names = (
         "seed, from min, Hz a neuron, bursts a minute, variation of intervals, ms, participation (10th-90th percentile)"
     )
-    columns = [*names.split(", "), "begun by ten channels", "missed"]
+    columns = [*names.split(", "), "begun by ten channels"]
     print(f"| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
     for seed in seeds:
         for row in over_hours(seed):
             spread = f"{row.participation:.2f} ({row.participation_p10:.2f}-{row.participation_p90:.2f})"
             bursts = f"{row.bursts_per_min:.1f} | {row.interval_cv:.2f} | {row.burst_ms:.0f} | {spread}"
-            missed = "; ".join(row.missed()) or "none"
             print(
-                f"| {seed} | {row.first_min} | {row.rate_hz:.2f} | {bursts} | {row.led_share:.2f} | {missed} |",
+                f"| {seed} | {row.first_min} | {row.rate_hz:.2f} | {bursts} | {row.led_share:.2f} |",
                 flush=True,
             )
 
