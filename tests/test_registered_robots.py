@@ -232,6 +232,7 @@ def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: p
         ("my_package.robots:At", "expected a class made of animat.Robot, got <class"),
         ("my_package.robots:", "to be importable, got "),
         (":Rover", "to be importable, got ValueError"),
+        ("./my_package/robots.py:Rover", "such as robots:Rover, got a file, './my_package/robots.py:Rover'"),
         ((("import animat", "import animat; 1 / 0"),), "to be importable, got ZeroDivisionError: division by zero"),
         ((("import animat", "raise SystemExit('no')"),), "to be importable, got SystemExit: no"),
         ((("def observe", "def see"),), "expected the methods of a robot, got a class without observe"),

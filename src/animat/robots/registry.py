@@ -190,6 +190,9 @@ def _imported(place: str) -> type[Robot[Any]]:
         if place_of(kind) == place:
             return kind
     module, _, name = place.partition(":")
+    if module.endswith(".py"):
+        meant = f"{Path(module).stem}:{name}"
+        raise InvalidArgument(f"robot: expected a module and its class, such as {meant}, got a file, {shown(place)}")
     try:
         found = getattr(importlib.import_module(module), name)
     except InvalidArgument:
