@@ -288,6 +288,9 @@ def test_groups_are_even_and_depend_on_the_number_of_policies_only() -> None:
         assert [i for group in groups for i in group] == list(range(n))
         assert max(map(len, groups)) <= 5
         assert max(map(len, groups)) - min(map(len, groups)) <= 1
+        on_two_cores = split_groups(n, fewest=2)
+        assert [i for group in on_two_cores for i in group] == list(range(n))
+        assert len(on_two_cores) == max(len(groups), min(2, n))
 
 
 def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:

@@ -184,25 +184,7 @@ def _roll_out(
 ) -> tuple[Array, Array, Array, Array, Array]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
 
-    def one_actor(actor: Actor, key: PRNGKeyArray) -> tuple[Array, Array, Array, Array, Array]:
-        def iteration(carry: tuple[Any, ...], key: PRNGKeyArray) -> tuple[tuple[Any, ...], None]:
-            state, going, returns, lengths, presented, passed, terminated = carry
-            uniforms = jax.random.uniform(key, (episodes, environment.noise_size + 1))
-            observation = jax.vmap(environment.observe)(state) / environment.scales
-            action = actor.act(environment, observation, uniforms[:, 0])
-            outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], state, action, simulator)
-            # An ended episode is carried along, and counts no further.
-            returns = returns + jnp.where(going, outcome.reward, 0.0)
-            terminated = terminated | (going & outcome.terminated)
-            lengths = lengths + going
-            if simulator is not None:
-                delivered = going[:, None] & (outcome.delivered[:, None] == jnp.arange(n_conditions))
-                passes = outcome.rate_hz >= simulator.percentiles[N_PERCENTILES // 2]
-                presented = presented + delivered.sum(axis=0)
-                passed = passed + (delivered & passes[:, None]).sum(axis=0)
-            going = going & ~(outcome.terminated | outcome.truncated)
-            return (outcome.state, going, returns, lengths, presented, passed, terminated), None
-
+    def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
         start, key = jax.random.split(key)
         carry = (
             jax.vmap(environment.reset)(jax.random.split(start, episodes)),
@@ -213,8 +195,32 @@ def _roll_out(
             jnp.zeros(n_conditions, jnp.int32),
             jnp.zeros(episodes, bool),
         )
-        keys = jax.random.split(key, environment.robot.episode_limit)
-        _, _, returns, lengths, presented, passed, terminated = jax.lax.scan(iteration, carry, keys)[0]
-        return returns, lengths, presented, passed, terminated
+        return carry, jax.random.split(key, environment.robot.episode_limit)
 
-    return jax.vmap(one_actor)(actors, keys)
+    def iteration(carry: tuple[Any, ...], actor: Actor, key: PRNGKeyArray) -> tuple[Any, ...]:
+        state, going, returns, lengths, presented, passed, terminated = carry
+        uniforms = jax.random.uniform(key, (episodes, environment.noise_size + 1))
+        observation = jax.vmap(environment.observe)(state) / environment.scales
+        action = actor.act(environment, observation, uniforms[:, 0])
+        outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], state, action, simulator)
+        # An ended episode is carried along, and counts no further.
+        returns = returns + jnp.where(going, outcome.reward, 0.0)
+        terminated = terminated | (going & outcome.terminated)
+        lengths = lengths + going
+        if simulator is not None:
+            delivered = going[:, None] & (outcome.delivered[:, None] == jnp.arange(n_conditions))
+            passes = outcome.rate_hz >= simulator.percentiles[N_PERCENTILES // 2]
+            presented = presented + delivered.sum(axis=0)
+            passed = passed + (delivered & passes[:, None]).sum(axis=0)
+        going = going & ~(outcome.terminated | outcome.truncated)
+        return outcome.state, going, returns, lengths, presented, passed, terminated
+
+    # The loop is outside of the `vmap`, and ends with the last episode: controls fail long before the limit.
+    first, of_iteration = jax.vmap(begin)(keys)
+    each = jax.vmap(iteration)
+    _, (_, _, *counted) = jax.lax.while_loop(
+        lambda at: (at[0] < environment.robot.episode_limit) & jnp.any(at[1][1]),
+        lambda at: (at[0] + 1, each(at[1], actors, of_iteration[:, at[0]])),
+        (0, first),
+    )
+    return tuple(counted)

@@ -10,7 +10,8 @@ from animat.compilation import kept_njit
 f4 = np.float32
 ONE, TWO, HALF, SIXTH = f4(1), f4(2), f4(0.5), f4(1 / 6)
 
-compiled = kept_njit(error_model="numpy", fastmath={"contract", "nsz"})
+# Without the interpreter's lock: `animat run` predicts and runs its loop meanwhile.
+compiled = kept_njit(error_model="numpy", fastmath={"contract", "nsz"}, nogil=True)
 
 
 @compiled

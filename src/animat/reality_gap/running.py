@@ -19,6 +19,7 @@ from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
@@ -142,8 +143,8 @@ def run_policies(
     else:
         contenders.append(random_control(len(loop.conditions)))
 
-    # Beside the prediction, on another core: it takes as long. Nothing else runs any more when the loop does.
-    limit = None
+    # Beside the prediction, on another core. Nothing else runs any more when a loop in real time does.
+    limit: Callable[[], float] | None = None
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
@@ -161,9 +162,9 @@ def run_policies(
         seed=seed,
         progress=progress,
     )
-    if limit is not None and progress is not None:
-        progress.update(0, 1, "best possible return")
-    best = None if limit is None else limit()
+    in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
+    if in_real_time:
+        _wait_for(limit, progress)
     of_each = planned_episodes(len(policies), len(contenders) - len(policies), episodes)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent")
@@ -175,6 +176,7 @@ def run_policies(
     session = run_session(
         culture, loop, contenders, folder, episodes=of_each, seed=seed, account=account, progress=progress
     )
+    best = _wait_for(limit, progress)
     rows = _rows(contenders, tuple(policies), predicted, session)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
@@ -222,6 +224,15 @@ def _meanwhile(compute: Callable[[], float]) -> Callable[[], float]:
     # A daemon: whoever stops while it computes need not wait for it.
     threading.Thread(target=work, name="best possible return", daemon=True).start()
     return found.result
+
+
+def _wait_for(limit: Callable[[], float] | None, progress: Progress | None) -> float | None:
+    """What `_meanwhile` returned, once it is known; at once where it is not asked for, or known already."""
+    if limit is None:
+        return None
+    if progress is not None:
+        progress.update(0, 1, "best possible return")
+    return limit()
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

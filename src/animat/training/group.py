@@ -212,10 +212,15 @@ def _bytes_of(leaves: list[Any]) -> int:
     return sum(leaf.nbytes for leaf in leaves)
 
 
-def split_groups(policies: int, largest: int = 5) -> list[tuple[int, ...]]:
+def split_groups(policies: int, largest: int = 5, *, fewest: int = 1) -> list[tuple[int, ...]]:
     """Cut the numbers of the policies into groups as even as possible, none larger than `largest`.
 
     It depends on nothing else, not on the machine: how many are trained side by side could change the last bits.
+
+    Args:
+        policies: how many there are.
+        largest: a group's policies at most.
+        fewest: groups at least, where there are as many policies: two keep two cores busy.
     """
-    n_groups = -(-policies // largest)
+    n_groups = max(-(-policies // largest), min(fewest, policies))
     return [tuple(int(i) for i in part) for part in np.array_split(np.arange(policies), n_groups)]

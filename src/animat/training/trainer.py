@@ -86,7 +86,7 @@ def train(
     manifest = describe(training, timeline, sources)
     groups = [
         Group(training, members, _on_host(timeline), manifest["fingerprint"], provenance_of(manifest))
-        for members in split_groups(training.policies)
+        for members in split_groups(training.policies, fewest=2)
     ]
     if folder is None:
         return _in_memory(groups, progress)
