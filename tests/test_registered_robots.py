@@ -224,6 +224,26 @@ def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: p
         robot_named("tank")
 
 
+def test_robots_are_listed_with_what_each_can_do(
+    package: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = [EntryPoint("rover", ROVER, "animat.robots"), EntryPoint("tank", "my_nowhere:Tank", "animat.robots")]
+    monkeypatch.setattr(
+        registry, "entry_points", lambda *, group, name=None: [each for each in points if name in (None, each.name)]
+    )
+    # A package that is broken hides no robot, and ends with status 1.
+    assert main(["robots", "--json"]) == 1
+    said, _, line = capsys.readouterr().out.strip().rpartition("\n")
+    told = json.loads(line)
+    assert list(told["robots"]) == ["cartpole", "navigation", "rover"]
+    assert told["robots"]["cartpole"]["can"] == ["heuristic", "value_grid", "draw", "draw_paths"]
+    assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
+    assert "  no rule made by hand among the controls: rover has no method `heuristic`" in said
+    assert "ModuleNotFoundError" in told["unusable"]["tank"] and "tank cannot be used: " in said
+    assert main(["robots", "my_nowhere:Tank"]) == 1
+    assert capsys.readouterr().err.startswith("animat: robot: expected my_nowhere:Tank to be importable")
+
+
 @pytest.mark.parametrize(
     ("place", "words"),
     [

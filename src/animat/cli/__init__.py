@@ -26,6 +26,7 @@ from animat.cli.live import Live
 from animat.cli.record import Record
 from animat.cli.recover import Recover
 from animat.cli.reproduce import Reproduce
+from animat.cli.robots import Robots
 from animat.cli.run import Run
 from animat.cli.study import StudyFile
 from animat.cli.train import Train
@@ -43,6 +44,7 @@ Command = (
     | Annotated[Run, subcommand("run")]
     | Annotated[Live, subcommand("live")]
     | Annotated[Recover, subcommand("recover")]
+    | Annotated[Robots, subcommand("robots")]
 )
 
 COMMANDS = tuple(command.__metadata__[0].name for command in get_args(Command))

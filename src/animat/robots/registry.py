@@ -99,13 +99,18 @@ def robot_named(name: str, /, **parameters: float) -> Robot[Any]:
         raise InvalidArgument(f"{name}: expected it to be made of {parameters}, got {_said(error)}") from error
 
 
+def robot_names() -> tuple[str, ...]:
+    """The names that are known here: of robots that are registered, then of those that packages announce."""
+    return tuple(dict.fromkeys([*_registered, *(point.name for point in entry_points(group=ENTRY_POINTS))]))
+
+
 def robot_class(name: str) -> type[Robot[Any]]:
     """The class of the robot of this name; arguments and errors as those of `robot_named`."""
     kind = _kind_named(name)
     if kind is None:
-        known = ", ".join(dict.fromkeys([*_registered, *(point.name for point in entry_points(group=ENTRY_POINTS))]))
         raise InvalidArgument(
-            f"robot: expected one of {known}, got {shown(name)}; one of your own is named by its module:Class"
+            f"robot: expected one of {', '.join(robot_names())}, got {shown(name)}; "
+            "one of your own is named by its module:Class"
         )
     return kind
 

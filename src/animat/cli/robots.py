@@ -1,0 +1,58 @@
+"""The command that lists the robots: what each observes, and what it can do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Robots:
+    """List the robots that can be trained: what each observes, its parameters, and what it can do."""
+
+    names: Positional[tuple[str, ...]] = ()
+    """Which of them, such as cartpole or my_package.robots:Rover; default: all that are known here"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """List them."""
+        from animat.errors import InvalidArgument
+        from animat.robots import robot_named
+        from animat.robots.registry import robot_names
+
+        listed, unusable = {}, {}
+        for name in self.names or robot_names():
+            try:
+                listed[name] = _told(robot_named(name))
+            except InvalidArgument as error:
+                # One that was asked for is an error; of all that packages announce, the others are listed.
+                if self.names:
+                    raise
+                unusable[name] = str(error)
+        for name, robot in listed.items():
+            observed = ", ".join(f"{each['name']} ({each['unit']})" for each in robot["observes"])
+            parameters = " ".join(f"{key}={value:g}" for key, value in robot["parameters"].items())
+            print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
+            for sentence in (*robot["lacks"].values(), *robot["caveats"]):
+                print(f"  {sentence}")
+        for name, why in unusable.items():
+            print(f"{name} cannot be used: {why}")
+        return {"robots": listed, "unusable": unusable}
+
+
+def _told(robot: Any) -> dict[str, Any]:
+    from animat.robots import robot_to_dict
+    from animat.robots.capabilities import WITHOUT, lacking
+
+    lacks = lacking(robot)
+    return {
+        "is": (type(robot).__doc__ or "").strip().partition("\n")[0],
+        "observes": [{"name": each.name, "unit": each.unit} for each in robot.quantities],
+        "parameters": robot_to_dict(robot)["parameters"],
+        "can": [name for name in WITHOUT if name not in lacks],
+        "lacks": lacks,
+        "caveats": list(robot.caveats()),
+    }
