@@ -125,9 +125,7 @@ def _run(given: list[str]) -> int:
     return 1 if results.get("unreadable") or results.get("unusable") else 0
 
 
-def _parse(
-    arguments: list[str],
-) -> Record | Inspect | Convert | Train | Evaluate | Reproduce | StudyFile | Run | Live | Recover:
+def _parse(arguments: list[str]) -> Command:
     """Read the command line; usage errors come in one line, not in a box."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {arguments[0]!r}")
