@@ -201,7 +201,7 @@ from animat.closed_loop.contenders import controls
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.mapping import mapping_named
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.robots.registry import robot_named
 use_simulated_culture(seed=1, neurons=300)
 pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))

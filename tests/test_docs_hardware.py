@@ -18,7 +18,7 @@ from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.mapping import Thresholds
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns

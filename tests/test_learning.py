@@ -22,7 +22,7 @@ from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.reading import read_recordings
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Presentation

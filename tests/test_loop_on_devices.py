@@ -21,7 +21,7 @@ from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MaxOneCulture
 from animat.errors import DeviceFailed
 from animat.mapping import Thresholds
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns

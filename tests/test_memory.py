@@ -32,7 +32,8 @@ from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.responses.conditions import Condition, conditions_named
+from animat.responses.condition import Condition
+from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.quality.memory import memory_findings
 from animat.responses.responses import Presented, Responses

@@ -25,7 +25,8 @@ from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import NO_CONDITION, Condition
+from animat.responses.condition import Condition
+from animat.responses.conditions import NO_CONDITION
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole

@@ -41,7 +41,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot

@@ -22,7 +22,8 @@ from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import Condition, conditions_named
+from animat.responses.condition import Condition
+from animat.responses.conditions import conditions_named
 from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.stimulation.protocol import Presentation, Protocol

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from animat.recordings.reading import read_recordings as read_recordings
     from animat.recordings.recording import Channels as Channels
     from animat.recordings.recording import Recording as Recording
-    from animat.responses.conditions import Condition as Condition
+    from animat.responses.condition import Condition as Condition
     from animat.responses.conditions import conditions_named as conditions_named
     from animat.responses.extraction import extract_responses as extract_responses
     from animat.responses.inspection import Inspection as Inspection
@@ -92,7 +92,8 @@ _WHERE = {
     "cultures.safety": ("Limits",),
     "cultures.virtual": ("VirtualCulture",),
     "cultures.replay": ("ReplayCulture",),
-    "responses.conditions": ("Condition", "conditions_named"),
+    "responses.condition": ("Condition",),
+    "responses.conditions": ("conditions_named",),
     "responses.responses": ("Responses",),
     "responses.extraction": ("extract_responses",),
     "responses.series": ("extract_series",),

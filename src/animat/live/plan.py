@@ -18,7 +18,7 @@ from animat.closed_loop.running import check_episodes
 from animat.closed_loop.session import expect_no_file
 from animat.errors import InvalidArgument, Mismatch
 from animat.mapping import N_PERCENTILES
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
 from animat.training.specification import Training
