@@ -195,7 +195,7 @@ class Run(Stimulating):
 
         presentation = first.presentation or CLOSED_LOOP.presentation
         encoder = Encoder(first.conditions, presentation.pulses)
-        protocol = protocol_of(encoder, presentation.order, culture.patterns, pulse_for(self.culture))
+        protocol = protocol_of(encoder, presentation.order, len(culture.patterns), pulse_for(self.culture))
         print("no recordings were given: the culture is recorded first", file=sys.stderr)
         recording = record_within(account, culture, protocol, self.seed, progress)
         write_nwb(recording, self.out / CALIBRATION_FILE)
