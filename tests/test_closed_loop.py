@@ -29,11 +29,11 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.closed_loop.tick import Tick
+from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
-from animat.mapping import Linear, Thresholds
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByFrequency

@@ -14,9 +14,9 @@ from animat.closed_loop.contenders import AnyCondition, Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.encoder import Dealer, Encoder
+from animat.coding.mapping import Thresholds
 from animat.coding.recording import protocol_of
 from animat.errors import InvalidArgument, Mismatch, UnusableData
-from animat.mapping import Thresholds
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition, other_stimulus
 from animat.responses.conditions import All, ByBoth, ByElectrode, ByFrequency, ByInterval, ByPattern, conditions_named

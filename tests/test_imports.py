@@ -20,7 +20,6 @@ STORY = (
     "recordings",
     "responses",
     "neurons",
-    "mapping",
     "coding",
     "robots",
     "animat",

@@ -16,11 +16,11 @@ from animat.closed_loop.contenders import Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
+from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MaxOneCulture
 from animat.errors import DeviceFailed
-from animat.mapping import Thresholds
 from animat.responses.condition import Condition
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
 from animat.cli.train import _memories
+from animat.coding.mapping import Linear, Thresholds
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
-from animat.mapping import Linear, Thresholds
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory

@@ -25,8 +25,8 @@ from scipy import stats
 from animat.animat import Delivery
 from animat.cli.responses import fit_as
 from animat.closed_loop.loop import Loop
+from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.mapping import mapping_named
 from animat.neurons.kinds import Kind
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named

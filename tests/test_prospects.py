@@ -15,12 +15,12 @@ from scipy.stats import binom
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.coding.mapping import Thresholds
 from animat.errors import UnusableData
 from animat.evaluation.optimum import Optimum, best_return, rough_values
 from animat.evaluation.prospects import prospects
 from animat.evaluation.resampling import _rough, with_intervals
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
-from animat.mapping import Thresholds
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording

@@ -13,9 +13,9 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import read_session
+from animat.coding.mapping import Thresholds
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
-from animat.mapping import Thresholds
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration

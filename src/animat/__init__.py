@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from animat.animat import Animat as Animat
     from animat.animat import WithoutNeurons as WithoutNeurons
     from animat.closed_loop.loop import Loop as Loop
+    from animat.coding.mapping import Linear as Linear
+    from animat.coding.mapping import Mapping as Mapping
+    from animat.coding.mapping import Thresholds as Thresholds
+    from animat.coding.mapping import mapping_named as mapping_named
     from animat.cultures.base import Culture as Culture
     from animat.cultures.replay import ReplayCulture as ReplayCulture
     from animat.cultures.safety import Limits as Limits
@@ -34,10 +38,6 @@ if TYPE_CHECKING:
     from animat.evaluation.statistics import compare as compare
     from animat.evaluation.table import Evaluation as Evaluation
     from animat.evaluation.table import evaluate as evaluate
-    from animat.mapping import Linear as Linear
-    from animat.mapping import Mapping as Mapping
-    from animat.mapping import Thresholds as Thresholds
-    from animat.mapping import mapping_named as mapping_named
     from animat.neurons.memory import fit_memory as fit_memory
     from animat.neurons.simulator import NeuronSimulator as NeuronSimulator
     from animat.neurons.simulator import fit_empirical as fit_empirical
@@ -101,7 +101,7 @@ _WHERE = {
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
-    "mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
+    "coding.mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
     "training.sac": ("SAC",),

@@ -81,9 +81,9 @@ class Run(Stimulating):
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.running import check_episodes
+        from animat.coding.mapping import N_PERCENTILES
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
-        from animat.mapping import N_PERCENTILES
         from animat.neurons.simulator import check_binning
         from animat.progress import Bar
         from animat.reality_gap import check_conditions, check_policies, run_policies

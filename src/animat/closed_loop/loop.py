@@ -11,9 +11,9 @@ from jaxtyping import Float32, Float64
 from numpy.typing import ArrayLike
 
 from animat.coding.encoder import Encoder
+from animat.coding.mapping import N_PERCENTILES, Mapping
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
-from animat.mapping import N_PERCENTILES, Mapping
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window

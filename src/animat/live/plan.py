@@ -16,8 +16,8 @@ from animat.closed_loop.gathering import RECORDING_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_episodes
 from animat.closed_loop.session import expect_no_file
+from animat.coding.mapping import N_PERCENTILES
 from animat.errors import InvalidArgument, Mismatch
-from animat.mapping import N_PERCENTILES
 from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule

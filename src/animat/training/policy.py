@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from animat.brief import briefly
+from animat.coding.mapping import Mapping, expect_loadable_mapping, mapping_named
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, shown
-from animat.mapping import Mapping, expect_loadable_mapping, mapping_named
 from animat.plain_file import expect_plain_file, is_folder
 from animat.responses.condition import Condition
 from animat.responses.windows import check_window
