@@ -211,8 +211,21 @@ def over(recordings: Path, by: str) -> Policy:
     )
 
 
-@pytest.mark.parametrize("by", ["pattern:1,6,4", "electrode", "frequency:20,80 x pattern:0,5", "interval:10,40", "all"])
-def test_whatever_was_recorded_is_run(by: str, series: Path, tmp_path: Path, small_ones: None) -> None:
+@pytest.mark.parametrize(
+    "by",
+    [
+        "pattern:1,6,4",
+        *(
+            pytest.param(by, marks=pytest.mark.oracle)
+            for by in ("frequency:20,80 x pattern:0,5", "interval:10,40", "all")
+        ),
+        pytest.param("electrode", marks=pytest.mark.oracle),
+    ],
+)
+def test_whatever_was_recorded_is_run(
+    by: str, series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
     policy = over(series, by)
     policy.save(tmp_path / "p0.safetensors")
     assert Policy.load(tmp_path / "p0.safetensors").conditions == policy.conditions
@@ -230,8 +243,11 @@ def test_whatever_was_recorded_is_run(by: str, series: Path, tmp_path: Path, sma
     assert set(stimuli.pattern.tolist()) <= set(recorded.pattern.tolist())
 
 
-def test_policies_of_before_are_run_as_their_recordings_tell(series: Path, tmp_path: Path, small_ones: None) -> None:
+def test_policies_of_before_are_run_as_their_recordings_tell(
+    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Files of 0.1.0 have the name of a pattern, and not its electrodes."""
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
     policy = over(series, "pattern:1,6,4")
     before = tuple(Condition(each.label, each.value, each.unit) for each in policy.conditions)
     assert run(tmp_path / "session", replace(policy, conditions=before), series, "--at-min", "2") == 0
@@ -240,8 +256,9 @@ def test_policies_of_before_are_run_as_their_recordings_tell(series: Path, tmp_p
 
 
 def test_a_culture_is_recorded_first_on_the_electrodes_of_the_policies(
-    series: Path, tmp_path: Path, small_ones: None
+    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
     sets = {c.label: c.electrodes for c in over(series, "pattern:1,6,4").conditions}
     alone = tuple(replace(c, only_last=False, frequencies_hz=(80.0,)) for c in over(series, "pattern:1,6,4").conditions)
     policy = replace(over(series, "pattern:1,6,4"), conditions=alone, presentation=Presentation("blocked", 1))

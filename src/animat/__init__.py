@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from animat.animat import Animat as Animat
     from animat.animat import WithoutNeurons as WithoutNeurons
     from animat.closed_loop.loop import Loop as Loop
+    from animat.coding.encoder import Encoder as Encoder
     from animat.coding.mapping import Linear as Linear
     from animat.coding.mapping import Mapping as Mapping
     from animat.coding.mapping import Thresholds as Thresholds
@@ -101,6 +102,7 @@ _WHERE = {
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
+    "coding.encoder": ("Encoder",),
     "coding.mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
