@@ -37,10 +37,10 @@ import numpy as np
 from animat.closed_loop.contenders import Contender, Greedy
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
+from animat.coding.mapping import mapping_named
 from animat.cultures.base import Culture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
-from animat.mapping import mapping_named
 from animat.recordings.recording import Channels
 from animat.responses.conditions import Condition
 from animat.robots import Cartpole

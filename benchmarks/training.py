@@ -154,8 +154,8 @@ def algorithm() -> Any:
 def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
     """(environment, settings, simulator, compiled-to-be chunk, learners-to-be), as a worker makes them."""
     from animat.animat import Animat
+    from animat.coding.mapping import mapping_named
     from animat.compilation import keep_compilations
-    from animat.mapping import mapping_named
     from animat.neurons.made_up import made_up_simulator
     from animat.robots.cartpole import Cartpole
     from animat.training.group import programs
@@ -235,7 +235,7 @@ def timeline() -> Any:
 
 def training(policies: int, iterations: int, seed: int = 1) -> Any:
     """What `animat train cartpole --mapping 9-thresholds` trains, at eight iterations an update."""
-    from animat.mapping import mapping_named
+    from animat.coding.mapping import mapping_named
     from animat.robots.cartpole import Cartpole
     from animat.training.specification import Training
 
@@ -268,7 +268,7 @@ def forward(calls: int) -> dict[str, Any]:
     import jax
     import numpy as np
 
-    from animat.mapping import mapping_named
+    from animat.coding.mapping import mapping_named
     from animat.responses.conditions import Condition
     from animat.robots.cartpole import Cartpole
     from animat.training.policy import Policy
@@ -315,8 +315,8 @@ def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
     next length must reach the return too.
     """
     from animat.animat import Animat
+    from animat.coding.mapping import mapping_named
     from animat.evaluation.rollouts import networks_of, roll_out
-    from animat.mapping import mapping_named
     from animat.robots.cartpole import Cartpole
     from animat.training.trainer import train
 

@@ -200,8 +200,8 @@ def test_a_closed_loop_runs_on_it_and_the_sdks_own_file_has_the_same_pulses(tmp_
 from animat.closed_loop.contenders import controls
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
-from animat.mapping import mapping_named
-from animat.responses.conditions import Condition
+from animat.coding.mapping import mapping_named
+from animat.responses.condition import Condition
 from animat.robots.registry import robot_named
 use_simulated_culture(seed=1, neurons=300)
 pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))

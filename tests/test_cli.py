@@ -21,10 +21,10 @@ from animat.animat import Animat
 from animat.cli import COMMANDS, main
 from animat.cli.responses import say_findings
 from animat.cli.train import Train
+from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import with_intervals
-from animat.mapping import Thresholds
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.made_up import write_made_up_series

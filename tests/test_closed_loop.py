@@ -29,13 +29,14 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.closed_loop.tick import Tick
+from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
-from animat.mapping import Linear, Thresholds
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import ByFrequency, Condition
+from animat.responses.condition import Condition
+from animat.responses.conditions import ByFrequency
 from animat.responses.extraction import extract_responses
 from animat.robots import Cartpole, Navigation, Robot
 from animat.stimulation.protocol import Presentation, Protocol
@@ -427,7 +428,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"pulses": 0}, "at least 1 pulse"),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),
-        ({"conditions": (Condition("electrode 5", 0.0),)}, "expected a frequency"),
+        ({"conditions": (Condition("electrode 5", 0.0),)}, "tell the frequency of its pulses"),
         ({"on_burst": "panic"}, "use, repeat, skip"),
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),

@@ -13,12 +13,12 @@ import stand_in_maxlab
 from animat.closed_loop.contenders import Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
+from animat.coding.mapping import Thresholds
 from animat.cultures.devices.cl1 import CL1_LIMITS, LEAD_US
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
-from animat.mapping import Thresholds
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from animat.animat import Animat, WithoutNeurons
+from animat.coding.mapping import Linear, Thresholds
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.mapping import Linear, Thresholds
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import fit_histogram, silenced
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline

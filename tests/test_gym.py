@@ -18,9 +18,9 @@ from gymnasium.vector import AutoresetMode
 
 import animat
 from animat.animat import Animat
+from animat.coding.mapping import Linear, mapping_named
 from animat.errors import InvalidArgument
 from animat.gym import IDS, register_environments
-from animat.mapping import Linear, mapping_named
 from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.simulator import silenced
 from animat.recordings.formats.nwb import write_nwb

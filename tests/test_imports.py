@@ -20,7 +20,7 @@ STORY = (
     "recordings",
     "responses",
     "neurons",
-    "mapping",
+    "coding",
     "robots",
     "animat",
     "training",
@@ -112,7 +112,7 @@ def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
     # What is in the package under the same name would be there or not, by what was imported before.
     assert not set(animat.__all__) & {path.stem for path in PACKAGE.iterdir()}
     # The nouns of the story that a study is made of are not those of its specification.
-    assert animat.Condition.__module__ == "animat.responses.conditions"
+    assert animat.Condition.__module__ == "animat.responses.condition"
     assert {"Study", "run_study", "read_study", "paper_study", "best_return"} <= set(animat.__all__)
 
 

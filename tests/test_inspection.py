@@ -18,7 +18,8 @@ from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms, rate_edges
 from animat.report.style import condition_colours, save_figure
-from animat.responses.conditions import All, ByFrequency, ByInterval, ByPattern, Condition
+from animat.responses.condition import Condition
+from animat.responses.conditions import All, ByFrequency, ByInterval, ByPattern
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.responses.psth import post_stimulus_histogram

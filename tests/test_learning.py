@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from animat.cli import main as animat
+from animat.coding.mapping import mapping_named
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.reading import read_recordings
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Presentation

@@ -12,6 +12,7 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import recover_session
+from animat.coding.mapping import Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
@@ -29,7 +30,6 @@ from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
 from animat.live.shadowing import Lived, live
-from animat.mapping import Thresholds
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration

@@ -16,12 +16,12 @@ from animat.closed_loop.contenders import Contender, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
+from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MaxOneCulture
 from animat.errors import DeviceFailed
-from animat.mapping import Thresholds
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.robots import Navigation
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
@@ -29,6 +29,7 @@ from animat.stimulation.pulse import BALANCED_PULSE, Pulse
 from animat.stimulation.selection import Selection
 
 HZ = (5.0, 20.0)
+BY_FREQUENCY = tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ)
 
 
 def selection() -> Selection:
@@ -36,11 +37,17 @@ def selection() -> Selection:
     return Selection(MAXONE, np.arange(13_000, 13_050), sites, draw_patterns(MAXONE, sites, seed=1))
 
 
-def loop_at(tmp_path: Path, culture: Culture, pulse: Pulse, chosen: int) -> Session:
+def loop_at(
+    tmp_path: Path,
+    culture: Culture,
+    pulse: Pulse,
+    chosen: int,
+    conditions: tuple[Condition, ...] = BY_FREQUENCY,
+) -> Session:
     loop = Loop(
         robot=Navigation(episode_limit=10),
         mapping=Thresholds(9),
-        conditions=tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ),
+        conditions=conditions,
         percentiles=np.linspace(0.0, 125.0, 11),
         pulses=5,
         pulse=pulse,
@@ -99,6 +106,42 @@ def test_a_maxone_is_in_time_however_long_its_sequences_take_to_make(
     monkeypatch.setattr(vendor, "append", slowly)
     culture = MaxOneCulture(selection(), stream=Running(rig), settle=False)
     assert_in_time(loop_at(tmp_path, culture, BALANCED_PULSE, chosen), chosen, 1 / 20_000)
+
+
+def assert_on(session: Session, chosen: tuple[int, ...]) -> None:
+    """All pulses were in time and on the chosen electrodes, as the session's recording tells."""
+    assert session.ending.by == "plan", session.ending.sentence
+    assert [tick.late_s for tick in session.ticks] == [0.0] * 20
+    stimuli = session.recording().stimuli
+    assert len(stimuli) == 100
+    assert {frozenset(row) - {-1} for row in stimuli.electrodes.tolist()} == {frozenset(chosen)}
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_a_cl1_is_stimulated_on_the_chosen_electrodes(
+    tmp_path: Path, chosen: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    neurons = stand_in_cl.install(monkeypatch)
+    sets = ((1, 20, 40), (2, 30))
+    on = tuple(Condition(f"electrodes {one}", i, "", (20.0,), (one,)) for i, one in enumerate(sets))
+    assert_on(loop_at(tmp_path, CL1Culture(), CL1_PULSE, chosen, on), sets[chosen])
+    # What the device delivered, and not only what it was asked for.
+    assert {channel for _, channel, _ in neurons.pulses} == set(sets[chosen])
+    assert len(neurons.pulses) == 100 * len(sets[chosen])
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_a_maxone_is_stimulated_on_the_chosen_electrodes(
+    tmp_path: Path, chosen: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = stand_in_maxlab.install(monkeypatch)
+    picked = selection()
+    sets = tuple(tuple(picked.stimulation[places].tolist()) for places in ([0, 9, 31], [4, 20]))
+    on = tuple(Condition(f"electrodes {one}", i, "", (20.0,), (one,)) for i, one in enumerate(sets))
+    culture = MaxOneCulture(picked, stream=stand_in_maxlab.Stream(rig), settle=False)
+    assert_on(loop_at(tmp_path, culture, BALANCED_PULSE, chosen, on), sets[chosen])
+    assert {pulse.electrode for pulse in rig.delivered} == set(sets[chosen])
+    assert len(rig.delivered) == 100 * len(sets[chosen])
 
 
 def test_a_cl1_that_is_gone_is_a_lost_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from animat.coding.mapping import MAPPING_NAMES, Linear, Thresholds, mapping_named
 from animat.errors import InvalidArgument
-from animat.mapping import MAPPING_NAMES, Linear, Thresholds, mapping_named
 
 PERCENTILES_HZ = np.array([2.0, 10, 14, 20, 27, 33, 38, 44, 51, 60, 95])
 
@@ -155,7 +155,7 @@ def test_robots_and_mappings_are_named_and_stored_without_jax() -> None:
     code = """
 import sys
 sys.modules["jax"] = None  # any import of it now fails
-from animat.mapping import mapping_named
+from animat.coding.mapping import mapping_named
 from animat.robots import ROBOTS, robot_from_dict, robot_named, robot_to_dict
 import numpy as np
 for name in ROBOTS:

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 import animat.gym  # noqa: F401
 from animat.animat import Animat, WithoutNeurons
 from animat.cli.train import _memories
+from animat.coding.mapping import Linear, Thresholds
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
-from animat.mapping import Linear, Thresholds
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
@@ -32,7 +32,8 @@ from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
-from animat.responses.conditions import Condition, conditions_named
+from animat.responses.condition import Condition
+from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.quality.memory import memory_findings
 from animat.responses.responses import Presented, Responses

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from animat.animat import Animat, WithoutNeurons
+from animat.coding.mapping import Linear, Thresholds
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import commands_of
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import cubic
-from animat.mapping import Linear, Thresholds
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import EmpiricalSimulator
 from animat.robots.base import Quantity, Robot

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from animat.closed_loop.loop import Loop
+from animat.coding.mapping import Thresholds
 from animat.cultures.budget import Account, Budget
-from animat.mapping import Thresholds
 from animat.reality_gap.outlook import Outlook, outlook
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
 from animat.responses.responses import Responses
 from animat.robots import Navigation

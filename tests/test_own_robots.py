@@ -18,9 +18,9 @@ import pytest
 
 from animat.animat import Animat
 from animat.closed_loop.contenders import HandMadeRule
+from animat.coding.mapping import Linear, Mapping, Thresholds, check_mapping
 from animat.errors import InvalidArgument
 from animat.evaluation.hand_made import HandMade
-from animat.mapping import Linear, Mapping, Thresholds, check_mapping
 from animat.robots import Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
 from animat.robots.grid import no_grid

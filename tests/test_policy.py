@@ -25,10 +25,11 @@ from scipy import stats
 from animat.animat import Delivery
 from animat.cli.responses import fit_as
 from animat.closed_loop.loop import Loop
+from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.mapping import mapping_named
 from animat.neurons.kinds import Kind
-from animat.responses.conditions import Condition, conditions_named
+from animat.responses.condition import Condition
+from animat.responses.conditions import conditions_named
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation

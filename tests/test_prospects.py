@@ -15,17 +15,18 @@ from scipy.stats import binom
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.coding.mapping import Thresholds
 from animat.errors import UnusableData
 from animat.evaluation.optimum import Optimum, best_return, rough_values
 from animat.evaluation.prospects import prospects
 from animat.evaluation.resampling import _rough, with_intervals
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
-from animat.mapping import Thresholds
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import NO_CONDITION, Condition
+from animat.responses.condition import Condition
+from animat.responses.conditions import NO_CONDITION
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole

@@ -21,6 +21,7 @@ from animat.cli import main
 from animat.closed_loop.contenders import HandMadeRule
 from animat.closed_loop.following import Following
 from animat.closed_loop.session import read_session
+from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
@@ -30,7 +31,6 @@ from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
-from animat.mapping import Linear, Mapping, Thresholds
 from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, check_policies, run_policies
@@ -41,7 +41,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole, Navigation, Robot

@@ -14,7 +14,7 @@ from animat.reality_gap.answered import Answered
 from animat.reality_gap.passes import Passes
 from animat.reality_gap.predicting import Predicted
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.responses import Presented, Responses
 from animat.stimulation.protocol import Presentation
 

@@ -13,16 +13,17 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import read_session
+from animat.coding.mapping import Thresholds
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
-from animat.mapping import Thresholds
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
-from animat.responses.conditions import Condition, conditions_named
+from animat.responses.condition import Condition
+from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.stimulation.protocol import Presentation, Protocol
@@ -195,6 +196,107 @@ def test_the_simulator_that_predicts_is_made_as_the_policies_unless_asked_otherw
     policy = replace(policy_of(0), provenance={"simulators": trained})
     with pytest.raises(Taken):
         run(tmp_path / "session", policy, series, *asked)
+
+
+def over(recordings: Path, by: str) -> Policy:
+    """A policy over what recordings have, as training leaves it."""
+    conditions = conditions_named(by).assign(read_recording(recordings / "recording_0000_min.nwb").stimuli).conditions
+    rng, policy = np.random.default_rng(1), policy_of(0)
+    return replace(
+        policy,
+        weights=(*policy.weights[:-1], rng.standard_normal((16, len(conditions))).astype(np.float32)),
+        biases=(*policy.biases[:-1], np.zeros(len(conditions), np.float32)),
+        conditions=conditions,
+        provenance={"simulators": {"kind": "memory", "by": by}},
+    )
+
+
+@pytest.mark.parametrize(
+    "by",
+    [
+        "pattern:1,6,4",
+        *(
+            pytest.param(by, marks=pytest.mark.oracle)
+            for by in ("frequency:20,80 x pattern:0,5", "interval:10,40", "all")
+        ),
+        pytest.param("electrode", marks=pytest.mark.oracle),
+    ],
+)
+def test_whatever_was_recorded_is_run(
+    by: str, series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
+    policy = over(series, by)
+    policy.save(tmp_path / "p0.safetensors")
+    assert Policy.load(tmp_path / "p0.safetensors").conditions == policy.conditions
+    assert run(tmp_path / "session", policy, series, "--at-min", "2") == 0
+    session = read_session(tmp_path / "session")
+    stimuli = session.recording().stimuli
+    # What was delivered is sorted, by the rule that the policy was trained by, into what was chosen to be delivered.
+    condition = conditions_named(by).assign(stimuli).condition[stimuli.is_last_of_presentation]
+    if by == "electrode":
+        sets = [c.electrodes[0] for c in policy.conditions if c.electrodes]
+        condition = ByElectrode(tuple(sets)).assign(stimuli).condition[stimuli.is_last_of_presentation]
+    assert condition.tolist() == [tick.delivered for tick in session.ticks if tick.patterns]
+    recorded = read_recording(series / "recording_0002_min.nwb").stimuli
+    assert set(stimuli.frequency_hz.tolist()) <= set(recorded.frequency_hz.tolist())
+    assert set(stimuli.pattern.tolist()) <= set(recorded.pattern.tolist())
+
+
+def test_policies_of_before_are_run_as_their_recordings_tell(
+    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files of 0.1.0 have the name of a pattern, and not its electrodes."""
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
+    policy = over(series, "pattern:1,6,4")
+    before = tuple(Condition(each.label, each.value, each.unit) for each in policy.conditions)
+    assert run(tmp_path / "session", replace(policy, conditions=before), series, "--at-min", "2") == 0
+    patterns = [tick.patterns[-1] for tick in read_session(tmp_path / "session").ticks if tick.patterns]
+    assert set(patterns) == {1, 6, 4}
+
+
+def test_a_culture_is_recorded_first_on_the_electrodes_of_the_policies(
+    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
+    sets = {c.label: c.electrodes for c in over(series, "pattern:1,6,4").conditions}
+    alone = tuple(replace(c, only_last=False, frequencies_hz=(80.0,)) for c in over(series, "pattern:1,6,4").conditions)
+    policy = replace(over(series, "pattern:1,6,4"), conditions=alone, presentation=Presentation("blocked", 1))
+    policy.save(tmp_path / "p0.safetensors")
+    given = ["--out", str(tmp_path / "session"), "--controls", "random", "--episodes", "1"]
+    assert main(["run", str(tmp_path / "p0.safetensors"), *given]) == 0
+    recording = read_recording(tmp_path / "session" / "calibration.nwb")
+    found = conditions_named("pattern").assign(recording.stimuli)
+    assert {c.label: c.electrodes for c in found.conditions} == sets
+    assert np.bincount(found.condition).tolist() == [100] * 3
+
+
+@pytest.mark.parametrize("lacks", ["electrodes", "frequency_hz"])
+def test_what_recordings_do_not_tell_is_refused_before_a_culture_is_opened(
+    lacks: str, series: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read_recording(series / "recording_0002_min.nwb")
+    column = getattr(recording.stimuli, lacks)
+    unknown = np.full_like(column, -1) if lacks == "electrodes" else np.full_like(column, np.nan)
+    (tmp_path / "from elsewhere").mkdir()
+    there = replace(recording, stimuli=replace(recording.stimuli, **{lacks: unknown}))
+    write_nwb(there, tmp_path / "from elsewhere" / "recording_0000_min.nwb")
+    monkeypatch.delattr("animat.cultures.kinds.culture_of")
+    policy = over(tmp_path / "from elsewhere", "pattern")
+    assert run(tmp_path / "session", policy, tmp_path / "from elsewhere") == 1
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "condition pattern 0" in line]
+    assert f"expected recordings that tell the {lacks.removesuffix('_hz')} of its pulses" in said
+    assert not (tmp_path / "session").exists()
+
+
+def test_patterns_on_other_electrodes_are_refused(
+    series: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = over(series, "pattern:1,6")
+    one, other = policy.conditions
+    swapped = (replace(one, electrodes=other.electrodes), replace(other, electrodes=one.electrodes))
+    assert run(tmp_path / "session", replace(policy, conditions=swapped), series) == 1
+    assert "conditions: expected pattern 1, its last pulse alone, at 5, 10, 20, 40, 80 Hz on" in capsys.readouterr().err
 
 
 def test_recordings_that_lack_a_frequency_are_refused_with_what_they_have(

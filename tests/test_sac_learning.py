@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import brentq
 
 from animat.animat import Animat, Environment, WithoutNeurons
-from animat.mapping import mapping_named
+from animat.coding.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.cartpole import Cartpole

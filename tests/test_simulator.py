@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.neurons.fidelity import fidelity
 from animat.neurons.simulator import fit_empirical, fit_histogram, silenced
 from animat.neurons.timeline import fit_timeline
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 

@@ -26,11 +26,11 @@ from scipy.stats import mannwhitneyu
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.coding.mapping import mapping_named
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
-from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.formats.nwb import recording_name, write_nwb

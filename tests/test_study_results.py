@@ -12,10 +12,10 @@ import pytest
 
 from animat.animat import Animat
 from animat.cli import main
+from animat.coding.mapping import Thresholds
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.statistics import holm
-from animat.mapping import Thresholds
 from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.reading import read_recordings

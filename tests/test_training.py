@@ -15,8 +15,8 @@ import jax
 import numpy as np
 import pytest
 
+from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.mapping import Thresholds
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.training.group import Group, split_groups, train_group

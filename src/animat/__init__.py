@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from animat.animat import Animat as Animat
     from animat.animat import WithoutNeurons as WithoutNeurons
     from animat.closed_loop.loop import Loop as Loop
+    from animat.coding.encoder import Encoder as Encoder
+    from animat.coding.mapping import Linear as Linear
+    from animat.coding.mapping import Mapping as Mapping
+    from animat.coding.mapping import Thresholds as Thresholds
+    from animat.coding.mapping import mapping_named as mapping_named
     from animat.cultures.base import Culture as Culture
     from animat.cultures.replay import ReplayCulture as ReplayCulture
     from animat.cultures.safety import Limits as Limits
@@ -34,10 +39,6 @@ if TYPE_CHECKING:
     from animat.evaluation.statistics import compare as compare
     from animat.evaluation.table import Evaluation as Evaluation
     from animat.evaluation.table import evaluate as evaluate
-    from animat.mapping import Linear as Linear
-    from animat.mapping import Mapping as Mapping
-    from animat.mapping import Thresholds as Thresholds
-    from animat.mapping import mapping_named as mapping_named
     from animat.neurons.memory import fit_memory as fit_memory
     from animat.neurons.simulator import NeuronSimulator as NeuronSimulator
     from animat.neurons.simulator import fit_empirical as fit_empirical
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from animat.recordings.reading import read_recordings as read_recordings
     from animat.recordings.recording import Channels as Channels
     from animat.recordings.recording import Recording as Recording
-    from animat.responses.conditions import Condition as Condition
+    from animat.responses.condition import Condition as Condition
     from animat.responses.conditions import conditions_named as conditions_named
     from animat.responses.extraction import extract_responses as extract_responses
     from animat.responses.inspection import Inspection as Inspection
@@ -92,7 +93,8 @@ _WHERE = {
     "cultures.safety": ("Limits",),
     "cultures.virtual": ("VirtualCulture",),
     "cultures.replay": ("ReplayCulture",),
-    "responses.conditions": ("Condition", "conditions_named"),
+    "responses.condition": ("Condition",),
+    "responses.conditions": ("conditions_named",),
     "responses.responses": ("Responses",),
     "responses.extraction": ("extract_responses",),
     "responses.series": ("extract_series",),
@@ -100,7 +102,8 @@ _WHERE = {
     "neurons.simulator": ("NeuronSimulator", "fit_histogram", "fit_empirical"),
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
-    "mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
+    "coding.encoder": ("Encoder",),
+    "coding.mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
     "training.sac": ("SAC",),

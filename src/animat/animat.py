@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
-from animat.mapping import Mapping
 from animat.neurons.simulator import AT_FIRST, Answer, NeuronSimulator
 from animat.robots.base import Robot
 

@@ -64,12 +64,12 @@ class Live(Stimulating):
     def run(self) -> dict[str, Any]:
         """Live."""
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
+        from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.cultures.kinds import culture_of, pulse_for
         from animat.live.plan import Timetable, check_plan
         from animat.live.shadowing import live
-        from animat.mapping import mapping_named
         from animat.progress import Bar
         from animat.recordings.reading import read_recordings
         from animat.robots.registry import robot_named

@@ -41,6 +41,9 @@ class Record:
     """Pulses a presentation, the last one read; default: 1"""
     presentations: int | None = None
     """Presentations at each frequency; default: 500, with --paper 100"""
+    places: str | None = None
+    """halves, quadrants, or a file of JSON with groups of electrodes, [[1, 2], [3, 4]]: each at each frequency is a
+    condition then, presented so often; default: at each frequency all of the culture's patterns"""
     protocol: Path | None = None
     """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too"""
     out: Path = Path("recordings")
@@ -65,7 +68,8 @@ class Record:
         # Before any device is powered.
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        asked = [f"--{name}" for name in ("order", "pulses", "presentations") if getattr(self, name) is not None]
+        given = ("order", "pulses", "presentations", "places")
+        asked = [f"--{name}" for name in given if getattr(self, name) is not None]
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
@@ -83,10 +87,10 @@ class Record:
         from animat.recordings.made_up import write_made_up_series
 
         usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.presentations in (None, 100)
-        if not usual or self.protocol is not None:
+        if not usual or self.places is not None or self.protocol is not None:
             raise InvalidArgument(
-                "--order, --pulses, --presentations, --protocol: made-up recordings are blocked, with one pulse and "
-                "100 presentations; --culture virtual takes others"
+                "--order, --pulses, --presentations, --places, --protocol: made-up recordings are blocked, with one "
+                "pulse, 100 presentations and no places; --culture virtual takes others"
             )
         with alone_in(self.out):
             return write_made_up_series(
@@ -140,6 +144,7 @@ class Record:
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
         from animat.cultures.kinds import pulse_for
+        from animat.stimulation.places import read_places
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER, read_protocol
 
         assert self.culture != "made-up"
@@ -149,6 +154,7 @@ class Record:
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
         asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}
+        asked["places"] = None if self.places is None else read_places(self.places)
         return replace(usual, **{name: value for name, value in asked.items() if value is not None})
 
 

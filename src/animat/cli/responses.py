@@ -21,7 +21,8 @@ class Responding:
     """How responses are read from recordings; the same in every command that reads them."""
 
     conditions: str | None = None
-    """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, all; default: by frequency"""
+    """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, "frequency x electrode", all;
+    default: by frequency"""
     window_ms: tuple[float, float] | None = None
     """Start and end of the response window after a stimulus, in ms; default: 2 10"""
     burst_threshold: float | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +18,7 @@ from animat.errors import InvalidArgument
 from animat.writing import alone_in
 
 if TYPE_CHECKING:
+    from animat.closed_loop.loop import Loop
     from animat.cultures.base import Culture
     from animat.cultures.budget import Account
     from animat.progress import Progress
@@ -80,9 +81,9 @@ class Run(Stimulating):
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.running import check_episodes
+        from animat.coding.mapping import N_PERCENTILES
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
-        from animat.mapping import N_PERCENTILES
         from animat.neurons.simulator import check_binning
         from animat.progress import Bar
         from animat.reality_gap import check_conditions, check_policies, run_policies
@@ -98,14 +99,15 @@ class Run(Stimulating):
         if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
-        Loop.of_policy(first, np.zeros(N_PERCENTILES), **settings)
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
-        calibration = None
+        calibration, conditions = None, first.conditions
         if recordings:
             calibration = self._calibration(recordings, first, self.at_min)
             check_conditions(first, calibration)
+            conditions = calibration.conditions
+        loop, _ = Loop.of_policy(first, np.zeros(N_PERCENTILES), conditions=conditions, **settings)
         with (
             ExitStack() as told,
             # Last, as it makes the folder.
@@ -114,7 +116,7 @@ class Run(Stimulating):
             Bar("closed loop") as progress,
             self._culture(recordings, progress) as culture,
         ):
-            pulse, patterns, noticed = self._presenting(culture, recordings, calibration)
+            pulse, patterns, noticed = self._presenting(culture, recordings, calibration, loop)
             if calibration is None:
                 recording = self._record(culture, first, account, progress)
                 calibration = self._calibration([recording], first, recording.start_min)
@@ -163,7 +165,7 @@ class Run(Stimulating):
         return culture
 
     def _presenting(
-        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration | None
+        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration | None, loop: Loop
     ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
         """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
         from animat.cultures.kinds import pulse_for
@@ -172,7 +174,9 @@ class Run(Stimulating):
 
         if calibration is None:
             return pulse_for(self.culture), None, ()
-        found = other_culture(recordings[0], calibration.start_min, culture), other_patterns(recordings[0], culture)
+        found = [other_culture(recordings[0], calibration.start_min, culture)]
+        if loop.encoder.takes_patterns:
+            found.append(other_patterns(recordings[0], culture))
         noticed = tuple(finding for finding in found if finding is not None)
         told = recordings[0].provenance.get("protocol")
         if told is None:
@@ -182,19 +186,16 @@ class Run(Stimulating):
 
     def _record(self, culture: Culture, first: Policy, account: Account, progress: Progress) -> Recording:
         """The culture as it is now, presented as the policies' recordings were."""
+        from animat.coding.encoder import Encoder
+        from animat.coding.recording import protocol_of
         from animat.cultures.kinds import pulse_for
         from animat.live.recording import record_within
         from animat.recordings.formats.nwb import write_nwb
-        from animat.stimulation.protocol import CLOSED_LOOP, PAPER
+        from animat.stimulation.protocol import CLOSED_LOOP
 
         presentation = first.presentation or CLOSED_LOOP.presentation
-        protocol = replace(
-            PAPER if presentation.order == "blocked" else CLOSED_LOOP,
-            frequencies_hz=tuple(condition.value for condition in first.conditions),
-            pulses=presentation.pulses,
-            patterns=min(100, len(culture.patterns)),
-            pulse=pulse_for(self.culture),
-        )
+        encoder = Encoder(first.conditions, presentation.pulses)
+        protocol = protocol_of(encoder, presentation.order, len(culture.patterns), pulse_for(self.culture))
         print("no recordings were given: the culture is recorded first", file=sys.stderr)
         recording = record_within(account, culture, protocol, self.seed, progress)
         write_nwb(recording, self.out / CALIBRATION_FILE)
@@ -208,7 +209,7 @@ class Run(Stimulating):
         trained = first.fitted.get("burst_threshold")
         series = extract_series(
             recordings,
-            _frequencies(recordings, first),
+            _conditions(recordings, first),
             window_ms=first.window_ms or DEFAULT_WINDOW_MS,
             burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
@@ -238,10 +239,13 @@ def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
         yield
 
 
-def _frequencies(recordings: Sequence[Recording], first: Policy) -> Conditions | None:
-    """The frequencies that policies pick from, which may be some of the recordings'; None where they are not."""
-    from animat.responses.conditions import ByFrequency
+def _conditions(recordings: Sequence[Recording], first: Policy) -> Conditions | None:
+    """What policies pick from: as they were trained, but some of the recordings' frequencies may be all there are."""
+    from animat.responses.conditions import ByFrequency, conditions_named
 
+    by = first.fitted.get("by") or "frequency"
+    if not by.startswith("frequency") or " x " in by:
+        return conditions_named(by)
     if not first.conditions or any(condition.unit != "Hz" for condition in first.conditions):
         return None
     picked = ByFrequency(tuple(condition.value for condition in first.conditions))

@@ -56,7 +56,7 @@ class Train(Fitting):
 
     def run(self) -> dict[str, Any]:
         """Train."""
-        from animat.mapping import mapping_named
+        from animat.coding.mapping import mapping_named
         from animat.progress import Bar
         from animat.robots.registry import robot_named
         from animat.training.specification import Training

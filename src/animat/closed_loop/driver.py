@@ -19,6 +19,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.stretch import Asked, Stretch, rows_of
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
+from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
@@ -26,7 +27,6 @@ from animat.errors import AnimatError, BudgetSpent, UnsafeStimulus
 from animat.responses.windows import read_windows
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
-from animat.tables import UNKNOWN
 
 
 class Stop(Exception):
@@ -72,11 +72,9 @@ class Driver:
         self._rng = np.random.default_rng([seed, 21])
         self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
-        usable = culture.patterns[: loop.patterns]
         self._following = None if loop.following is None else Following(loop.following)
         self._percentiles = loop.percentiles
-        self._patterns = [tuple(int(e) for e in row if e != UNKNOWN) for row in usable]
-        self._deck: list[int] = []
+        self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
         self._begun: Counter[str] = Counter()
         self._presented = self._stretches = 0
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
@@ -176,14 +174,14 @@ class Driver:
         Before iteration 0 the robot stands, whatever the answer.
         """
         loop, is_lead_in = self._loop, iteration < 0
-        frequency_hz = loop.conditions[delivered].value
+        frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
         stimuli: list[Stimulus] = []
         if contender.delivery != "silent":
             stimuli = [
-                Stimulus(float(t), self._patterns[p], loop.pulse, frequency_hz, p, self._presented)
-                for t, p in zip(times_s, self._deal(), strict=True)
+                Stimulus(float(t), on.electrodes, loop.pulse, frequency_hz, on.pattern, self._presented)
+                for t, on in zip(times_s, self._dealer.targets(delivered), strict=True)
             ]
         # Two samples more than the window: no spike at its very end can then be seen only in the next stretch.
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
@@ -276,16 +274,6 @@ class Driver:
             behind_s = self._clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
             first_s = max(first_s, behind_s)
         return now_s, on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
-
-    def _deal(self) -> list[int]:
-        """A pattern for each pulse, all different where there are enough, from a deck that is shuffled when empty."""
-        hand: list[int] = []
-        while len(hand) < self._loop.pulses:
-            if not self._deck:
-                self._deck = self._rng.permutation(len(self._patterns)).tolist()
-            place = next((i for i, pattern in enumerate(self._deck) if pattern not in hand), 0)
-            hand.append(self._deck.pop(place))
-        return hand
 
     def _see(self, stimuli: Sequence[Stimulus], duration_s: float, since_s: float, pause: bool = False) -> Stretch:
         """Deliver, watch, and check what came back; times count from `since_s`; a pause is written down here."""

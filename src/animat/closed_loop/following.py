@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from animat.mapping import N_PERCENTILES
+from animat.coding.mapping import N_PERCENTILES
 
 MOST_FOLLOWED = 100
 """Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones follow late."""

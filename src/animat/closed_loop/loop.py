@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import ArrayLike
 
+from animat.coding.encoder import Encoder
+from animat.coding.mapping import N_PERCENTILES, Mapping
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
-from animat.mapping import N_PERCENTILES, Mapping
 from animat.recordings.findings import Finding
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.robots.registry import robot_to_dict
@@ -26,8 +27,6 @@ OnLate = Literal["continue", "stop"]
 
 MOST_LEAD_IN = 100
 """Times that each condition leads in: as many as a recording holds; more wears a culture out for nothing."""
-SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
-"""Frequencies that a presentation may have: a quarter of an hour is waited for a pulse at most."""
 
 
 class Trained(Protocol):
@@ -58,13 +57,14 @@ class Trained(Protocol):
 class Loop:
     """The settings of a closed loop.
 
-    An action is a presentation: `pulses` pulses, the first one 1/f after the last pulse of the action before it and
-    the others 1/f apart, each one of the patterns in random order; the response to the last one is read.
+    An action is a presentation of a condition: `pulses` pulses, the first one 1/f after the last pulse of the action
+    before it and the others 1/f apart, on the condition's electrodes or, where it names none, each one of the patterns
+    in random order; the response to the last one is read.
 
     Attributes:
         robot: that is driven.
         mapping: from a response to a command.
-        conditions: what is chosen from: frequencies.
+        conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,).
         following: non-burst responses of each condition in that recording, Hz, in the order of time; where given, the
             percentiles follow the culture (see `animat.closed_loop.following`). None: they are held.
@@ -87,7 +87,7 @@ class Loop:
 
     Raises:
         InvalidArgument: for a setting that cannot be.
-        UnusableData: for conditions that are not frequencies.
+        UnusableData: for conditions that cannot be delivered (`animat.coding.encoder.Encoder`).
     """
 
     robot: Robot[Any]
@@ -116,14 +116,7 @@ class Loop:
         object.__setattr__(self, "percentiles", percentiles)
         check_window(self.window_ms)
         _ = self.presentation
-        if not self.conditions:
-            raise InvalidArgument("conditions: expected at least one, got none")
-        for condition in self.conditions:
-            if condition.unit != "Hz" or not SLOWEST_HZ <= condition.value <= FASTEST_HZ:
-                raise UnusableData(
-                    f"condition {condition.label}: expected a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, as a "
-                    "closed loop presents by frequency; train on recordings whose conditions are frequencies"
-                )
+        _ = self.encoder
         if self.following is not None and (
             len(self.following) != len(self.conditions) or not all(len(x) for x in self.following)
         ):
@@ -148,8 +141,13 @@ class Loop:
 
     @property
     def presentation(self) -> Presentation:
-        """How it presents; frequencies are mixed, as each is chosen when it is its turn."""
+        """How it presents; conditions are mixed, as each is chosen when it is its turn."""
         return Presentation("mixed", self.pulses)
+
+    @property
+    def encoder(self) -> Encoder:
+        """What its actions are as stimuli."""
+        return Encoder(self.conditions, self.pulses)
 
     @classmethod
     def of_policy(
@@ -158,7 +156,7 @@ class Loop:
         """The loop that a policy was trained for, and where it differs from how the policy's recordings were made.
 
         Args:
-            policy: its robot, mapping, conditions, window and presentation are taken.
+            policy: its robot, mapping, conditions, window and presentation are taken, but for those in `settings`.
             percentiles: of the simulator that it was trained on, in Hz, shape (11,).
             pulses: of a presentation; None: as many as in its recordings (1 where that is not known).
             settings: the other attributes.
@@ -171,15 +169,11 @@ class Loop:
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses
-        if policy.window_ms is not None:
-            settings = {"window_ms": policy.window_ms, **settings}
+        settings = {"conditions": policy.conditions, "window_ms": policy.window_ms, **settings}
+        if settings["window_ms"] is None:
+            del settings["window_ms"]
         loop = cls(
-            policy.robot,
-            policy.mapping,
-            policy.conditions,
-            np.asarray(percentiles, np.float32),
-            pulses=pulses,
-            **settings,
+            policy.robot, policy.mapping, percentiles=np.asarray(percentiles, np.float32), pulses=pulses, **settings
         )
         return loop, _differences(policy, loop)
 

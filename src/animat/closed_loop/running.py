@@ -32,7 +32,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.observed import more_left_out
-from animat.errors import AnimatError, InvalidArgument, shown
+from animat.errors import AnimatError, InvalidArgument, Mismatch, shown
 from animat.progress import Progress, Silent
 
 MOST_EPISODES = 100_000
@@ -82,6 +82,7 @@ def run_session(
 
     Raises:
         InvalidArgument: for a culture that is closed or stopped, no contenders, or a session in the folder already.
+        Mismatch: for conditions on electrodes that the culture cannot stimulate.
         InvalidFile: if the log cannot be begun.
     """
     planned = [episodes] * len(contenders) if isinstance(episodes, int) else list(episodes)
@@ -337,3 +338,9 @@ def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episod
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if loop.patterns is not None and loop.patterns > len(culture.patterns):
         raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")
+    if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
+        raise Mismatch(
+            f"conditions: expected electrodes that the {culture.name} culture can stimulate "
+            f"({', '.join(map(str, culture.stimulation_electrodes))}), got {', '.join(map(str, strange))}: run on the "
+            "culture that was recorded, or train on recordings of this one"
+        )

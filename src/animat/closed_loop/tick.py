@@ -21,8 +21,8 @@ class Tick:
             and what leads in has -1.
         chosen: the condition that was chosen, by the contender or, where it leads in, by lot.
         delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
-        frequency_hz: of the delivered one.
-        patterns: of each pulse, none under the silent control.
+        frequency_hz: that the delivered one was presented at.
+        patterns: of each pulse, -1 where its electrodes are none of the culture's; none under the silent control.
         pulse_time_s: when each pulse really began.
         read_after_s: the pulse that the response was read after, or when it would have come.
         spikes: in the response window.

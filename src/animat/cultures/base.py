@@ -18,11 +18,13 @@ from animat.cultures.sealing import refuse_overrides
 from animat.errors import AnimatError, InvalidArgument
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, Recording
+from animat.stimulation.places import electrodes_of
 from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.schedule import Schedule, make_schedule
 from animat.stimulation.stimulus import Stimulus, plain_stimuli
+from animat.tables import UNKNOWN
 
 
 class Culture(Openable):
@@ -189,7 +191,13 @@ class Culture(Openable):
     @final
     def schedule(self, protocol: Protocol, seed: int = 0) -> Schedule:
         """The stimuli that `record` would deliver."""
-        return make_schedule(protocol, self.patterns, seed)
+        table, electrodes = self.channels, np.array(self.stimulation_electrodes, np.int64)
+        row_of = {electrode: row for row, electrode in enumerate(table.electrode.tolist())}
+        rows = [row_of.get(electrode, UNKNOWN) for electrode in electrodes.tolist()]
+        # One that is not recorded has no position here.
+        x_um, y_um = (np.append(each, np.nan)[rows] for each in (table.x_um, table.y_um))
+        places = electrodes_of(protocol.places, electrodes, x_um, y_um)
+        return make_schedule(protocol, self.patterns, seed, places=places)
 
     @final
     def record(self, protocol: Protocol, seed: int = 0, progress: Progress | None = None) -> Recording:
@@ -200,7 +208,7 @@ class Culture(Openable):
 
         Args:
             protocol: what to do; it is kept in the recording's provenance, as JSON.
-            seed: decides the order of frequencies and patterns.
+            seed: decides the order of conditions and patterns.
             progress: told after each block.
 
         Raises:

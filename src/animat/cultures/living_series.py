@@ -147,7 +147,8 @@ def _expect_of(file: Path, there: Recording, culture: Culture, protocol: Protoco
                 f"{file}: expected a recording of this culture's channels, got others ({name}s differ): choose another "
                 "folder"
             )
-    if (strange := other_patterns(there, culture)) is not None:
+    # Places are told by the protocol, and are no patterns.
+    if not protocol.places and (strange := other_patterns(there, culture)) is not None:
         raise Mismatch(
             f"{file}: expected a recording by this culture's patterns, got others ({strange.value:g} of them): choose "
             "another folder"

@@ -17,6 +17,8 @@ from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN
 
 NS = 1_000_000_000
+_Key = tuple[int, float, bool, int]
+"""A recording, a frequency, whether the pulse is the last of its presentation, and its set of electrodes."""
 REACH_S = 1.0
 """How much of what followed a stimulus is its answer, unless another one came sooner: beyond any response window."""
 
@@ -25,7 +27,8 @@ class ReplayCulture(Culture):
     """A culture made of recordings: a stimulus at f is answered by the spikes that followed a recorded one at f.
 
     The last pulse of a presentation is answered by one that was the last of a recorded presentation, the others by
-    ones that were not, where there are any; a stimulus without a frequency by any. The newest recording at the
+    ones that were not, where there are any; of these by one on the same electrodes, where there are any; a stimulus
+    without a frequency by one of any. The newest recording at the
     culture's clock answers; the clock starts where the first recording did. There is no memory beyond that and no
     activity between responses: what a closed loop does has no effect on what comes next, which is just what a loop on
     living matter is there to test.
@@ -80,7 +83,8 @@ class ReplayCulture(Culture):
         self._zero_s = 60.0 * first.start_min
         self._now_ns = 0
         self._answered = 0
-        self._turn: dict[tuple[int, float, bool], int] = {}
+        self._sets = [_numbered_sets(recording.stimuli.electrodes) for recording in self._recordings]
+        self._turn: dict[_Key, int] = {}
         self._pending_ns, self._pending_channel = np.empty(0, np.int64), np.empty(0, np.int64)
 
     @property
@@ -147,26 +151,27 @@ class ReplayCulture(Culture):
             stimulus_time_s=np.array([time_ns - start_ns for time_ns, _ in answers], dtype=np.float64) / NS,
         )
 
-    def _pool(
-        self, stimulus: Stimulus, is_last: bool
-    ) -> tuple[Recording, tuple[int, float, bool], Int64[np.ndarray, " pulses"]]:
+    def _pool(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, _Key, Int64[np.ndarray, " pulses"]]:
         """The recorded pulses that may answer, and the recording they are in."""
         minute = (self.now_s + stimulus.time_s) / 60
         row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
         recording = self._recordings[row]
         frequency_hz = recording.stimuli.frequency_hz
         same = (frequency_hz == stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
-        alike = same & (recording.stimuli.is_last_of_presentation == is_last)
-        pool = np.flatnonzero(alike if np.any(alike) else same)
+        number_of, set_of_pulse = self._sets[row]
+        electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
+        for narrower in (recording.stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
+            same = same & narrower if np.any(same & narrower) else same
+        pool = np.flatnonzero(same)
         if not len(pool):
             known = ", ".join(f"{f:g}" for f in np.unique(frequency_hz[~np.isnan(frequency_hz)]))
             raise InvalidArgument(
                 f"frequency_hz: expected one that was recorded ({known} Hz), got {stimulus.frequency_hz:g}: a replay "
                 "has answers to nothing else"
             )
-        return recording, (row, stimulus.frequency_hz, is_last), pool
+        return recording, (row, stimulus.frequency_hz, is_last, electrodes), pool
 
-    def _choose(self, key: tuple[int, float, bool], pool: Int64[np.ndarray, " pulses"]) -> int:
+    def _choose(self, key: _Key, pool: Int64[np.ndarray, " pulses"]) -> int:
         if self._how == "draw":
             chosen = int(np.random.default_rng([self._seed, 13, self._answered]).integers(len(pool)))
         else:
@@ -209,6 +214,14 @@ def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:
         _, first = np.unique(stimuli.pattern[numbered], return_index=True)
         return np.asarray(stimuli.electrodes[numbered][first])
     return np.asarray(np.unique(stimuli.electrodes[has_electrodes], axis=0))
+
+
+def _numbered_sets(
+    electrodes: Int64[np.ndarray, "pulses size"],
+) -> tuple[dict[frozenset[int], int], Int64[np.ndarray, " pulses"]]:
+    """A number for every set of electrodes, and the number of each pulse's."""
+    rows, number = np.unique(np.sort(electrodes, axis=1), axis=0, return_inverse=True)
+    return {frozenset(row) - {UNKNOWN}: i for i, row in enumerate(rows.tolist())}, number.reshape(-1)
 
 
 def _is_last(stimuli: Sequence[Stimulus]) -> Bool[np.ndarray, " stimuli"]:

@@ -180,7 +180,7 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
         )
     # How long a schedule takes does not depend on the electrodes: no culture need be opened to refuse.
     patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
-    takes_min = make_schedule(protocol, patterns, seed=0).duration_s / 60
+    takes_min = make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
     if sessions > 1 and interval_min < takes_min:
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
 from animat.animat import Animat, Environment
+from animat.coding.mapping import Mapping, Thresholds
 from animat.errors import InvalidArgument
-from animat.mapping import Mapping, Thresholds
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import AT_FIRST, NeuronSimulator, Stored
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from animat.animat import Animat
+from animat.coding.mapping import Mapping, Thresholds
 from animat.evaluation.optimum import Optimum, best_returns
 from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Uniform, roll_out
-from animat.mapping import Mapping, Thresholds
 from animat.neurons.simulator import HistogramSimulator, fit_histogram, pooled_percentiles
 from animat.responses.responses import Responses
 from animat.robots.base import Robot

@@ -16,7 +16,7 @@ from animat.neurons.kinds import fit_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.responses.responses import Responses
 from animat.robots.grid import Grid, grid_for

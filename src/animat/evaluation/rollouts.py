@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
 from animat.animat import Environment
 from animat.brief import briefly
+from animat.coding.mapping import N_PERCENTILES
 from animat.compilation import FAST_TO_COMPILE
 from animat.errors import InvalidArgument, shown
-from animat.mapping import N_PERCENTILES
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.training.policy import Policy

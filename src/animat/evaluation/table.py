@@ -23,6 +23,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
+from animat.responses.condition import other_stimulus
 from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
 from animat.stimulation.protocol import Presentation
@@ -317,6 +318,8 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
             f"conditions: expected {', '.join(c.label for c in policy.conditions)}, which the policies pick from, got "
             f"recordings with {', '.join(c.label for c in timeline.conditions)}"
         )
+    if others := other_stimulus(policy.conditions, timeline.conditions):
+        raise Mismatch(f"conditions: {others} in the recordings")
     found = []
     if policy.window_ms != timeline.window_ms:
         found.append(

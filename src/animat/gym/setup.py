@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from animat.animat import Animat, Delivery
+from animat.coding.mapping import Mapping, mapping_named
 from animat.errors import InvalidArgument
-from animat.mapping import Mapping, mapping_named
 from animat.neurons.kinds import Kind
 from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.simulator import NeuronSimulator

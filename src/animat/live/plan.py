@@ -16,9 +16,9 @@ from animat.closed_loop.gathering import RECORDING_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_episodes
 from animat.closed_loop.session import expect_no_file
+from animat.coding.mapping import N_PERCENTILES
 from animat.errors import InvalidArgument, Mismatch
-from animat.mapping import N_PERCENTILES
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
 from animat.training.specification import Training
@@ -85,7 +85,8 @@ def check_plan(
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
     expect_trainable(training, is_saved=True)
     # How long it takes does not depend on which electrodes are pulsed.
-    takes_min = make_schedule(protocol, np.zeros((protocol.patterns, 1), np.int64), 0).duration_s / 60
+    patterns, places = np.zeros((protocol.patterns, 1), np.int64), [(0,)] * protocol.n_places
+    takes_min = make_schedule(protocol, patterns, 0, places=places).duration_s / 60
     if takes_min > timetable.interval_min:
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, "

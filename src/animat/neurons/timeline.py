@@ -17,7 +17,7 @@ from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.recordings.findings import Finding
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition, other_stimulus
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 
@@ -138,6 +138,8 @@ def fit_timeline(
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
                     f"{first.start_min:g} min and {_words(getattr(other, name))} at {other.start_min:g} min"
                 )
+        if others := other_stimulus(first.conditions, other.conditions):
+            raise Mismatch(f"conditions: {others} at {other.start_min:g} min")
     start_min = np.array([responses.start_min for responses in ordered], dtype=np.float64)
     if np.any(np.diff(start_min) == 0):
         twice = start_min[:-1][np.diff(start_min) == 0][0]

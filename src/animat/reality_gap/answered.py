@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session
-from animat.mapping import N_PERCENTILES
+from animat.coding.mapping import N_PERCENTILES
 from animat.reality_gap.passes import Passes
 from animat.responses.extraction import SILENCE_S
 from animat.responses.responses import Presented, Responses

@@ -14,7 +14,7 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation

@@ -71,7 +71,7 @@ def outlook(
         account: of the budget.
         now_min: on the culture's clock.
     """
-    interval_s = loop.pulses / np.array([condition.value for condition in loop.conditions])
+    interval_s = loop.pulses * np.array([condition.interval_s for condition in loop.conditions])
     total_s = pulses = 0.0
     for n, acted, is_stimulated in episodes:
         presented = acted + (loop.lead_in or 0) * is_stimulated

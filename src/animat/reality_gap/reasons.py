@@ -12,7 +12,7 @@ from animat.reality_gap.answered import Answered
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Predicted
 from animat.recordings.findings import Finding
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.quality.memory import memory_findings
 from animat.responses.quality.responses import FEW_SAMPLES
 
@@ -70,17 +70,17 @@ def few_samples(evidence: Evidence) -> Finding | None:
 
 
 def lateness(evidence: Evidence) -> Finding | None:
-    """Pulses came so late that a condition was another frequency."""
+    """Pulses came so late that a condition was at another frequency."""
     answers, told, most = evidence.answered, [], 0.0
     for i, condition in enumerate(_conditions(evidence)):
         late_s = answers.late_s[answers.responses.condition == i]
-        if not len(late_s) or (part := float(late_s.mean()) * condition.value) < LEAST_LATE:
+        if not len(late_s) or (part := float(late_s.mean()) / condition.interval_s) < LEAST_LATE:
             continue
         most = max(most, part)
         share, late_ms = float(np.mean(late_s > 0)), 1000 * float(late_s[late_s > 0].mean())
         told.append(
             f"{condition.label} in {100 * share:.0f} % of its presentations, by {late_ms:.2g} ms of its "
-            f"{1000 / condition.value:.3g} on average"
+            f"{1000 * condition.interval_s:.3g} on average"
         )
     return _reason("lateness", f"pulses came late: {', '.join(told)}", most) if told else None
 

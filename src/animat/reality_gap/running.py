@@ -34,6 +34,7 @@ from animat.reality_gap.predicting import Predicted, predict, together
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding
+from animat.responses.condition import other_stimulus
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
 from animat.training.policy import Policy
@@ -97,6 +98,8 @@ def run_policies(
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if follow:
         settings["following"] = calibration.responses_hz
+    # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
+    settings["conditions"] = calibration.conditions
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":
@@ -259,11 +262,15 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
     Raises:
         Mismatch: if it is not.
     """
-    if first.mapping is not None and first.conditions != calibration.conditions:
+    if first.mapping is None:
+        return
+    if first.conditions != calibration.conditions:
         raise Mismatch(
             f"conditions: expected {', '.join(c.label for c in first.conditions)}, which the policies pick from, got "
             f"recordings with {', '.join(c.label for c in calibration.conditions)}"
         )
+    if others := other_stimulus(first.conditions, calibration.conditions):
+        raise Mismatch(f"conditions: {others} in the recordings: run on those that the policies were trained on")
 
 
 def _rows(

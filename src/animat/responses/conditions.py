@@ -4,50 +4,19 @@ from __future__ import annotations
 
 import abc
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Int64
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument
+from animat.responses.condition import Condition
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
 """The index of a stimulus that belongs to no condition."""
-_LONGEST_LABEL = 10_000
-"""A condition may be a set of very many electrodes, and its label names all of them."""
-_LARGEST_VALUE = 2.0**63
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One thing an agent can choose to do to the culture, such as stimulating at 5 Hz.
-
-    Attributes:
-        label: what figures and tables call it, with its unit: `"5 Hz"`, `"electrodes 909+23923"`.
-        value: the frequency in Hz; the number of the pattern; the position in the list for electrodes; 0 for "all".
-        unit: of `value`: `"Hz"`, or empty for a number that only counts.
-
-    Raises:
-        InvalidArgument: for a label that is no line of text, or a value that is no finite number.
-    """
-
-    label: str
-    value: float
-    unit: str = ""
-
-    def __post_init__(self) -> None:
-        told: Any
-        for name, told in (("label", self.label), ("unit", self.unit)):
-            if not isinstance(told, str) or not told.isprintable() or len(told) > _LONGEST_LABEL:
-                raise InvalidArgument(f"condition.{name}: expected a line of text, got {shown(told)}")
-        if not self.label:
-            raise InvalidArgument("condition.label: expected some text, got none")
-        value: Any = self.value
-        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= _LARGEST_VALUE:
-            raise InvalidArgument(f"condition.value: expected a finite number, got {shown(value)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +49,7 @@ class All(Conditions):
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Put every pulse into condition 0."""
-        return Assignment(np.zeros(len(stimuli), dtype=np.int64), (Condition("all", 0.0),))
+        return _recorded(stimuli, np.zeros(len(stimuli), dtype=np.int64), [Condition("all", 0.0)])
 
 
 @dataclass(frozen=True)
@@ -191,10 +160,9 @@ class ByElectrode(Conditions):
         sets = self.sets or tuple(sorted({s for s in set_of_row if s}, key=lambda s: (len(s), s)))
         index_of = {electrodes: i for i, electrodes in enumerate(sets)}
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
-        labels = (f"electrode{'s' if len(s) > 1 else ''} {'+'.join(map(str, s))}" for s in sets)
-        return Assignment(
-            index_of_row[row_of.reshape(-1)], tuple(Condition(label, float(i)) for i, label in enumerate(labels))
-        )
+        labels = [f"electrode{'s' if len(s) > 1 else ''} {'+'.join(map(str, s))}" for s in sets]
+        found = [Condition(label, float(i), electrodes=(sets[i],)) for i, label in enumerate(labels)]
+        return _recorded(stimuli, index_of_row[row_of.reshape(-1)], found)
 
 
 @dataclass(frozen=True)
@@ -223,7 +191,39 @@ class ByPattern(Conditions):
         index = np.full(len(stimuli), NO_CONDITION)
         for i, pattern in enumerate(patterns):
             index[stimuli.pattern == pattern] = i
-        return Assignment(index, tuple(Condition(f"pattern {pattern}", float(pattern)) for pattern in patterns))
+        found = [Condition(f"pattern {pattern}", float(pattern), electrodes=()) for pattern in patterns]
+        return _recorded(stimuli, index, found)
+
+
+@dataclass(frozen=True)
+class ByBoth(Conditions):
+    """By when and where pulses come: the combinations that occur, those of the first `when` before the others.
+
+    Attributes:
+        when: frequencies or intervals.
+        where: electrodes or patterns.
+    """
+
+    when: ByFrequency | ByInterval
+    where: ByElectrode | ByPattern
+
+    def __str__(self) -> str:
+        return f"{self.when} x {self.where}"
+
+    def assign(self, stimuli: Stimuli) -> Assignment:
+        """Put each pulse to its combination; a pulse without either has no condition."""
+        when, where = self.when.assign(stimuli), self.where.assign(stimuli)
+        both = (when.condition != NO_CONDITION) & (where.condition != NO_CONDITION)
+        number = np.where(both, when.condition * len(where.conditions) + where.condition, NO_CONDITION)
+        occurring = np.unique(number[both & stimuli.is_last_of_presentation])
+        index = np.full(len(stimuli), NO_CONDITION)
+        found = []
+        for i, each in enumerate(occurring.tolist()):
+            index[number == each] = i
+            at, on = when.conditions[each // len(where.conditions)], where.conditions[each % len(where.conditions)]
+            label = f"{at.label}, {on.label}"
+            found.append(Condition(label, float(i), "", at.frequencies_hz, on.electrodes))
+        return _recorded(stimuli, index, found)
 
 
 def default_conditions(stimuli: Stimuli) -> Conditions:
@@ -235,11 +235,18 @@ def conditions_named(text: str) -> Conditions:
     """Read conditions from their text form.
 
     `all`, `frequency`, `frequency:5,10`, `interval:5,10`, `interval:5,10+-25%`, `electrode`,
-    `electrode:23275,909+23923`, `pattern`, `pattern:0,3`.
+    `electrode:23275,909+23923`, `pattern`, `pattern:0,3`, and of frequency or interval with electrode or pattern the
+    product, `frequency:5,80 x pattern:0,3`.
 
     Raises:
         InvalidArgument: for anything else, saying what was expected.
     """
+    first, is_product, second = text.partition(" x ")
+    if is_product:
+        when, where = conditions_named(first), conditions_named(second)
+        if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
+            return ByBoth(when, where)
+        raise _unread(text, "frequency or interval before x, and electrode or pattern after it")
     name, _, rest = text.strip().partition(":")
     name, rest = name.strip(), rest.strip()
     if name == "all" and not rest:
@@ -258,7 +265,30 @@ def conditions_named(text: str) -> Conditions:
         return ByElectrode(tuple(_integers(text, part, "+") for part in rest.split(",") if rest))
     if name == "pattern":
         return ByPattern(_integers(text, rest, ","))
-    raise _unread(text, "one of all, frequency, frequency:5,10, interval:5,10+-25%, electrode, pattern")
+    raise _unread(
+        text, "one of all, frequency, frequency:5,10, interval:5,10+-25%, electrode, pattern, frequency x pattern"
+    )
+
+
+def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]) -> Assignment:
+    """An assignment whose conditions say what their stimuli were, where they do not say it yet."""
+    last = np.flatnonzero(stimuli.is_last_of_presentation)
+    pulses, of = np.diff(last, prepend=-1), index[last]
+    # Pulses before the last one that are of another condition than the presentation.
+    strays = np.repeat(of, pulses) != index
+    has_others = set(np.repeat(of, pulses)[strays].tolist())
+    found = []
+    for i, condition in enumerate(conditions):
+        rows = last[of == i]
+        known_hz, electrodes = condition.frequencies_hz, condition.electrodes
+        if not known_hz and len(rows) and not np.any(np.isnan(stimuli.frequency_hz[rows])):
+            known_hz = tuple(np.unique(stimuli.frequency_hz[rows]).tolist())
+        if electrodes == ():
+            sets = {frozenset(row) - {UNKNOWN} for row in stimuli.electrodes[rows].tolist()}
+            electrodes = () if frozenset() in sets else tuple(sorted(tuple(sorted(one)) for one in sets))
+        only_last = electrodes is not None and i in has_others
+        found.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
+    return Assignment(index, tuple(found))
 
 
 def _frequency(value_hz: float) -> Condition:

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float64, Int64
 from animat.brief import briefly
 from animat.errors import Mismatch
 from animat.recordings.findings import Finding
-from animat.responses.conditions import NO_CONDITION, Condition
+from animat.responses.condition import Condition
+from animat.responses.conditions import NO_CONDITION
 from animat.stimulation.protocol import Presentation
 
 

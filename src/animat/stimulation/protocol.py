@@ -11,6 +11,7 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, shown
 from animat.plain_file import read_plain_text
+from animat.stimulation.places import Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
 Order = Literal["blocked", "mixed"]
@@ -65,10 +66,12 @@ class Protocol:
 
     Attributes:
         frequencies_hz: the conditions, each once.
-        order: `"blocked"` or `"mixed"`: the frequencies' presentations shuffled together, as a closed loop meets them.
+        order: `"blocked"` or `"mixed"`: the conditions' presentations shuffled together, as a closed loop meets them.
         pulses: of one presentation, with different patterns where there are enough.
         patterns: how many of the culture's patterns are used, the first ones; 1 repeats one pattern.
         presentations: at each frequency; each pattern is read equally often, in random order.
+        places: groups of electrodes, `"halves"` or `"quadrants"` (`animat.stimulation.places`), in place of patterns:
+            each at each frequency is then a condition of its own, presented so often, all pulses on the whole group.
         setup_s: before each block (mixed: before the one block), the time that setting up takes. Nothing is recorded
             meanwhile, and the recording's clock leaves it out.
         pause_s: recorded without stimuli before each block.
@@ -86,6 +89,7 @@ class Protocol:
     pulses: int = 1
     patterns: int = 100
     presentations: int = 100
+    places: Places = ()
     setup_s: float = 14.0
     pause_s: float = 2.0
     tail_s: float = 0.1
@@ -100,6 +104,7 @@ class Protocol:
         for name in ("patterns", "presentations"):
             if not 1 <= getattr(self, name) <= 1_000_000:
                 raise InvalidArgument(f"{name}: expected 1 to 1,000,000, got {shown(getattr(self, name))}")
+        object.__setattr__(self, "places", check_places(self.places))
         for name in ("setup_s", "pause_s", "tail_s"):
             if not 0 <= getattr(self, name) <= _LONGEST_S:
                 raise InvalidArgument(
@@ -109,14 +114,15 @@ class Protocol:
             object.__setattr__(self, name, float(getattr(self, name)))
         # The order and the number of pulses are checked there.
         _ = self.presentation
-        pulses = len(self.frequencies_hz) * self.presentations * self.pulses
+        of_each = self.presentations * self.pulses * max(1, self.n_places)
+        pulses = len(self.frequencies_hz) * of_each
         if pulses > _MOST_PULSES:
             raise InvalidArgument(
-                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x presentations x pulses), got "
-                f"{pulses:,}"
+                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x places x presentations x "
+                f"pulses), got {pulses:,}"
             )
 
-        stimulated_s = sum(self.presentations * self.pulses / f for f in self.frequencies_hz)
+        stimulated_s = sum(of_each / f for f in self.frequencies_hz)
         if stimulated_s > _LONGEST_RECORDING_S:
             raise InvalidArgument(
                 f"frequencies_hz: expected stimuli of at most a week ({_LONGEST_RECORDING_S:,} s) in a recording, got "
@@ -128,9 +134,17 @@ class Protocol:
         """The part of it that must be the same when a robot is driven."""
         return Presentation(self.order, self.pulses)
 
+    @property
+    def n_places(self) -> int:
+        """How many places there are; 0: the culture's patterns are used."""
+        return count_places(self.places)
+
     def to_json(self) -> str:
         """As one line of JSON, the way it travels in a recording's provenance under `"protocol"`."""
         data = {each.name: getattr(self, each.name) for each in fields(self)}
+        if not self.places:
+            # A series knows its own protocol by its text, and those of before have no places.
+            del data["places"]
         return json.dumps({**data, "pulse": self.pulse.to_list()})
 
     @staticmethod
@@ -205,7 +219,7 @@ def _setting(name: str, value: Any) -> Any:
         if not isinstance(value, int) or isinstance(value, bool):
             raise InvalidArgument(f"{name}: expected a whole number, got {value!r}")
         return value
-    return value if name == "order" else _number(name, value)
+    return value if name in ("order", "places") else _number(name, value)
 
 
 def _number(name: str, value: Any) -> float:

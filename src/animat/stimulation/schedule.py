@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,18 +64,28 @@ class Schedule:
         return stimuli_of(block.stimuli, self.protocol)
 
 
-def make_schedule(protocol: Protocol, patterns: Int64[np.ndarray, "patterns size"], seed: int) -> Schedule:
-    """Draw the order of frequencies and patterns of one recording.
+def make_schedule(
+    protocol: Protocol,
+    patterns: Int64[np.ndarray, "patterns size"],
+    seed: int,
+    *,
+    places: Sequence[tuple[int, ...]] = (),
+) -> Schedule:
+    """Draw the order of conditions and patterns of one recording.
 
     Args:
         protocol: what to do.
         patterns: the culture's patterns, electrodes of each, padded with -1.
         seed: zero or more.
+        places: electrodes of each of the protocol's places, where it has any.
 
     Raises:
-        InvalidArgument: if the culture has fewer patterns than the protocol uses, or for a negative seed.
+        InvalidArgument: if the culture has fewer patterns than the protocol uses, for other places than it has, or for
+            a negative seed.
     """
-    if protocol.patterns > len(patterns):
+    if len(places) != protocol.n_places:
+        raise InvalidArgument(f"places: expected electrodes of {protocol.n_places}, got those of {len(places)}")
+    if not places and protocol.patterns > len(patterns):
         raise InvalidArgument(
             f"patterns: expected at most the {len(patterns)} that the culture's electrode selection has, got "
             f"{protocol.patterns}: select more, or use fewer"
@@ -83,10 +94,13 @@ def make_schedule(protocol: Protocol, patterns: Int64[np.ndarray, "patterns size
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 7])
     n_frequencies, each = len(protocol.frequencies_hz), protocol.presentations
+    n_conditions = n_frequencies * max(1, len(places))
     if protocol.order == "blocked":
-        orders = [np.full(each, frequency) for frequency in rng.permutation(n_frequencies)]
+        orders = [np.full(each, condition) for condition in rng.permutation(n_conditions)]
     else:
-        orders = [rng.permutation(np.repeat(np.arange(n_frequencies), each))]
+        orders = [rng.permutation(np.repeat(np.arange(n_conditions), each))]
+    if places:
+        return Schedule(protocol, seed, _at_places(protocol, orders, patterns, places))
     read = [_balanced(rng, protocol.patterns, each) for _ in range(n_frequencies)]
     taken = [0] * n_frequencies
     blocks, presentation = [], 0
@@ -100,6 +114,28 @@ def make_schedule(protocol: Protocol, patterns: Int64[np.ndarray, "patterns size
         presentation += len(order)
         blocks.append(_block(protocol, frequency_hz, patterns[pattern.ravel()], pattern.ravel(), number))
     return Schedule(protocol, seed, tuple(blocks))
+
+
+def _at_places(
+    protocol: Protocol,
+    orders: Sequence[Int64[np.ndarray, " presentations"]],
+    patterns: Int64[np.ndarray, "patterns size"],
+    places: Sequence[tuple[int, ...]],
+) -> tuple[Block, ...]:
+    """Blocks of which each presentation is all on one place; one that is a pattern of the culture has its number."""
+    number_of = {frozenset(row) - {UNKNOWN}: number for number, row in enumerate(patterns.tolist())}
+    pattern = np.array([number_of.get(frozenset(place), UNKNOWN) for place in places])
+    electrodes = np.full((len(places), max(map(len, places))), UNKNOWN)
+    for number, place in enumerate(places):
+        electrodes[number, : len(place)] = place
+    blocks, presentation = [], 0
+    for order in orders:
+        of = np.repeat(np.arange(presentation, presentation + len(order)), protocol.pulses)
+        frequency, where = np.divmod(np.repeat(order, protocol.pulses), len(places))
+        frequency_hz = np.array(protocol.frequencies_hz)[frequency]
+        blocks.append(_block(protocol, frequency_hz, electrodes[where], pattern[where], of))
+        presentation += len(order)
+    return tuple(blocks)
 
 
 def stimuli_of(stimuli: Stimuli, protocol: Protocol) -> list[Stimulus]:

@@ -18,7 +18,8 @@ from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
-from animat.responses.conditions import Condition, conditions_named
+from animat.responses.condition import Condition
+from animat.responses.conditions import conditions_named
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Presentation

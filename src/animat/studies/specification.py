@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
+from animat.coding.mapping import MAPPING_NAMES
 from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
-from animat.mapping import MAPPING_NAMES
 from animat.recordings.made_up import MadeUpCulture
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import is_ours, place_of, robot_named

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from animat.mapping import mapping_named
+from animat.coding.mapping import mapping_named
 from animat.neurons.timeline import SimulatorTimeline
 from animat.studies.draws import draw_seed
 from animat.studies.jobs import Report, Task

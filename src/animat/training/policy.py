@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from animat.brief import briefly
+from animat.coding.mapping import Mapping, expect_loadable_mapping, mapping_named
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, shown
-from animat.mapping import Mapping, expect_loadable_mapping, mapping_named
 from animat.plain_file import expect_plain_file, is_folder
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import expect_loadable_robot, robot_from_dict, robot_to_dict

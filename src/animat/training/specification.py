@@ -10,8 +10,8 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 import numpy as np
 
 from animat.animat import Animat, Delivery, Environment, WithoutNeurons
+from animat.coding.mapping import Mapping, mapping_named
 from animat.errors import InvalidArgument, shown
-from animat.mapping import Mapping, mapping_named
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.base import Robot
 from animat.robots.registry import robot_named, robot_to_dict

@@ -19,9 +19,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from animat.coding.mapping import check_mapping, expect_loadable_mapping
 from animat.differences import first_difference
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch
-from animat.mapping import check_mapping, expect_loadable_mapping
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot

@@ -1,0 +1,137 @@
+"""From an action to a stimulus: each condition is delivered as it was in the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from animat.errors import InvalidArgument, UnusableData
+from animat.responses.condition import Condition
+from animat.tables import UNKNOWN
+
+SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
+"""Frequencies that a presentation may have: a quarter of an hour is waited for a pulse at most."""
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """What the actions of an agent are as stimuli: a condition each, presented as so many pulses.
+
+    Attributes:
+        conditions: by the number of their action.
+        pulses: of one presentation.
+
+    Raises:
+        InvalidArgument: for no conditions.
+        UnusableData: for a condition that cannot be delivered, as it is not known at which frequency or on which
+            electrodes it was.
+    """
+
+    conditions: tuple[Condition, ...]
+    pulses: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.conditions:
+            raise InvalidArgument("conditions: expected at least one, got none")
+        for condition in self.conditions:
+            if not condition.frequencies_hz:
+                raise UnusableData(
+                    f"condition {condition.label}: expected recordings that tell the frequency of its pulses, at which "
+                    "a closed loop presents it, got none; sort the stimuli by their intervals too: --conditions "
+                    "'interval:5,10 x electrode'"
+                )
+            if not all(SLOWEST_HZ <= each <= FASTEST_HZ for each in condition.frequencies_hz):
+                raise UnusableData(
+                    f"condition {condition.label}: expected a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, as a "
+                    f"closed loop presents by frequency, got {', '.join(f'{f:g}' for f in condition.frequencies_hz)}"
+                )
+            if condition.electrodes == ():
+                raise UnusableData(
+                    f"condition {condition.label}: expected recordings that tell the electrodes of its pulses, through "
+                    "which a closed loop presents it, got none; train on conditions by frequency or interval"
+                )
+
+    @property
+    def electrodes(self) -> tuple[int, ...]:
+        """All that its conditions name, rising."""
+        sets = (one for condition in self.conditions for one in condition.electrodes or ())
+        return tuple(sorted({electrode for one in sets for electrode in one}))
+
+    @property
+    def takes_patterns(self) -> bool:
+        """Whether any pulse is on whatever patterns the culture has."""
+        return any(each.electrodes is None or (each.only_last and self.pulses > 1) for each in self.conditions)
+
+
+class Target(NamedTuple):
+    """What one pulse is on.
+
+    Attributes:
+        electrodes: pulsed together.
+        pattern: number of the culture's pattern that they are, -1 where they are none.
+    """
+
+    electrodes: tuple[int, ...]
+    pattern: int
+
+
+class Dealer:
+    """Deals out the stimuli of one presentation after the other, as the schedule of a recording does.
+
+    What a condition leaves open is dealt: patterns from a deck that is shuffled when it is empty, so that all are
+    used equally often, and its frequencies by lot.
+
+    Args:
+        encoder: what the actions are.
+        patterns: electrodes of each of the culture's patterns in use, padded with -1.
+        rng: of all draws.
+    """
+
+    def __init__(
+        self, encoder: Encoder, patterns: Int64[np.ndarray, "patterns size"], rng: np.random.Generator
+    ) -> None:
+        self._encoder, self._rng = encoder, rng
+        targets = [Target(tuple(int(e) for e in row if e != UNKNOWN), number) for number, row in enumerate(patterns)]
+        number_of = {frozenset(target.electrodes): target.pattern for target in targets}
+        self._any = _Deck(targets, rng)
+        self._decks = [
+            self._any
+            if each.electrodes is None
+            else _Deck([Target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
+            for each in encoder.conditions
+        ]
+
+    def frequency_hz(self, condition: int) -> float:
+        """The frequency of the next presentation of a condition."""
+        known = self._encoder.conditions[condition].frequencies_hz
+        return known[0] if len(known) == 1 else float(known[self._rng.integers(len(known))])
+
+    def targets(self, condition: int) -> list[Target]:
+        """What the pulses of the next presentation of a condition are on, different ones where there are enough."""
+        pulses, deck = self._encoder.pulses, self._decks[condition]
+        if not self._encoder.conditions[condition].only_last:
+            return deck.hand(pulses)
+        last = deck.hand(1)
+        return [*self._any.hand(pulses - 1, but=last), *last]
+
+
+class _Deck:
+    def __init__(self, targets: Sequence[Target], rng: np.random.Generator) -> None:
+        self._targets, self._rng = targets, rng
+        self._left: list[Target] = []
+
+    def hand(self, n: int, but: Iterable[Target] = ()) -> list[Target]:
+        """So many, different from each other and from those in `but` as long as the deck has such."""
+        hand: list[Target] = []
+        avoided = list(but)
+        while len(hand) < n:
+            if not self._left:
+                self._left = [self._targets[i] for i in self._rng.permutation(len(self._targets))]
+            place = next((i for i, each in enumerate(self._left) if each not in avoided), 0)
+            hand.append(self._left.pop(place))
+            avoided.append(hand[-1])
+        return hand

@@ -1,0 +1,101 @@
+"""Places on an array: groups of electrodes that are pulsed together, named or listed."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.plain_file import read_plain_text
+
+NAMED = {"halves": (2, 1), "quadrants": (2, 2)}
+"""Columns and rows that the stimulation electrodes are cut into, as many electrodes in each as can be."""
+_MOST_BYTES = 2**20
+_MOST_PLACES = 1000
+
+Places = str | tuple[tuple[int, ...], ...]
+"""One of `NAMED`, or the electrodes of each place."""
+
+
+def check_places(given: Any) -> Places:
+    """Places as a protocol has them, lists as tuples.
+
+    Raises:
+        InvalidArgument: for another name, or what is no list of groups of electrodes, each group once.
+    """
+    if isinstance(given, str) and given in NAMED:
+        return given
+    is_listed = isinstance(given, list | tuple) and all(isinstance(place, list | tuple) and place for place in given)
+    if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in given for e in place):
+        raise InvalidArgument(
+            f"places: expected {' or '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], got "
+            f"{shown(given)}"
+        )
+    places = tuple(tuple(sorted(set(place))) for place in given)
+    if len(set(places)) < len(places) or len(places) > _MOST_PLACES:
+        raise InvalidArgument(f"places: expected at most {_MOST_PLACES:,} groups, each once, got {shown(given)}")
+    return places
+
+
+def read_places(text: str | os.PathLike[str]) -> Places:
+    """One of `NAMED`, or the places in a file of JSON: a list of lists of electrodes.
+
+    Raises:
+        InvalidFile: naming the file, what was expected and what came.
+    """
+    if text in NAMED:
+        return str(text)
+    try:
+        return check_places(json.loads(read_plain_text(text, _MOST_BYTES)))
+    except (ValueError, RecursionError) as error:
+        said = (
+            error if isinstance(error, InvalidArgument) else f"places: expected JSON as [[1, 2], [3, 4]], got {error}"
+        )
+        raise InvalidFile(f"{text}: {said}") from error
+
+
+def count_places(places: Places) -> int:
+    """How many there are."""
+    return int(np.prod(NAMED[places])) if isinstance(places, str) else len(places)
+
+
+def electrodes_of(
+    places: Places,
+    electrodes: Int64[np.ndarray, " electrodes"],
+    x_um: Float64[np.ndarray, " electrodes"],
+    y_um: Float64[np.ndarray, " electrodes"],
+) -> tuple[tuple[int, ...], ...]:
+    """The electrodes of each place on an array.
+
+    Halves are those with the smaller and the larger x; each is cut by y for quadrants. Electrodes at the same x (or y)
+    go by their numbers.
+
+    Args:
+        places: named or listed.
+        electrodes: that can be stimulated.
+        x_um, y_um: where they are.
+
+    Raises:
+        InvalidArgument: for named places of electrodes that are too few, or whose positions are not known.
+    """
+    if not isinstance(places, str):
+        return places
+    columns, rows = NAMED[places]
+    known = np.isfinite(x_um) & np.isfinite(y_um)
+    if not np.all(known) or len(electrodes) < columns * rows:
+        missing = (
+            f"{np.count_nonzero(~known)} of them unknown" if not np.all(known) else f"{len(electrodes)} electrodes"
+        )
+        raise InvalidArgument(
+            f"places: expected positions of {columns * rows} stimulation electrodes or more to cut into {places}, got "
+            f"{missing}: list the electrodes of each place"
+        )
+    found = []
+    for column in np.array_split(np.lexsort((electrodes, x_um)), columns):
+        in_order = column[np.lexsort((electrodes[column], y_um[column]))]
+        found += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
+    return tuple(found)

@@ -1,0 +1,134 @@
+"""Places: groups of electrodes that are pulsed together, cut by hand, presented as conditions, read from files."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from animat.cli import main
+from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.reading import read_recording
+from animat.responses.conditions import conditions_named
+from animat.stimulation.places import check_places, electrodes_of, read_places
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.schedule import make_schedule
+from cultures import small_culture
+
+GRID = np.arange(12)
+X_UM, Y_UM = 10.0 * (GRID % 4), 10.0 * (GRID // 4)
+"""Four columns and three rows, numbered row by row."""
+LISTED = ((0, 1), (5, 7), (3, 9, 11))
+
+
+def test_halves_and_quadrants_are_cut_by_position() -> None:
+    left, right = electrodes_of("halves", GRID, X_UM, Y_UM)
+    assert (left, right) == ((0, 1, 4, 5, 8, 9), (2, 3, 6, 7, 10, 11))
+    assert electrodes_of("quadrants", GRID, X_UM, Y_UM) == ((0, 1, 4), (5, 8, 9), (2, 3, 6), (7, 10, 11))
+    assert electrodes_of(LISTED, GRID, X_UM, Y_UM) == LISTED
+    with pytest.raises(InvalidArgument, match="positions of 2 stimulation electrodes or more to cut into halves"):
+        electrodes_of("halves", GRID, X_UM, np.append(Y_UM[1:], np.nan))
+    with pytest.raises(InvalidArgument, match=r"positions of 4 .* got 3 electrodes: list"):
+        electrodes_of("quadrants", GRID[:3], X_UM[:3], Y_UM[:3])
+
+
+@given(st.integers(4, 40), st.sampled_from(["halves", "quadrants"]), st.integers(0, 10**6))
+def test_every_electrode_is_in_one_place_and_places_are_as_large(n: int, named: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    electrodes = rng.permutation(100)[:n]
+    x_um, y_um = rng.integers(0, 5, n) * 1.0, rng.integers(0, 5, n) * 1.0
+    places = electrodes_of(named, electrodes, x_um, y_um)
+    assert sorted(e for place in places for e in place) == sorted(electrodes.tolist())
+    assert max(map(len, places)) - min(map(len, places)) <= 2
+    x_of = dict(zip(electrodes.tolist(), x_um.tolist(), strict=True))
+    half = len(places) // 2
+    left, right = ([x_of[e] for place in some for e in place] for some in (places[:half], places[half:]))
+    assert max(left) <= min(right)
+
+
+@pytest.mark.parametrize(
+    "given_",
+    ["thirds", [[1, 2], []], [[1, -2]], [[1.5]], [1, 2], {"left": [1]}, [[True]], [[1, 2], [2, 1]], 3],
+)
+def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match=r"^places: expected"):
+        check_places(given_)
+    file = tmp_path / "places.json"
+    file.write_text(json.dumps(given_))
+    with pytest.raises(InvalidFile, match=r"places\.json: places: expected"):
+        read_places(str(file))
+    file.write_text("[[1, 2]")
+    with pytest.raises(InvalidFile, match=r"places\.json: places: expected JSON as"):
+        read_places(str(file))
+    with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):
+        read_places(str(tmp_path / "nothing.json"))
+
+
+@pytest.mark.parametrize("order", ["mixed", "blocked"])
+def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
+    protocol = Protocol((5.0, 20.0), order, 2, presentations=7, places=LISTED)  # type: ignore[arg-type]
+    assert Protocol.from_json(protocol.to_json()) == protocol
+    # The second place is the third of the culture's patterns.
+    patterns = np.array([[0, 2, -1], [3, 9, 0], [7, 5, -1]])
+    schedule = make_schedule(protocol, patterns, 3, places=LISTED)
+    assert len(schedule.blocks) == (6 if order == "blocked" else 1)
+    each: Counter[object] = Counter()
+    for block in schedule.blocks:
+        stimuli = block.stimuli
+        sets = [frozenset(row) - {-1} for row in stimuli.electrodes.tolist()]
+        assert all(sets[i] == sets[i + 1] for i in range(0, len(sets), 2))
+        assert stimuli.pattern.tolist() == [2 if one == {5, 7} else -1 for one in sets]
+        # Each pulse comes 1/f after the one before it, as without places.
+        np.testing.assert_allclose(np.diff(stimuli.time_s), 1 / stimuli.frequency_hz[1:], atol=6e-5)
+        each.update(zip(stimuli.frequency_hz.tolist(), sets, strict=True))
+        if order == "blocked":
+            assert len({*sets}) == len({*stimuli.frequency_hz.tolist()}) == 1
+    assert each == {(hz, frozenset(place)): 14 for hz in (5.0, 20.0) for place in LISTED}
+    numbers = np.concatenate([block.stimuli.presentation for block in schedule.blocks])
+    assert numbers.tolist() == [i // 2 for i in range(84)]
+    with pytest.raises(InvalidArgument, match="places: expected electrodes of 3, got those of 0"):
+        make_schedule(protocol, patterns, 3)
+
+
+def test_in_a_mixed_recording_a_place_may_follow_itself() -> None:
+    """As in a closed loop: a round of all places before any comes again would never show it."""
+    protocol = Protocol((10.0,), "mixed", presentations=500, places=LISTED)
+    (block,) = make_schedule(protocol, np.zeros((100, 1), np.int64), 0, places=LISTED).blocks
+    first = block.stimuli.electrodes[:, 0]
+    share = float(np.mean(first[1:] == first[:-1]))
+    # A third, with the standard error of 1,500 draws.
+    assert share == pytest.approx(1 / 3, abs=4 * (2 / 9 / 1500) ** 0.5)
+
+
+def test_a_protocol_without_places_is_written_as_before() -> None:
+    assert "places" not in json.loads(Protocol().to_json())
+
+
+def test_halves_of_a_virtual_culture_are_recorded_and_sorted(tmp_path: Path) -> None:
+    protocol = Protocol((20.0,), "mixed", presentations=3, places="halves", setup_s=0.0, pause_s=0.1)
+    with small_culture() as culture:
+        recording = culture.record(protocol)
+        x_of = dict(zip(culture.channels.electrode.tolist(), culture.channels.x_um.tolist(), strict=True))
+        electrodes = set(culture.stimulation_electrodes)
+    write_nwb(recording, tmp_path / "halves.nwb")
+    left, right = conditions_named("electrode").assign(read_recording(tmp_path / "halves.nwb").stimuli).conditions
+    assert left.electrodes and right.electrodes
+    (one,), (other,) = sorted((left.electrodes, right.electrodes), key=lambda sets: x_of[sets[0][0]])
+    assert {*one, *other} == electrodes and len(one) == len(other)
+    assert max(x_of[e] for e in one) <= min(x_of[e] for e in other)
+
+
+def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, file = tmp_path / "out", tmp_path / "places.json"
+    file.write_text("[[1, 2]")
+    assert main(["record", "--places", str(file), "--out", str(out)]) == 1
+    assert "places.json: places: expected JSON" in capsys.readouterr().err
+    assert main(["record", "--culture", "made-up", "--places", "halves", "--out", str(out)]) == 1
+    assert "no places; --culture virtual takes others" in capsys.readouterr().err
+    assert not out.exists()
