@@ -18,6 +18,7 @@ from animat.cli import main as animat
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
+from animat.execution.training import train
 from animat.mapping import mapping_named
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -27,7 +28,6 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.specification import Training
-from animat.training.trainer import train
 
 pytestmark = pytest.mark.oracle
 

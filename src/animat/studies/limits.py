@@ -9,13 +9,14 @@ from typing import Any, final
 from animat.animat import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
+from animat.progress import Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
-from animat.studies.jobs import Report, Task
 from animat.studies.places import limits_file, read_table, write_table
 from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.task import StudyTask
 
 HEAD = (
     "mapping",
@@ -70,7 +71,7 @@ def left_out(study: Study) -> list[str]:
 
 @final
 @dataclass(frozen=True)
-class Limit(Task):
+class Limit(StudyTask):
     """The best possible return on a robot for every mapping of the study, of conditions with enough responses.
 
     Of a robot without a grid the table is empty.
@@ -80,16 +81,16 @@ class Limit(Task):
             at the minutes that anything is evaluated at.
     """
 
-    grows_with = ("limit_resolution", "limit_episodes")
+    sizes = ("limit_resolution", "limit_episodes")
 
     body: Body
     over_time: bool = False
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
         file = limits_file(folder, self.body.name, "over-time" if self.over_time else "limits")
         if no_grid(self.body.robot()) is not None:
             return [write_table(file, HEAD, [])]
-        study, timeline = as_recorded(study, folder)
+        study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         kinds, minutes = kinds_of(study), study.limit_minutes(first, last)
         resolution, episodes = self.body.limit_resolution or study.limit_resolution, study.limit_episodes
@@ -119,7 +120,7 @@ class Limit(Task):
         for i, (environment, _) in cases.items():
             alike.setdefault(asked[i][0] if self.over_time else environment.n_actions is None, []).append(i)
         known = {} if self.over_time else {i: counted[i] for i in counted if asked[i] in _compared(study, first, last)}
-        told = _Told(report, len(cases) + len(known))
+        told = _Told(progress, len(cases) + len(known))
         found: dict[int, Optimum] = {}
         for same in alike.values():
             best = best_returns(
@@ -160,8 +161,8 @@ def _cells(optimum: Optimum | None) -> tuple[float | int | None, ...]:
 
 
 class _Told:
-    def __init__(self, report: Report, n_cases: int) -> None:
-        self._report, self._n_cases, self.before = report, n_cases, 0
+    def __init__(self, progress: Progress, n_cases: int) -> None:
+        self._progress, self._n_cases, self.before = progress, n_cases, 0
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self._report((self.before + done) / self._n_cases, note)
+        self._progress.update(self.before + done, self._n_cases, note)

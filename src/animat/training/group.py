@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -88,6 +88,14 @@ def train_group(
 def untrained_policies(group: Group) -> list[Policy]:
     """A group's policies as they are before their first iteration: what training is compared with."""
     return SideBySide(group).policies()
+
+
+def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> list[Path]:
+    """Write a group's policies by their numbers in the training; returns the files."""
+    files = [folder / f"p{member}.safetensors" for member in group.members]
+    for file, policy in zip(files, policies, strict=True):
+        policy.save(file)
+    return files
 
 
 def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -212,10 +220,10 @@ def _bytes_of(leaves: list[Any]) -> int:
     return sum(leaf.nbytes for leaf in leaves)
 
 
-def split_groups(policies: int, largest: int = 5) -> list[tuple[int, ...]]:
-    """Cut the numbers of the policies into groups as even as possible, none larger than `largest`.
+def split_groups(policies: int) -> list[tuple[int, ...]]:
+    """Cut the numbers of the policies into groups as even as possible, none larger than five.
 
     It depends on nothing else, not on the machine: how many are trained side by side could change the last bits.
     """
-    n_groups = -(-policies // largest)
+    n_groups = -(-policies // 5)
     return [tuple(int(i) for i in part) for part in np.array_split(np.arange(policies), n_groups)]
