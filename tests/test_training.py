@@ -144,10 +144,16 @@ class Interrupting:
     """A progress that interrupts the whole foreground group, as Ctrl-C in a terminal does, and says who is in it."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        children = [child for of in Path("/proc/self/task").glob("*/children") for child in of.read_text().split()]
-        if not children:
+        begun = [
+            Path("/proc", child)
+            for of in Path("/proc/self/task").glob("*/children")
+            for child in of.read_text().split()
+        ]
+        # Not one that is just being forked.
+        workers = [child.name for child in begun if b"animat.execution.worker" in (child / "cmdline").read_bytes()]
+        if not workers:
             return
-        print(*(os.getpgid(int(child)) == os.getpgrp() for child in children), flush=True)
+        print(*(os.getpgid(int(worker)) == os.getpgrp() for worker in workers), flush=True)
         os.killpg(os.getpgrp(), signal.SIGINT)
 
 
