@@ -20,6 +20,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.training import train
 from animat.mapping import Thresholds
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.progress import Silent
 from animat.robots import Cartpole, Navigation
 from animat.training.folder import describe
 from animat.training.group import Group, split_groups, train_group
@@ -223,8 +224,11 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
     class Stop(Exception):
         pass
 
-    def stop(done: int, mean_return: float) -> None:
-        raise Stop
+    class Stopping:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            raise Stop
+
+    stop = Stopping()
 
     with pytest.raises(Stop):
         train_group(group, checkpoint, stop, checkpoint_s=0.0)
@@ -254,7 +258,7 @@ def weights_after(training: Training, timeline: SimulatorTimeline, checkpoint: P
     """The first layer of the first policy, trained in this process."""
     group = Group(training, (0,), timeline, "any", {})
     # Without a checkpoint, however slow the machine: the next training would go on from it.
-    policy = train_group(group, checkpoint, lambda done, mean_return: None, checkpoint_s=float("inf"))[0]
+    policy = train_group(group, checkpoint, Silent(), checkpoint_s=float("inf"))[0]
     return policy.weights[0].tobytes()
 
 

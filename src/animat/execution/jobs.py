@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 from animat.errors import AnimatError, InvalidArgument
@@ -39,19 +40,12 @@ class Job:
 def in_order(jobs: Sequence[Job]) -> list[Job]:
     """Jobs so that each comes after what it needs; first the one that the longest chain of others waits for."""
     by_name = {job.name: job for job in jobs}
-    waited_for: dict[str, list[str]] = {job.name: [] for job in jobs}
-    for job in jobs:
-        for need in job.needs:
-            waited_for[need].append(job.name)
-    urgency: dict[str, float] = {}
-
-    def urgent(name: str) -> float:
-        if name not in urgency:
-            urgency[name] = by_name[name].cost_s + max((urgent(other) for other in waited_for[name]), default=0.0)
-        return urgency[name]
-
+    waited_for_s = dict.fromkeys(by_name, 0.0)
+    for name in reversed([*TopologicalSorter({job.name: job.needs for job in jobs}).static_order()]):
+        for need in by_name[name].needs:
+            waited_for_s[need] = max(waited_for_s[need], by_name[name].cost_s + waited_for_s[name])
     # A job is always more urgent than what waits for it, as it takes some time itself.
-    return sorted(jobs, key=lambda job: -urgent(job.name))
+    return sorted(jobs, key=lambda job: -(job.cost_s + waited_for_s[job.name]))
 
 
 def expect_workers(workers: int | None, executor: Executor | None) -> None:

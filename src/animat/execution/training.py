@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from animat.errors import InvalidArgument
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Progress, Silent
+from animat.progress import Part, Progress, Silent
 from animat.robots.registry import register_robot
 from animat.training.folder import MANIFEST, describe, expect_trainable, groups_of, is_ours, write_description
 from animat.training.group import CHECKPOINT_S, Group, save_policies, train_group
@@ -132,18 +131,10 @@ def train_into(
         progress: told how far it is.
         checkpoint_s: seconds between checkpoints.
     """
-
-    def report(done: int, mean_return: float) -> None:
-        progress.update(done, CHUNKS, _note(mean_return))
-
-    policies = train_group(group, checkpoint, report, checkpoint_s=checkpoint_s)
+    policies = train_group(group, checkpoint, progress, checkpoint_s=checkpoint_s)
     files = save_policies(group, policies, folder)
     checkpoint.unlink(missing_ok=True)
     return files
-
-
-def _note(mean_return: float) -> str:
-    return "" if math.isnan(mean_return) else f"return {mean_return:.1f}"
 
 
 def _names(group: Group) -> str:
@@ -163,10 +154,7 @@ def _in_memory(groups: Sequence[Group], progress: Progress) -> dict[str, Policy]
     """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
     for number, group in enumerate(groups):
-
-        def report(done: int, mean_return: float, number: int = number) -> None:
-            progress.update(number * CHUNKS + done, len(groups) * CHUNKS, _note(mean_return))
-
-        policies = train_group(group, None, report)
+        part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
+        policies = train_group(group, None, part)
         trained |= {f"p{member}": policy for member, policy in zip(group.members, policies, strict=True)}
     return trained

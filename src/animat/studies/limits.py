@@ -9,7 +9,7 @@ from typing import Any, final
 from animat.animat import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
-from animat.progress import Progress
+from animat.progress import Part, Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
@@ -120,18 +120,17 @@ class Limit(StudyTask):
         for i, (environment, _) in cases.items():
             alike.setdefault(asked[i][0] if self.over_time else environment.n_actions is None, []).append(i)
         known = {} if self.over_time else {i: counted[i] for i in counted if asked[i] in _compared(study, first, last)}
-        told = _Told(progress, len(cases) + len(known))
+        steps = len(cases) + len(known)
         found: dict[int, Optimum] = {}
         for same in alike.values():
+            part = Part(progress, len(found), len(same), steps)
             best = best_returns(
-                [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=told
+                [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=part
             )
             found |= dict(zip(same, best, strict=True))
-            told.before += len(same)
-        for i, of in known.items():
+        for done, (i, of) in enumerate(known.items(), len(cases) + 1):
             found[i] = of.known(found[i], resolution=COARSER * resolution, seed=study.seed)
-            told.update(1, len(known), "how well it is known")
-            told.before += 1
+            progress.update(done, steps, "how well it is known")
         rows = [
             (kind.mapping, kind.percentiles, at, *_cells(found.get(i)), "; ".join(left_out.get(i, ())) or None)
             for i, (kind, at) in enumerate(asked)
@@ -158,11 +157,3 @@ def _cells(optimum: Optimum | None) -> tuple[float | int | None, ...]:
     told["best_return"] = told["value"]
     told["low_95"], told["high_95"] = (None, None) if interval is None else (interval.low, interval.high)
     return tuple(told[name] for name in HEAD[3:-1])
-
-
-class _Told:
-    def __init__(self, progress: Progress, n_cases: int) -> None:
-        self._progress, self._n_cases, self.before = progress, n_cases, 0
-
-    def update(self, done: float, total: float, note: str = "") -> None:
-        self._progress.update(self.before + done, self._n_cases, note)

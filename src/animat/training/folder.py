@@ -150,13 +150,7 @@ def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def groups_of(training: Training, timeline: SimulatorTimeline | None, manifest: dict[str, Any]) -> list[Group]:
-    """All policies of a training in groups, which can go to other processes.
-
-    Args:
-        training: what is trained.
-        timeline: the culture's simulators; None without neurons.
-        manifest: the description of both (`describe`).
-    """
+    """All policies of a training in groups, which can go to other processes; `manifest` describes both."""
     if timeline is not None:
         timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
     return [

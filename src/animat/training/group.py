@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,14 +19,11 @@ from animat.compilation import FAST_TO_COMPILE
 from animat.errors import InvalidFile
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress
 from animat.training.policy import Policy
 from animat.training.sac import SAC, Learner, begin, train_chunk
 from animat.training.specification import CHUNKS, Training
 from animat.writing import written_whole
-
-Report = Callable[[int, float], None]
-"""Told after each chunk how many are done, and the mean return of the episodes that ended in it (NaN for none)."""
-
 
 CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
@@ -51,7 +49,7 @@ class Group:
 
 
 def train_group(
-    group: Group, checkpoint: Path | None, report: Report, *, checkpoint_s: float = CHECKPOINT_S
+    group: Group, checkpoint: Path | None, progress: Progress, *, checkpoint_s: float = CHECKPOINT_S
 ) -> list[Policy]:
     """Train a group of policies, going on from its checkpoint where there is one.
 
@@ -61,7 +59,7 @@ def train_group(
         group: the policies to train.
         checkpoint: file to write now and then, complete or absent; the caller removes it when it is done with. None:
             none is written.
-        report: told after each chunk.
+        progress: told after each chunk how many are done, and the mean return of the episodes that ended in it.
         checkpoint_s: seconds between checkpoints; they change how much is done again, never the result.
 
     Raises:
@@ -81,7 +79,7 @@ def train_group(
         if checkpoint is not None and time.monotonic() - written > checkpoint_s:
             together.keep(checkpoint)
             written = time.monotonic()
-        report(index + 1, mean_return)
+        progress.update(index + 1, CHUNKS, "" if math.isnan(mean_return) else f"return {mean_return:.1f}")
     return together.policies()
 
 
