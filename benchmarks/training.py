@@ -254,7 +254,7 @@ def memory(folder: str) -> dict[str, Any]:
     """Peak resident memory of a worker that trains five policies, by the kernel's account of ended children."""
     import resource
 
-    from animat.training.trainer import train
+    from animat.execution.training import train
 
     train(training(5, 50_000), timeline(), folder, workers=1)
     of_worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
@@ -317,8 +317,8 @@ def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
     from animat.animat import Animat
     from animat.coding.mapping import mapping_named
     from animat.evaluation.rollouts import networks_of, roll_out
+    from animat.execution.training import train
     from animat.robots.cartpole import Cartpole
-    from animat.training.trainer import train
 
     culture = timeline()
     # Another seed, so that the first length is measured with programs compiled as all the others are.

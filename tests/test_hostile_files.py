@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidFile
+from animat.progress import Silent
 from animat.stimulation.protocol import read_protocol
 from animat.stimulation.selection import Selection
 from animat.training.group import Group, train_group
@@ -77,4 +78,4 @@ def test_a_checkpoint_that_unpacks_to_more_than_one_holds_is_not_read(tmp_path: 
     group = Group(SHORT, (0,), timeline_of(), "f", {})
     np.savez_compressed(tmp_path / "c.npz", fingerprint=np.array("f"), more=np.zeros(2**24))
     with pytest.raises(InvalidFile, match=r"c\.npz: expected a checkpoint of at most .* bytes, got 134,"):
-        train_group(group, tmp_path / "c.npz", lambda done, mean_return: None)
+        train_group(group, tmp_path / "c.npz", Silent())

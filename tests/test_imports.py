@@ -25,6 +25,7 @@ STORY = (
     "animat",
     "training",
     "evaluation",
+    "execution",
     "cultures",
     "closed_loop",
     "reality_gap",

@@ -19,6 +19,7 @@ from animat.coding.mapping import mapping_named
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
+from animat.execution.training import train
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.reading import read_recordings
@@ -27,7 +28,6 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.specification import Training
-from animat.training.trainer import train
 
 pytestmark = pytest.mark.oracle
 

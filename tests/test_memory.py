@@ -24,6 +24,7 @@ from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
+from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
@@ -45,7 +46,6 @@ from animat.studies.paper import paper_study
 from animat.studies.simulating import load_timeline, save_timeline
 from animat.studies.specification import Simulators
 from animat.training.specification import Training
-from animat.training.trainer import train
 from test_optimum import STEPS, Stairs, coins
 from test_responses import recording
 from test_simulator import responses_of

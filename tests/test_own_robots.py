@@ -21,13 +21,13 @@ from animat.closed_loop.contenders import HandMadeRule
 from animat.coding.mapping import Linear, Mapping, Thresholds, check_mapping
 from animat.errors import InvalidArgument
 from animat.evaluation.hand_made import HandMade
+from animat.execution.training import train
 from animat.robots import Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
 from animat.robots.grid import no_grid
 from animat.robots.registry import robot_named
 from animat.training.policy import load_policies
 from animat.training.specification import Training
-from animat.training.trainer import train
 from test_training import SMALL, Kept, timeline_of
 
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from animat.progress import Bar
+from animat.progress import Bar, Part
 
 SCRIPT = """
 from animat.progress import Bar
@@ -43,3 +43,24 @@ def test_nothing_is_drawn_where_there_is_no_terminal(capsys: pytest.CaptureFixtu
     with Bar("counting") as progress:
         progress.update(1, 2)
     assert capsys.readouterr() == ("", "")
+
+
+def test_parts_make_up_the_whole() -> None:
+    told: list[tuple[float, float, str]] = []
+
+    class Kept:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            told.append((done, total, note))
+
+    whole = Kept()
+    for before, units, note in ((0, 2, "first"), (2, 6, "")):
+        part = Part(whole, before, units, 8, note)
+        # Parts of parts, each in two steps.
+        for half in (0, 1):
+            within = Part(part, half, 1, 2)
+            within.update(1, 2)
+            within.update(2, 2, "done")
+    assert told == [
+        (0.5, 8, "first"), (1.0, 8, "done"), (1.5, 8, "first"), (2.0, 8, "done"),
+        (3.5, 8, ""), (5.0, 8, "done"), (6.5, 8, ""), (8.0, 8, "done"),
+    ]  # fmt: skip

@@ -21,6 +21,7 @@ import pytest
 from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
+from animat.execution.training import train
 from animat.recordings.made_up import write_made_up_series
 from animat.robots import (
     ROBOTS,
@@ -39,7 +40,6 @@ from animat.studies.specification import Body, Source, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training
-from animat.training.trainer import train
 from test_training import SMALL, timeline_of
 
 DOCS = Path(__file__).parents[1] / "docs" / "robots.md"

@@ -14,6 +14,8 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,8 +33,12 @@ from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
+from animat.execution.jobs import in_order
+from animat.execution.receipts import Receipt
+from animat.execution.task import carry_out
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
+from animat.progress import Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
@@ -41,10 +47,8 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.executor import Event, Executor
 from animat.studies.folder import describe_study, sums_of
 from animat.studies.identity import settle_identity
-from animat.studies.jobs import Job, Receipt, Report, Task, in_order, receipt_of, receipt_path
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file
@@ -297,9 +301,8 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
     study = Study(culture=Source(sessions=2, interval_min=2.0, presentations=2))
 
     def record(name: str) -> Receipt:
-        job = Job("record", Record(tmp_path))
-        made = job.task.run(study, tmp_path / name, lambda share, words: None)
-        return receipt_of(job, "study", tmp_path / name, made, {})
+        done = carry_out(Record(study, tmp_path), tmp_path / name, tmp_path / "told")
+        return Receipt("record", "study", {}, done.files)
 
     undisturbed = record("undisturbed")
     assert sorted(undisturbed.outputs) == [
@@ -329,7 +332,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
 
     state = tmp_path / "killed" / "recordings" / "culture.state"
     for damage in (state.unlink, lambda: state.write_bytes(b"damaged")):
-        undisturbed.save(tmp_path / "killed")
+        undisturbed.save(tmp_path / "killed" / "jobs")
         damage()
         assert record("killed") == undisturbed
 
@@ -368,14 +371,8 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path) ->
         made = make_up_recording(1, patterns=20, channels=channels)
         write_nwb(replace(made, start_min=minute), folder / "recordings" / recording_name(minute))
     study = Study(culture=Source("files", files=("recordings",)))
-    CulturePictures().run(study, folder, lambda share, words="": None)
+    CulturePictures(study).run(folder, Silent())
     assert sum(bool(row["channel"]) for row in rows(folder / "tables" / "culture-array.csv")) == 24
-
-
-def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
-    """Names of robots and conditions may hold dots, spaces and dashes."""
-    jobs = ["limit/cartpole/over-time", "limit/cartpole.over-time", "limit.cartpole/over-time"]
-    assert len({receipt_path(tmp_path, job) for job in jobs}) == 3
 
 
 def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
@@ -383,7 +380,7 @@ def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None
         write_nwb(make_up_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
     study = Study(culture=Source("files", files=("0.nwb", "1.nwb")))
     with pytest.raises(InvalidFile, match=r"two that would both be recording_1\.23457e"):
-        Record(tmp_path).run(study, tmp_path / "study", lambda share, words: None)
+        Record(study, tmp_path).run(tmp_path / "study", Silent())
 
 
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
@@ -405,26 +402,15 @@ class Halts(Executor):
 
     def __init__(self, after: int = 0) -> None:
         self._left = after
-        self._told: list[Event] = []
 
-    @property
-    def free(self) -> int:
-        return int(not self._told)
-
-    def start(self, job: Job, study: Study, folder: Path) -> None:
-        if self._left == 0:
-            self._told = [Event(job.name, "failed", words="halted")]
-            return
-        self._left -= 1
-        ran = job.task.run(study, folder, lambda share, words: None)
-        self._told = [Event(job.name, "done", files=tuple(str(file) for file in ran))]
-
-    def wait(self) -> list[Event]:
-        told, self._told = self._told, []
-        return told
-
-    def close(self) -> None:
-        """Nothing runs."""
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if self._left:
+            self._left -= 1
+            future.set_result(fn(*args, **kwargs))
+        else:
+            future.set_exception(AnimatError("halted"))
+        return future
 
 
 # --- the results ----------------------------------------------------------------------------------------------------
@@ -879,22 +865,22 @@ def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
         conditions=PAIR,
         comparisons=(moved, replace(moved, name="b", at_min=30.0)),
     )
-    Record(tmp_path).run(study, tmp_path / "study", lambda share, words: None)
-    kept, _ = Fit().run(study, tmp_path / "study", lambda share, words: None)
+    Record(study, tmp_path).run(tmp_path / "study", Silent())
+    kept, _ = Fit(study).run(tmp_path / "study", Silent())
     (told,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
     assert told.sentence == "before and after was asked for at 29 min and is made on the recording at 30 min"
     with pytest.raises(InvalidArgument, match="at_min"):
-        Fit().run(replace(study, comparisons=(replace(moved, at_min=99.0),)), tmp_path / "study", lambda s, w: None)
+        Fit(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
 
 
 def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> None:
     write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     one = Study(culture=Source("files", files=("made",)), simulators=Simulators(conditions="all"))
-    Record(tmp_path).run(one, tmp_path / "study", lambda share, words: None)
+    Record(one, tmp_path).run(tmp_path / "study", Silent())
     with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more .* got one \(all\)"):
-        Fit().run(one, tmp_path / "study", lambda share, words: None)
+        Fit(one).run(tmp_path / "study", Silent())
     knowing = replace(one, simulators=Simulators(conditions="all", allow=("one-condition",)))
-    kept, _ = Fit().run(knowing, tmp_path / "study", lambda share, words: None)
+    kept, _ = Fit(knowing).run(tmp_path / "study", Silent())
     assert len(load_timeline(kept).conditions) == 1
 
 
@@ -922,24 +908,16 @@ def test_a_missing_file_is_told_in_one_line(tmp_path: Path, capsys: pytest.Captu
     assert not (tmp_path / "out").exists()
 
 
+def test_the_specifications_on_the_page_are_read(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
+    blocks = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        (tmp_path / "study.toml").write_text(block)
+        assert read_study(tmp_path / "study.toml").conditions
+
+
 # --- jobs -----------------------------------------------------------------------------------------------------------
-
-
-class Nothing(Task):
-    """Does nothing."""
-
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        return []
-
-
-def test_jobs_come_after_what_they_need_and_long_chains_first() -> None:
-    jobs = [
-        Job("short", Nothing(), (), 1.0),
-        Job("end", Nothing(), ("long",), 5.0),
-        Job("long", Nothing(), (), 2.0),
-        Job("middle", Nothing(), (), 4.0),
-    ]
-    assert [job.name for job in in_order(jobs)] == ["long", "end", "middle", "short"]
 
 
 def test_every_need_of_a_plan_is_a_job_of_it() -> None:
@@ -951,37 +929,15 @@ def test_every_need_of_a_plan_is_a_job_of_it() -> None:
             assert set(job.needs) <= set(names[:place]), job.name
 
 
-class HereAndNow(Executor):
-    """Runs jobs in this process: another engine needs no more than this."""
-
-    def __init__(self) -> None:
-        self._told: list[Event] = []
-
-    @property
-    def free(self) -> int:
-        return int(not self._told)
-
-    def start(self, job: Job, study: Study, folder: Path) -> None:
-        ran = job.task.run(study, folder, lambda share, words: None)
-        self._told = [Event(job.name, "done", files=tuple(str(file) for file in ran))]
-
-    def wait(self) -> list[Event]:
-        told, self._told = self._told, []
-        return told
-
-    def close(self) -> None:
-        """Nothing runs."""
-
-
 def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
     write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     study = Study(culture=Source("files", files=("made",)), simulators=Simulators(kind="empirical"))
     folder = tmp_path / "study"
-    copies = Record(tmp_path).run(study, folder, lambda share, words: None)
+    copies = Record(study, tmp_path).run(folder, Silent())
     assert [path.name for path in copies] == ["recording_0000_min.nwb", "recording_0030_min.nwb"]
     for copy in copies:
         assert read_recording(copy).equals(read_recording(tmp_path / "made" / copy.name))
-    kept, responses = Fit().run(study, folder, lambda share, words: None)
+    kept, responses = Fit(study).run(folder, Silent())
     timeline = load_timeline(kept)
     fitted = fit_timeline(extract_series(read_recordings(tmp_path / "made")), kind="empirical")
     for one, other in zip(jax.tree.leaves(timeline.simulators), jax.tree.leaves(fitted.simulators), strict=True):
@@ -1002,7 +958,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
         policies=1,
         paper=False,
     )
-    ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=HereAndNow())
+    ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
     assert len(ran.done_now) == ran.jobs
     page = ran.report.read_text()
     assert "The study compares no conditions" in page

@@ -18,6 +18,7 @@ from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.statistics import holm
 from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline
+from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.robots import Navigation
@@ -33,11 +34,6 @@ from animat.studies.specification import Body, Compared, Source, Study, StudyCon
 from animat.studies.tabulating import References, Tabulate
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
-
-
-def told(share: float, words: str) -> None:
-    """Progress that nobody reads."""
-
 
 # --- which side is better -------------------------------------------------------------------------------------------
 
@@ -74,7 +70,7 @@ def compared_returns(folder: Path, *comparisons: Compared) -> list[dict[str, Any
         limit = {"mapping": "none", "percentiles": "moving", "at_min": 0.0, "best_return": 20.0, "grid_error": 0.1}
         limit |= {"monte_carlo": 20.0, "standard_error": 0.1, "without_clock": 20.0, "left_out": None}
         write_table(limits_file(folder, body.name), LIMIT_HEAD, [[limit.get(name, 0.0) for name in LIMIT_HEAD]])
-    Tabulate().run(study, folder, told)
+    Tabulate(study).run(folder, Silent())
     return read_table(table_file(folder, "comparisons"))
 
 
@@ -119,8 +115,13 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
         actions="drawn",
     )
     (body,) = study.robots
-    for task in (Record(tmp_path), Fit(), TrainGroup(body, condition, (0, 1)), Evaluate(body, condition)):
-        task.run(study, tmp_path, told)
+    for task in (
+        Record(study, tmp_path),
+        Fit(study),
+        TrainGroup(study, body, condition, (0, 1)),
+        Evaluate(study, body, condition),
+    ):
+        task.run(tmp_path, Silent())
     got = read_table(episodes_file(tmp_path, body, condition))
 
     timeline = fit_timeline(extract_series(read_recordings(tmp_path / "recordings")))
@@ -157,13 +158,13 @@ FEW = Study(
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("few")
-    Record(folder).run(FEW, folder, told)
-    Fit().run(FEW, folder, told)
+    Record(FEW, folder).run(folder, Silent())
+    Fit(FEW).run(folder, Silent())
     return folder
 
 
 def limits_of(folder: Path, name: str = "limits") -> list[dict[str, Any]]:
-    (file,) = Limit(FEW.robots[0], over_time=name == "over-time").run(FEW, folder, told)
+    (file,) = Limit(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
     assert file == limits_file(folder, "navigation", name)
     return read_table(file)
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,15 @@ import pytest
 
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.progress import Silent
 from animat.robots import Cartpole, Navigation
+from animat.training.folder import describe
 from animat.training.group import Group, split_groups, train_group
 from animat.training.policy import Policy
 from animat.training.sac import SAC
 from animat.training.specification import CHUNKS, Training
-from animat.training.trainer import describe, train
 from animat.writing import alone_in
 from test_simulator import responses_of
 
@@ -65,6 +68,17 @@ def test_the_same_seed_gives_the_same_bits_with_any_number_of_workers(tmp_path: 
     assert not (tmp_path / "one" / ".unfinished").exists()
 
 
+def test_it_runs_on_another_executor_which_stays_open(tmp_path: Path) -> None:
+    seven = replace(SHORT, policies=7, iterations=500)
+    with ThreadPoolExecutor(2) as executor:
+        trained = train(seven, timeline_of(), tmp_path / "lent", executor=executor)
+        assert executor.submit(len, trained).result() == 7
+    assert not (tmp_path / "lent" / ".unfinished").exists()
+    alone = train(seven, timeline_of(), None)
+    for name, policy in trained.items():
+        np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
+
+
 def test_policies_differ_from_each_other_and_from_those_of_another_seed(tmp_path: Path) -> None:
     weights = [
         policy.weights[0].tobytes()
@@ -78,7 +92,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from test_training import SHORT, timeline_of
-from animat.training.trainer import train
+from animat.execution.training import train
 train(SHORT, timeline_of(), Path(sys.argv[1]), checkpoint_s=0.0)
 """
 
@@ -86,7 +100,7 @@ train(SHORT, timeline_of(), Path(sys.argv[1]), checkpoint_s=0.0)
 def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_path: Path) -> None:
     train(SHORT, timeline_of(), tmp_path / "undisturbed")
     folder = tmp_path / "killed"
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     checkpoint = folder / ".unfinished" / "from-p0.npz"
     seen = set()
     for _ in range(2):
@@ -121,7 +135,7 @@ import signal, sys
 from pathlib import Path
 # A process that was started in the background ignores the keyboard; this one is to feel it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from animat.training.trainer import train
+from animat.execution.training import train
 from test_training import SHORT, Interrupting, replace, timeline_of
 train(replace(SHORT, policies=7, iterations=10_000_000), timeline_of(), Path(sys.argv[1]), progress=Interrupting())
 """
@@ -131,13 +145,21 @@ class Interrupting:
     """A progress that interrupts the whole foreground group, as Ctrl-C in a terminal does, and says who is in it."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-        print(*(os.getpgid(int(child)) == os.getpgrp() for child in children), flush=True)
+        begun = [
+            Path("/proc", child)
+            for of in Path("/proc/self/task").glob("*/children")
+            for child in of.read_text().split()
+        ]
+        # Not one that is just being forked.
+        workers = [child.name for child in begun if b"animat.execution.worker" in (child / "cmdline").read_bytes()]
+        if not workers:
+            return
+        print(*(os.getpgid(int(worker)) == os.getpgrp() for worker in workers), flush=True)
         os.killpg(os.getpgrp(), signal.SIGINT)
 
 
 def test_an_interrupt_from_the_keyboard_does_not_reach_the_workers(tmp_path: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(
         [sys.executable, "-c", WATCHED, str(tmp_path)],
         env=environment,
@@ -202,8 +224,11 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
     class Stop(Exception):
         pass
 
-    def stop(done: int, mean_return: float) -> None:
-        raise Stop
+    class Stopping:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            raise Stop
+
+    stop = Stopping()
 
     with pytest.raises(Stop):
         train_group(group, checkpoint, stop, checkpoint_s=0.0)
@@ -233,7 +258,7 @@ def weights_after(training: Training, timeline: SimulatorTimeline, checkpoint: P
     """The first layer of the first policy, trained in this process."""
     group = Group(training, (0,), timeline, "any", {})
     # Without a checkpoint, however slow the machine: the next training would go on from it.
-    policy = train_group(group, checkpoint, lambda done, mean_return: None, checkpoint_s=float("inf"))[0]
+    policy = train_group(group, checkpoint, Silent(), checkpoint_s=float("inf"))[0]
     return policy.weights[0].tobytes()
 
 
@@ -328,6 +353,8 @@ def test_neurons_and_mapping_come_together(tmp_path: Path) -> None:
         train(replace(SHORT, mapping=None), timeline_of(), tmp_path)
     with pytest.raises(InvalidArgument, match="workers"):
         train(SHORT, timeline_of(), tmp_path, workers=0)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(InvalidArgument, match="workers: expected none beside"):
+        train(SHORT, timeline_of(), tmp_path, workers=1, executor=executor)
 
 
 def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:

@@ -1,65 +1,105 @@
-"""Tasks that go wrong or grow, for workers in other processes to import."""
+"""Tasks and calls that go wrong, grow or wait, for workers in other processes to import."""
 
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from animat.errors import InvalidFile
-from animat.studies.jobs import Report, Task
-from animat.studies.specification import Study
+from animat.errors import InvalidFile, UnsafeStimulus
+from animat.execution.task import Task
+from animat.progress import Progress
 
 HELD: list[bytearray] = []
 
 
+def tell_process(holds_mib: int = 0) -> tuple[int, list[int]]:
+    """The process and the cores that it may use; afterwards it holds so much memory."""
+    print("a library that talks")
+    HELD.append(bytearray(os.urandom(1024)) * 1024 * holds_mib)
+    return os.getpid(), sorted(os.sched_getaffinity(0))
+
+
+def refuse(limit: str) -> None:
+    """Raise an error that is made of other arguments than its message."""
+    raise UnsafeStimulus(limit, "too much")
+
+
+def rest(seconds: float) -> float:
+    """Take so long."""
+    time.sleep(seconds)
+    return seconds
+
+
+def die() -> None:
+    """End its process."""
+    os._exit(7)
+
+
+class Sized(Task):
+    """Its memory grows with something."""
+
+    @property
+    def grows_with(self) -> dict[str, object]:
+        return {"policies": 10, "culture.channels": 256}
+
+
 @dataclass(frozen=True)
-class TellProcess(Task):
-    """Leaves a file named after the process that ran it, which afterwards holds so much memory."""
+class Join(Sized):
+    """Leaves a file of its name in brackets, around what the files of others hold.
 
-    holds_mib: int = 0
+    Attributes:
+        log: file that is told when it began, and when it ended.
+    """
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        print("a library that talks")
-        HELD.append(bytearray(os.urandom(1024)) * 1024 * self.holds_mib)
-        report(0.5, "half")
-        path = folder / f"{os.getpid()}"
-        path.write_text(str(sorted(os.sched_getaffinity(0))))
+    name: str
+    of: tuple[str, ...] = ()
+    log: Path | None = None
+    takes_s: float = 0.0
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        held = "".join((folder / other).read_text() for other in self.of)
+        progress.update(1, 2, "half")
+        self._say("begins")
+        time.sleep(self.takes_s)
+        path = folder / self.name
+        path.write_text(f"({self.name}{held})")
+        self._say("ends")
         return [path]
 
+    def _say(self, what: str) -> None:
+        if self.log is not None:
+            with self.log.open("a") as file:
+                file.write(f"{self.name} {what}\n")
 
-@dataclass(frozen=True)
-class Die(Task):
+
+class Die(Sized):
     """Ends its process."""
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
         os._exit(7)
 
 
-@dataclass(frozen=True)
-class Fail(Task):
+class Fail(Sized):
     """Fails with an error that says why."""
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
         raise InvalidFile("a.nwb: expected a recording, got none")
 
 
-@dataclass(frozen=True)
-class Stumble(Task):
+class Stumble(Sized):
     """Fails with an error that nobody foresaw."""
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
         raise TypeError("expected an int, got a float\nand so on")
 
 
-@dataclass(frozen=True)
-class Starve(Task):
+class Starve(Sized):
     """Asks numpy for more memory than any machine has."""
 
-    grows_with = ("policies", "culture.channels")
-
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
         np.zeros(2**58, np.uint8)
         return []

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from animat.evaluation.statistics import compare as compare
     from animat.evaluation.table import Evaluation as Evaluation
     from animat.evaluation.table import evaluate as evaluate
+    from animat.execution.training import train as train
     from animat.neurons.memory import fit_memory as fit_memory
     from animat.neurons.simulator import NeuronSimulator as NeuronSimulator
     from animat.neurons.simulator import fit_empirical as fit_empirical
@@ -79,7 +80,6 @@ if TYPE_CHECKING:
     from animat.training.policy import load_policies as load_policies
     from animat.training.sac import SAC as SAC
     from animat.training.specification import Training as Training
-    from animat.training.trainer import train as train
 
 _WHERE = {
     "recordings.recording": ("Recording", "Channels"),
@@ -108,7 +108,7 @@ _WHERE = {
     "animat": ("Animat", "WithoutNeurons"),
     "training.sac": ("SAC",),
     "training.specification": ("Training",),
-    "training.trainer": ("train",),
+    "execution.training": ("train",),
     "training.policy": ("Policy", "load_policies"),
     "evaluation.table": ("Evaluation", "evaluate"),
     "evaluation.optimum": ("Optimum", "best_return", "best_returns"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copyreg
 import re
+from typing import Any
 
 
 class AnimatError(Exception):
@@ -15,6 +17,10 @@ class AnimatError(Exception):
     """
 
     is_admitted = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Not made again by its arguments, which are others than its message: it goes from process to process.
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class InvalidArgument(AnimatError, ValueError):

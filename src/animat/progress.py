@@ -21,6 +21,20 @@ class Silent:
         """Ignore the report."""
 
 
+class Part:
+    """A part of longer work, as a progress: so many units of the whole's total, after those before it.
+
+    Where the part itself says nothing, `note` is said.
+    """
+
+    def __init__(self, whole: Progress, before: float, units: float, total: float, note: str = "") -> None:
+        self._whole, self._before, self._units, self._total, self._note = whole, before, units, total, note
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        """Move the whole on by as much."""
+        self._whole.update(self._before + self._units * done / total, self._total, note or self._note)
+
+
 class Bar:
     """A progress bar on standard error, with the time left; nothing is drawn where that is not a terminal.
 

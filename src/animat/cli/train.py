@@ -81,7 +81,8 @@ class Train(Fitting):
             delivery=self.delivery,
             commands=robot.baseline_commands if mapping == "none" else None,
         )
-        from animat.training.trainer import expect_folder_for, expect_trainable, is_finished, train
+        from animat.execution.training import train
+        from animat.training.folder import expect_folder_for, expect_trainable, is_finished
 
         expect_trainable(training, is_saved=True)
         expect_folder_for(training, self.out)

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from animat.cultures.base import Culture
 from animat.cultures.same_culture import other_patterns
-from animat.cultures.series import PartOfSeries, check_interval, difference_from
+from animat.cultures.series import check_interval, difference_from
 from animat.errors import InvalidArgument, Mismatch
-from animat.progress import Progress, Silent
+from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -99,7 +99,7 @@ def record_in_held_folder(
                 missed_min.append(session * interval_min)
                 continue
             culture.rest(max(0.0, due_s - culture.now_s))
-            part = PartOfSeries(progress, session, sessions, file.name)
+            part = Part(progress, session, 1, sessions, file.name)
             write_nwb(culture.record(protocol, seed * 10_000 + session, part), file)
         progress.update(session + 1, sessions, file.name)
     return LivingSeries([file for file in files if file.exists()], missed_min)

@@ -13,7 +13,7 @@ import numpy as np
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
-from animat.progress import Progress, Silent
+from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -102,7 +102,7 @@ def _record(
             culture.save_state(folder / STATE_FILE, sessions=0)
         for session in range(recorded, sessions):
             culture.rest(max(0.0, 60 * session * interval_min - culture.now_s))
-            part = PartOfSeries(progress, session, sessions, files[session].name)
+            part = Part(progress, session, 1, sessions, files[session].name)
             recording = culture.record(protocol, _seed(culture, session), part)
             if files[session].exists():
                 _expect_equal(files[session], recording)
@@ -232,13 +232,3 @@ def _parsed(words: str) -> Any:
         return json.loads(words)
     except ValueError:
         return words
-
-
-class PartOfSeries:
-    """The progress of one session as a part of the series'."""
-
-    def __init__(self, whole: Progress, session: int, sessions: int, note: str) -> None:
-        self._whole, self._session, self._sessions, self._note = whole, session, sessions, note
-
-    def update(self, done: float, total: float, note: str = "") -> None:
-        self._whole.update(self._session + done / total, self._sessions, note or self._note)

@@ -21,8 +21,8 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
+from animat.training.folder import expect_trainable
 from animat.training.specification import Training
-from animat.training.trainer import expect_trainable
 from animat.writing import LOCK
 
 LOG_FILE = "live.log"

@@ -34,10 +34,9 @@ from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Protocol
-from animat.training.group import Group, split_groups
+from animat.training.folder import describe, groups_of
 from animat.training.policy import Policy
 from animat.training.specification import Training
-from animat.training.trainer import describe
 from animat.writing import alone_in
 
 _POLL_S = 0.1
@@ -196,7 +195,7 @@ class _Run:
         if timeline is None:
             raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
         exchange.publish(0, float(timeline.start_min[-1]), _newest(timeline))
-        groups = self._groups(timeline)
+        groups = groups_of(self._training, timeline, describe(self._training, timeline))
         with Trainers(groups, exchange, self.folder / POLICIES) as trainers:
             self.write("training", policies=self._training.policies, processes=len(groups))
             try:
@@ -291,15 +290,6 @@ class _Run:
         # All are fitted again, so that they have one shape.
         timeline = fit_timeline(series, kind=self._kind)
         return timeline.with_first_percentiles() if self._training.percentiles == "first" else timeline
-
-    def _groups(self, timeline: SimulatorTimeline) -> list[Group]:
-        timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
-        manifest = describe(self._training, timeline)
-        provenance = {key: value for key, value in manifest.items() if key not in ("sources", "recorded_at_min")}
-        return [
-            Group(self._training, members, timeline, manifest["fingerprint"], provenance)
-            for members in split_groups(self._training.policies)
-        ]
 
     def _note(self, swaps: Sequence[dict[str, Any]]) -> None:
         for swap in swaps:

@@ -11,12 +11,13 @@ from animat.evaluation.controls import controls_of
 from animat.evaluation.rollouts import Actor, Episodes, Networks, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress
 from animat.studies.draws import draw_seed
-from animat.studies.jobs import Report, Task
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, policies_folder, write_table
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.task import StudyTask
 from animat.studies.training import training_of
 from animat.training.policy import Policy
 
@@ -25,16 +26,16 @@ HEAD = ("at_min", "actor", "episode", "return", "iterations", "ended")
 
 @final
 @dataclass(frozen=True)
-class Evaluate(Task):
+class Evaluate(StudyTask):
     """Run a condition's policies at the minutes of its comparisons, at every recording, and once for their paths."""
 
-    grows_with = ("policies", "episodes", "episodes_over_time")
+    sizes = ("policies", "episodes", "episodes_over_time")
 
     body: Body
     condition: StudyCondition
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        study, timeline = as_recorded(study, folder)
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        study, timeline = as_recorded(self.study, folder)
         setting = setting_of(study, self.body, self.condition, timeline)
         networks = _networks(study, folder, self.body, self.condition)
         robot, slug, n = self.body.name, self.condition.slug, study.policies
@@ -47,7 +48,7 @@ class Evaluate(Task):
         if self.condition.through_neurons and timeline is not None:
             over_time = []
             for i, at_min in enumerate(timeline.start_min.tolist()):
-                report(i / len(timeline), "over time")
+                progress.update(i, len(timeline), "over time")
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
                 means = setting.run(networks, n, at_min, study.episodes_over_time, seed).returns.mean(axis=1)
                 over_time += [(at_min, f"p{i}", mean) for i, mean in enumerate(means.tolist())]
@@ -69,20 +70,20 @@ class Evaluate(Task):
 
 @final
 @dataclass(frozen=True)
-class Control(Task):
+class Control(StudyTask):
     """Run the controls of a mapping on a robot: random, constant, made by hand; and silent and shuffled with policies.
 
     Attributes:
         plain: condition that gives the mapping; the one whose policies are used, if it is trained as usual.
     """
 
-    grows_with = ("policies", "episodes", "episodes_over_time")
+    sizes = ("policies", "episodes", "episodes_over_time")
 
     body: Body
     plain: StudyCondition
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        study, timeline = as_recorded(study, folder)
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        study, timeline = as_recorded(self.study, folder)
         condition, robot = replace(self.plain, delivery="chosen"), self.body.name
         setting = setting_of(study, self.body, condition, timeline)
         name = f"controls-{condition.mapping}" + ("-held" if condition.percentiles == "first" else "")
@@ -91,7 +92,7 @@ class Control(Task):
         first, last = first_minute(timeline), last_minute(timeline)
         minutes = study.limit_minutes(first, last) if condition.through_neurons else [last]
         for i, at_min in enumerate(minutes):
-            report(i / len(minutes), f"at {at_min:g} min")
+            progress.update(i, len(minutes), f"at {at_min:g} min")
             answering = setting.simulator(at_min)
             for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
                 seed, n = draw_seed(study.seed, robot, name, at_min, each.name), each.n_actors

@@ -13,8 +13,8 @@ from typing import Any
 
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.execution.receipts import sha256
 from animat.recordings.formats.csv import stimuli_beside
-from animat.studies.jobs import sha256
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml

@@ -9,13 +9,14 @@ from typing import Any, final
 from animat.animat import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
+from animat.progress import Part, Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
-from animat.studies.jobs import Report, Task
 from animat.studies.places import limits_file, read_table, write_table
 from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.task import StudyTask
 
 HEAD = (
     "mapping",
@@ -70,7 +71,7 @@ def left_out(study: Study) -> list[str]:
 
 @final
 @dataclass(frozen=True)
-class Limit(Task):
+class Limit(StudyTask):
     """The best possible return on a robot for every mapping of the study, of conditions with enough responses.
 
     Of a robot without a grid the table is empty.
@@ -80,16 +81,16 @@ class Limit(Task):
             at the minutes that anything is evaluated at.
     """
 
-    grows_with = ("limit_resolution", "limit_episodes")
+    sizes = ("limit_resolution", "limit_episodes")
 
     body: Body
     over_time: bool = False
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
         file = limits_file(folder, self.body.name, "over-time" if self.over_time else "limits")
         if no_grid(self.body.robot()) is not None:
             return [write_table(file, HEAD, [])]
-        study, timeline = as_recorded(study, folder)
+        study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         kinds, minutes = kinds_of(study), study.limit_minutes(first, last)
         resolution, episodes = self.body.limit_resolution or study.limit_resolution, study.limit_episodes
@@ -119,18 +120,17 @@ class Limit(Task):
         for i, (environment, _) in cases.items():
             alike.setdefault(asked[i][0] if self.over_time else environment.n_actions is None, []).append(i)
         known = {} if self.over_time else {i: counted[i] for i in counted if asked[i] in _compared(study, first, last)}
-        told = _Told(report, len(cases) + len(known))
+        steps = len(cases) + len(known)
         found: dict[int, Optimum] = {}
         for same in alike.values():
+            part = Part(progress, len(found), len(same), steps)
             best = best_returns(
-                [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=told
+                [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=part
             )
             found |= dict(zip(same, best, strict=True))
-            told.before += len(same)
-        for i, of in known.items():
+        for done, (i, of) in enumerate(known.items(), len(cases) + 1):
             found[i] = of.known(found[i], resolution=COARSER * resolution, seed=study.seed)
-            told.update(1, len(known), "how well it is known")
-            told.before += 1
+            progress.update(done, steps, "how well it is known")
         rows = [
             (kind.mapping, kind.percentiles, at, *_cells(found.get(i)), "; ".join(left_out.get(i, ())) or None)
             for i, (kind, at) in enumerate(asked)
@@ -157,11 +157,3 @@ def _cells(optimum: Optimum | None) -> tuple[float | int | None, ...]:
     told["best_return"] = told["value"]
     told["low_95"], told["high_95"] = (None, None) if interval is None else (interval.low, interval.high)
     return tuple(told[name] for name in HEAD[3:-1])
-
-
-class _Told:
-    def __init__(self, report: Report, n_cases: int) -> None:
-        self._report, self._n_cases, self.before = report, n_cases, 0
-
-    def update(self, done: float, total: float, note: str = "") -> None:
-        self._report((self.before + done) / self._n_cases, note)

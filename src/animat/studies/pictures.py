@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress
 from animat.recordings.reading import read_recordings
 from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
@@ -38,7 +39,6 @@ from animat.studies.figure_tables import (
     write_learning,
     write_psth,
 )
-from animat.studies.jobs import Report, Task
 from animat.studies.limits import kinds_of, limits_of_all
 from animat.studies.places import (
     RECORDINGS,
@@ -50,6 +50,7 @@ from animat.studies.places import (
 from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.tabulating import TRAINED, References, named_mapping, performances
+from animat.studies.task import StudyTask
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,11 +58,11 @@ if TYPE_CHECKING:
 
 @final
 @dataclass(frozen=True)
-class CulturePictures(Task):
+class CulturePictures(StudyTask):
     """Draw the first recording, and the series; write their numbers beside."""
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        series = read_series(study, folder)
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        series = read_series(self.study, folder)
         first = read_recordings(folder / RECORDINGS)[0]
         responses = series[0]
         to_ms = max(50.0, 2 * responses.window_ms[1])
@@ -79,7 +80,7 @@ class CulturePictures(Task):
             write_bursts(folder, series),
             write_conditions(folder, series),
         ]
-        report(0.3, "first recording")
+        progress.update(0.3, 1, "first recording")
         if first.channels.has_positions:
             figures["array"] = draw_array(first)
             tables.append(write_array(folder, first))
@@ -88,12 +89,12 @@ class CulturePictures(Task):
             figures["over-time"] = draw_responses_over_time(series, 0)
             figures["drift"] = draw_drift(series)
             tables.append(write_drift(folder, drift_of(series)))
-        return tables + _save(folder, "culture", figures, report)
+        return tables + _save(folder, "culture", figures, progress)
 
 
 @final
 @dataclass(frozen=True)
-class RobotPictures(Task):
+class RobotPictures(StudyTask):
     """Draw learning, comparisons, the course over the recordings, controls, paths and frames of one robot.
 
     The numbers of what no other table holds are written beside: learning with its intervals, and the course.
@@ -101,9 +102,9 @@ class RobotPictures(Task):
 
     body: Body
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
         robot, name = self.body.robot(), self.body.name
-        study, timeline = as_recorded(study, folder)
+        study, timeline = as_recorded(self.study, folder)
         last = last_minute(timeline)
         known = References(study, folder, self.body)
         figures: dict[str, Figure] = {}
@@ -122,7 +123,7 @@ class RobotPictures(Task):
             drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
             figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
             tables.append(write_courses(folder, name, courses))
-        report(0.2, "controls")
+        progress.update(0.2, 1, "controls")
         figures["controls"] = draw_controls(_controls(folder, self.body), f"{name}: controls")
         paths = {condition.name: _paths(folder, self.body, condition) for condition in study.conditions}
         lacks = lacking(robot)
@@ -132,13 +133,13 @@ class RobotPictures(Task):
         if "draw" not in lacks:
             middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
             figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each condition")
-        return tables + _save(folder, name, figures, report)
+        return tables + _save(folder, name, figures, progress)
 
 
-def _save(folder: Path, of: str, figures: Mapping[str, Figure], report: Report) -> list[Path]:
+def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progress) -> list[Path]:
     files = []
     for i, (name, figure) in enumerate(figures.items()):
-        report(0.3 + 0.7 * i / len(figures), name)
+        progress.update(0.3 + 0.7 * i / len(figures), 1, name)
         files += [save_figure(figure, folder / "figures" / f"{of}-{name}.{ending}") for ending in FORMATS]
     return files
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
+from animat.execution.task import UNFINISHED
 from animat.studies.specification import Body, StudyCondition
 from animat.writing import written_whole
 
@@ -15,8 +16,7 @@ RECORDINGS = "recordings"
 TIMELINE = "simulators/timeline.safetensors"
 RESPONSES = "simulators/responses.csv"
 REPORT = "report.html"
-UNFINISHED = ".unfinished"
-"""For checkpoints; gone when the study is finished."""
+RECEIPTS = "jobs"
 OWN_FOLDERS = (
     RECORDINGS,
     "simulators",
@@ -26,7 +26,7 @@ OWN_FOLDERS = (
     "limits",
     "tables",
     "figures",
-    "jobs",
+    RECEIPTS,
     UNFINISHED,
 )
 """All that a study makes in its folder, beside the report, the specification and its description."""

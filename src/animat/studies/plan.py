@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from animat.studies.jobs import Job
+from animat.execution.jobs import Job
 from animat.studies.specification import Body, Study, StudyCondition
 
 ITERATIONS_PER_S = 110_000
 """Of training on one core, all policies of a group together; only the order of jobs and the time left rest on it."""
-
-LARGEST_GROUP = 5
 
 
 def plan_study(study: Study, base: Path) -> list[Job]:
@@ -35,29 +33,29 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     if study.needs_neurons:
         sessions = study.culture.sessions
         jobs += [
-            Job(JOB, Record(base), (), 2 + (2.5 if study.culture.kind == "virtual" else 0.3) * sessions),
-            Job("fit", Fit(), (JOB,), 3),
-            Job("pictures/culture", CulturePictures(), (JOB, "fit"), 15),
+            Job(JOB, Record(study, base), (), 2 + (2.5 if study.culture.kind == "virtual" else 0.3) * sessions),
+            Job("fit", Fit(study), (JOB,), 3),
+            Job("pictures/culture", CulturePictures(study), (JOB, "fit"), 15),
         ]
         neurons = ("fit",)
     for body in study.robots:
         for condition in study.conditions:
             needs = neurons if condition.through_neurons else ()
             groups = []
-            for members in split_groups(study.policies, LARGEST_GROUP):
+            for members in split_groups(study.policies):
                 groups.append(f"train/{body.name}/{condition.slug}/p{members[0]}")
                 trained = body.trained_for * len(members) / ITERATIONS_PER_S if condition.trained else 0.0
-                jobs.append(Job(groups[-1], TrainGroup(body, condition, members), needs, 4 + trained))
+                jobs.append(Job(groups[-1], TrainGroup(study, body, condition, members), needs, 4 + trained))
             # Its minute is the last recording's, also without neurons.
             needs = (*groups, *neurons)
-            jobs.append(Job(f"evaluate/{body.name}/{condition.slug}", Evaluate(body, condition), needs, 4))
+            jobs.append(Job(f"evaluate/{body.name}/{condition.slug}", Evaluate(study, body, condition), needs, 4))
         jobs += _beside(study, body, neurons)
         results = [job.name for job in jobs if job.name.split("/")[1:2] == [body.name]]
-        jobs.append(Job(f"pictures/{body.name}", RobotPictures(body), (*results, *neurons, "tables"), 15))
+        jobs.append(Job(f"pictures/{body.name}", RobotPictures(study, body), (*results, *neurons, "tables"), 15))
     everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "limit", "train")]
-    jobs.append(Job("tables", Tabulate(), (*everything, *neurons), 2))
+    jobs.append(Job("tables", Tabulate(study), (*everything, *neurons), 2))
     pictures = [job.name for job in jobs if job.name.startswith("pictures/")]
-    jobs.append(Job("report", Publish(), (*pictures, "tables"), 1))
+    jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1))
     return jobs
 
 
@@ -70,16 +68,14 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
     jobs = []
     for kind in kinds_of(study):
         plain = plain_condition(study, kind)
-        groups = [
-            f"train/{body.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies, LARGEST_GROUP)
-        ]
+        groups = [f"train/{body.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies)]
         name = f"controls/{body.name}/{kind.mapping}" + ("-held" if kind.percentiles == "first" else "")
-        jobs.append(Job(name, Control(body, plain), (*groups, *neurons), 6))
+        jobs.append(Job(name, Control(study, body, plain), (*groups, *neurons), 6))
     resolution = body.limit_resolution or study.limit_resolution
     cost_s = 40 * resolution ** len(body.robot().quantities) + 10
-    jobs.append(Job(f"limit/{body.name}", Limit(body), neurons, cost_s))
+    jobs.append(Job(f"limit/{body.name}", Limit(study, body), neurons, cost_s))
     if neurons:
-        jobs.append(Job(f"limit/{body.name}/over-time", Limit(body, over_time=True), neurons, 12))
+        jobs.append(Job(f"limit/{body.name}/over-time", Limit(study, body, over_time=True), neurons, 12))
     return jobs
 
 

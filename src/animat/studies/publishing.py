@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, final
 
 from animat.evaluation.statistics import p_of_u
+from animat.progress import Progress
 from animat.report.html import Picture, Section, Table, write_page
 from animat.report.style import FORMATS
 from animat.stimulation.protocol import Presentation
@@ -16,7 +17,6 @@ from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
 from animat.studies.heuristic import not_outperforming
-from animat.studies.jobs import Report, Task
 from animat.studies.learned import as_good_as_the_limit_allows, learned_of
 from animat.studies.places import REPORT, RESPONSES, read_table, table_file
 from animat.studies.shown import (
@@ -30,15 +30,16 @@ from animat.studies.shown import (
 )
 from animat.studies.specification import Study
 from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL
+from animat.studies.task import StudyTask
 
 
 @final
 @dataclass(frozen=True)
-class Publish(Task):
+class Publish(StudyTask):
     """Write the report."""
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        manifest = json.loads((folder / MANIFEST).read_text())
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        study, manifest = self.study, json.loads((folder / MANIFEST).read_text())
         sections = [_short(study, folder), _scores(study, folder)]
         if study.needs_neurons:
             sections.append(_culture(study, folder))

@@ -8,41 +8,43 @@ from typing import final
 
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
 from animat.errors import InvalidFile
+from animat.execution.receipts import Receipt
+from animat.progress import Progress
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.folder import source_files
 from animat.studies.identity import settle_identity
-from animat.studies.jobs import Receipt, Report, Task
-from animat.studies.places import RECORDINGS
+from animat.studies.places import RECEIPTS, RECORDINGS
 from animat.studies.specification import Study
+from animat.studies.task import StudyTask
 
 JOB = "record"
 
 
 @final
 @dataclass(frozen=True)
-class Record(Task):
+class Record(StudyTask):
     """Make the recordings, as NWB.
 
     Attributes:
         base: what a specification's file names are relative to.
     """
 
-    grows_with = ("culture.presentations", "culture.pulses", "culture.channels")
+    sizes = ("culture.presentations", "culture.pulses", "culture.channels")
 
     base: Path
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
         out = folder / RECORDINGS
         _remove_changed(folder)
-        files = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[study.culture.kind](
-            study, out, _Told(report)
-        )
+        kind = self.study.culture.kind
+        make = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[kind]
+        files = make(self.study, out, progress)
         for file in files:
             settle_identity(file)
-        kept = (SELECTION_FILE, STATE_FILE) if study.culture.kind == "virtual" else ()
+        kept = (SELECTION_FILE, STATE_FILE) if kind == "virtual" else ()
         return [*files, *(out / name for name in kept)]
 
-    def _copies(self, study: Study, out: Path, progress: _Told) -> list[Path]:
+    def _copies(self, study: Study, out: Path, progress: Progress) -> list[Path]:
         from animat.recordings.reading import read_recordings
 
         copies: list[Path] = []
@@ -61,12 +63,12 @@ class Record(Task):
 
 def _remove_changed(folder: Path) -> None:
     """Remove recordings that are no longer as they were left: nobody else can tell, as they may still be good ones."""
-    receipt = Receipt.load(folder, JOB)
+    receipt = Receipt.load(folder / RECEIPTS, JOB)
     for name in () if receipt is None else receipt.changed(folder):
         (folder / name).unlink(missing_ok=True)
 
 
-def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
+def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     from animat.cultures.virtual import VirtualCulture
     from animat.stimulation.protocol import Protocol
 
@@ -83,7 +85,7 @@ def _virtual(study: Study, out: Path, progress: _Told) -> list[Path]:
     )
 
 
-def _made_up(study: Study, out: Path, progress: _Told) -> list[Path]:
+def _made_up(study: Study, out: Path, progress: Progress) -> list[Path]:
     from animat.recordings.made_up import write_made_up_series
 
     culture = study.culture
@@ -96,13 +98,3 @@ def _made_up(study: Study, out: Path, progress: _Told) -> list[Path]:
         patterns=culture.presentations,
         channels=culture.channels,
     )
-
-
-class _Told:
-    """A progress that reports."""
-
-    def __init__(self, report: Report) -> None:
-        self._report = report
-
-    def update(self, done: float, total: float, note: str = "") -> None:
-        self._report(done / total, note)

@@ -16,6 +16,7 @@ from animat.neurons.fidelity import Fidelity
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
 from animat.responses.condition import Condition
@@ -23,9 +24,9 @@ from animat.responses.conditions import conditions_named
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Presentation
-from animat.studies.jobs import Report, Task
 from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE, write_table
 from animat.studies.specification import Study
+from animat.studies.task import StudyTask
 from animat.writing import written_whole
 
 _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator, MemorySimulator)}
@@ -33,14 +34,14 @@ _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulato
 
 @final
 @dataclass(frozen=True)
-class Fit(Task):
+class Fit(StudyTask):
     """Read the responses of all recordings and fit a simulator to each."""
 
-    grows_with = ("culture.sessions", "culture.presentations", "simulators.bins")
+    sizes = ("culture.sessions", "culture.presentations", "simulators.bins")
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        study, settings = self.study, self.study.simulators
         series = read_series(study, folder)
-        settings = study.simulators
         timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
         if len(timeline.conditions) < 2 and "one-condition" not in settings.allow:
             raise UnusableData(

@@ -14,10 +14,10 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import bracket_findings
 from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
+from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.heuristic import HEAD, rows_beside_heuristic
-from animat.studies.jobs import Report, Task
 from animat.studies.limits import HEAD as LIMITS
 from animat.studies.limits import kinds_of, left_out, limits_of_all
 from animat.studies.paper import PRINTED
@@ -31,6 +31,7 @@ from animat.studies.places import (
 )
 from animat.studies.places import write_table as write
 from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.task import StudyTask
 from animat.training.policy import Policy
 
 LEVEL = 0.01
@@ -113,11 +114,11 @@ CURVES = ("robot", "condition", "policy", "iterations", "episodes", "mean_return
 
 @final
 @dataclass(frozen=True)
-class Tabulate(Task):
+class Tabulate(StudyTask):
     """Write `tables/`: scores, comparisons, controls, heuristic, learning-curves, limits, controllability, findings."""
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
-        study, timeline = as_recorded(study, folder)
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         files: list[Path] = []
 

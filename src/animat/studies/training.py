@@ -2,56 +2,49 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 from animat.coding.mapping import mapping_named
+from animat.execution.task import UNFINISHED
+from animat.execution.training import train_into
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress
 from animat.studies.draws import draw_seed
-from animat.studies.jobs import Report, Task
-from animat.studies.places import TIMELINE, UNFINISHED, policies_folder
+from animat.studies.places import TIMELINE, policies_folder
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Body, Study, StudyCondition
-from animat.training.group import Group, train_group, untrained_policies
+from animat.studies.task import StudyTask
+from animat.training.folder import describe, provenance_of, write_description
+from animat.training.group import Group, save_policies, untrained_policies
 from animat.training.sac import SAC
-from animat.training.specification import CHUNKS, Training
-from animat.training.trainer import MANIFEST, describe, provenance_of
-from animat.writing import written_whole
+from animat.training.specification import Training
 
 
 @final
 @dataclass(frozen=True)
-class TrainGroup(Task):
+class TrainGroup(StudyTask):
     """Train some policies of a condition on a robot, going on from where a killed run stopped."""
 
-    grows_with = ("algorithm",)
+    sizes = ("algorithm",)
 
     body: Body
     condition: StudyCondition
     members: tuple[int, ...]
 
-    def run(self, study: Study, folder: Path, report: Report) -> list[Path]:
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
         timeline = timeline_for(self.condition, folder)
-        training = training_of(study, self.body, self.condition)
+        training = training_of(self.study, self.body, self.condition)
         manifest = describe(training, timeline)
         out = policies_folder(folder, self.body, self.condition)
         group = Group(training, self.members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / self.body.name / self.condition.slug / f"p{self.members[0]}.npz"
-
-        def told(done: int, mean_return: float) -> None:
-            report(done / CHUNKS, "" if math.isnan(mean_return) else f"return {mean_return:.1f}")
-
-        policies = train_group(group, checkpoint, told) if self.condition.trained else untrained_policies(group)
-        files = [out / f"p{member}.safetensors" for member in self.members]
-        for file, policy in zip(files, policies, strict=True):
-            policy.save(file)
-        with written_whole(out / MANIFEST) as beside:
-            beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
-        checkpoint.unlink(missing_ok=True)
-        return [*files, out / MANIFEST]
+        if self.condition.trained:
+            files = train_into(out, group, checkpoint, progress)
+        else:
+            files = save_policies(group, untrained_policies(group), out)
+        return [*files, write_description(out, manifest)]
 
 
 def training_of(study: Study, body: Body, condition: StudyCondition) -> Training:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,14 +19,11 @@ from animat.compilation import FAST_TO_COMPILE
 from animat.errors import InvalidFile
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Progress
 from animat.training.policy import Policy
 from animat.training.sac import SAC, Learner, begin, train_chunk
 from animat.training.specification import CHUNKS, Training
 from animat.writing import written_whole
-
-Report = Callable[[int, float], None]
-"""Told after each chunk how many are done, and the mean return of the episodes that ended in it (NaN for none)."""
-
 
 CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
@@ -51,7 +49,7 @@ class Group:
 
 
 def train_group(
-    group: Group, checkpoint: Path | None, report: Report, *, checkpoint_s: float = CHECKPOINT_S
+    group: Group, checkpoint: Path | None, progress: Progress, *, checkpoint_s: float = CHECKPOINT_S
 ) -> list[Policy]:
     """Train a group of policies, going on from its checkpoint where there is one.
 
@@ -61,7 +59,7 @@ def train_group(
         group: the policies to train.
         checkpoint: file to write now and then, complete or absent; the caller removes it when it is done with. None:
             none is written.
-        report: told after each chunk.
+        progress: told after each chunk how many are done, and the mean return of the episodes that ended in it.
         checkpoint_s: seconds between checkpoints; they change how much is done again, never the result.
 
     Raises:
@@ -81,13 +79,21 @@ def train_group(
         if checkpoint is not None and time.monotonic() - written > checkpoint_s:
             together.keep(checkpoint)
             written = time.monotonic()
-        report(index + 1, mean_return)
+        progress.update(index + 1, CHUNKS, "" if math.isnan(mean_return) else f"return {mean_return:.1f}")
     return together.policies()
 
 
 def untrained_policies(group: Group) -> list[Policy]:
     """A group's policies as they are before their first iteration: what training is compared with."""
     return SideBySide(group).policies()
+
+
+def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> list[Path]:
+    """Write a group's policies by their numbers in the training; returns the files."""
+    files = [folder / f"p{member}.safetensors" for member in group.members]
+    for file, policy in zip(files, policies, strict=True):
+        policy.save(file)
+    return files
 
 
 def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -212,15 +218,14 @@ def _bytes_of(leaves: list[Any]) -> int:
     return sum(leaf.nbytes for leaf in leaves)
 
 
-def split_groups(policies: int, largest: int = 5, *, fewest: int = 1) -> list[tuple[int, ...]]:
-    """Cut the numbers of the policies into groups as even as possible, none larger than `largest`.
+def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:
+    """Cut the numbers of the policies into groups as even as possible, none larger than five.
 
     It depends on nothing else, not on the machine: how many are trained side by side could change the last bits.
 
     Args:
         policies: how many there are.
-        largest: a group's policies at most.
         fewest: groups at least, where there are as many policies: two keep two cores busy.
     """
-    n_groups = max(-(-policies // largest), min(fewest, policies))
+    n_groups = max(-(-policies // 5), min(fewest, policies))
     return [tuple(int(i) for i in part) for part in np.array_split(np.arange(policies), n_groups)]

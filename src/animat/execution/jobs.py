@@ -1,0 +1,171 @@
+"""Jobs: tasks by name, each with what must be done before it; those that are not done yet are run, all at once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+from animat.errors import AnimatError, InvalidArgument
+from animat.execution.pinned import PinnedProcesses
+from animat.execution.receipts import Receipt, receipt_path
+from animat.execution.task import UNFINISHED, Done, Task, carry_out, memory_of, told
+from animat.progress import Progress
+
+_LOOK_EVERY_S = 0.2
+
+
+@dataclass(frozen=True)
+class Job:
+    """A task with a name, what must be done before it, and how long it takes.
+
+    Attributes:
+        name: such as `train/cartpole/1-threshold/p0`.
+        task: what it does.
+        needs: names of the jobs whose files it reads.
+        cost_s: about how many seconds of one core it takes, for the order of jobs and the time left.
+    """
+
+    name: str
+    task: Task
+    needs: tuple[str, ...] = ()
+    cost_s: float = 1.0
+
+
+def in_order(jobs: Sequence[Job]) -> list[Job]:
+    """Jobs so that each comes after what it needs; first the one that the longest chain of others waits for."""
+    by_name = {job.name: job for job in jobs}
+    waited_for_s = dict.fromkeys(by_name, 0.0)
+    for name in reversed([*TopologicalSorter({job.name: job.needs for job in jobs}).static_order()]):
+        for need in by_name[name].needs:
+            waited_for_s[need] = max(waited_for_s[need], by_name[name].cost_s + waited_for_s[name])
+    # A job is always more urgent than what waits for it, as it takes some time itself.
+    return sorted(jobs, key=lambda job: -(job.cost_s + waited_for_s[job.name]))
+
+
+def expect_workers(workers: int | None, executor: Executor | None) -> None:
+    """Refuse fewer workers than one, and any beside an executor (InvalidArgument)."""
+    if workers is not None and workers < 1:
+        raise InvalidArgument(f"workers: expected at least 1, got {workers}")
+    if workers is not None and executor is not None:
+        raise InvalidArgument(f"workers: expected none beside an executor, which has its own, got {workers}")
+
+
+class Jobs:
+    """The jobs of a folder: which are done, by their receipts, and running the others.
+
+    Args:
+        jobs: all of them.
+        folder: where their files are.
+        receipts: the folder of their receipts.
+        fingerprint: of the study or training; a receipt of another one counts for nothing.
+
+    Raises:
+        InvalidFile: if a receipt cannot be read.
+    """
+
+    def __init__(self, jobs: Sequence[Job], folder: Path, receipts: Path, fingerprint: str) -> None:
+        self._folder, self._receipts, self._fingerprint = folder, receipts, fingerprint
+        self._done: dict[str, Receipt] = {}
+        self.waiting = [job for job in in_order(jobs) if not self._is_done(job)]
+        """Those that are not done, the most urgent first."""
+
+    def run(self, *, workers: int | None, executor: Executor | None, progress: Progress) -> dict[str, float]:
+        """Run the jobs that are not done; the first that fails ends all.
+
+        Args:
+            workers: processes, each on a core of its own; None: one a core. Not with an executor.
+            executor: where tasks are run, in view of the folder; it stays open. None: processes on this machine.
+            progress: told how far it is, and what runs.
+
+        Returns:
+            The processor seconds of each job that was run.
+
+        Raises:
+            AnimatError: if a job failed; its message names the job.
+        """
+        notices = self._folder / UNFINISHED / "told"
+        # Of a run that was killed.
+        shutil.rmtree(notices, ignore_errors=True)
+        total_s = sum(job.cost_s for job in self.waiting)
+        running: dict[Future[Done], Job] = {}
+        cpu_s: dict[str, float] = {}
+
+        def tell() -> None:
+            done_s, parts = total_s - sum(job.cost_s for job in self.waiting), []
+            for job in running.values():
+                share, words = told(receipt_path(notices, job.name)) or (0.0, None)
+                done_s -= job.cost_s * (1 - share)
+                if words is not None:
+                    parts.append(f"{job.name} {100 * share:.0f} % {words}".strip())
+            n_jobs = len(self._done) + len(running) + len(self.waiting)
+            note = f"{len(self._done)} of {n_jobs} jobs; {'; '.join(parts)}" if parts else ""
+            progress.update(done_s, total_s, note)
+
+        with _running_on(executor, workers, running) as at:
+            while self.waiting or running:
+                for job in [job for job in self.waiting if self._has_needs(job)]:
+                    self.waiting.remove(job)
+                    # What it needs may have been made again, with the same bytes as before.
+                    if not self._is_done(job):
+                        notice = receipt_path(notices, job.name)
+                        running[at.submit(carry_out, job.task, self._folder, notice)] = job
+                tell()
+                for future in wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done:
+                    done = _done(future, running[future])
+                    job = running.pop(future)
+                    receipt = Receipt(job.name, self._fingerprint, self._inputs(job), done.files)
+                    receipt.save(self._receipts)
+                    self._done[job.name] = receipt
+                    cpu_s[job.name] = done.cpu_s
+        tell()
+        return cpu_s
+
+    def _is_done(self, job: Job) -> bool:
+        """Whether a job has a receipt, on inputs as they are now, for files as they are now."""
+        receipt = Receipt.load(self._receipts, job.name) if self._has_needs(job) else None
+        is_ours = receipt is not None and (receipt.study, receipt.inputs) == (self._fingerprint, self._inputs(job))
+        if receipt is None or not is_ours or receipt.changed(self._folder):
+            return False
+        self._done[job.name] = receipt
+        return True
+
+    def _has_needs(self, job: Job) -> bool:
+        return all(need in self._done for need in job.needs)
+
+    def _inputs(self, job: Job) -> dict[str, str]:
+        return {need: self._done[need].digest for need in job.needs}
+
+
+@contextmanager
+def _running_on(executor: Executor | None, workers: int | None, running: dict[Future[Done], Job]) -> Iterator[Executor]:
+    """The executor that was lent, or processes of ours; if the block fails, nothing goes on after it."""
+    if executor is None:
+        with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours:
+            yield ours
+        return
+    try:
+        yield executor
+    except BaseException:
+        # The folder is let go of only when nobody writes to it any more.
+        wait([future for future in running if not future.cancel()])
+        raise
+
+
+def _done(future: Future[Done], job: Job) -> Done:
+    try:
+        return future.result()
+    except AnimatError as error:
+        error.args = (f"{job.name}: {error}",)
+        raise
+    except Exception as error:
+        # The executor's: of a process that ended, or a machine that is lost.
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise AnimatError(
+            f"{job.name}: {words} (is there memory enough? {memory_of(job.task)}); start again to go on"
+        ) from error

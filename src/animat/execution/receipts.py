@@ -1,0 +1,83 @@
+"""Receipts: that a job is done, on which inputs, and which files it left."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from animat.errors import InvalidFile
+from animat.writing import written_whole
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """That a job is done: of which study, from which receipts, and which files it left.
+
+    Attributes:
+        job: its name.
+        study: fingerprint of the study or training that it is part of.
+        inputs: digest of the receipt of each job it needed.
+        outputs: SHA-256 of each file, by its place in the folder.
+    """
+
+    job: str
+    study: str
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+
+    @property
+    def digest(self) -> str:
+        """Stands for all of it."""
+        return hashlib.sha256(self._text().encode()).hexdigest()
+
+    def _text(self) -> str:
+        words: dict[str, Any] = {"job": self.job, "study": self.study, "inputs": self.inputs, "outputs": self.outputs}
+        return json.dumps(words, indent=1, sort_keys=True) + "\n"
+
+    def save(self, receipts: Path) -> None:
+        """Write it into a folder of receipts, after all files are there."""
+        with written_whole(receipt_path(receipts, self.job)) as beside:
+            beside.write_text(self._text())
+
+    def changed(self, folder: Path) -> list[str]:
+        """The files that are not in the folder any more as they were left."""
+        return [name for name, sum_ in self.outputs.items() if not _is_file_of(folder / name, sum_)]
+
+    @staticmethod
+    def load(receipts: Path, job: str) -> Receipt | None:
+        """The receipt of a job; None where there is none.
+
+        Raises:
+            InvalidFile: if it cannot be read.
+        """
+        path = receipt_path(receipts, job)
+        if not path.exists():
+            return None
+        try:
+            words = json.loads(path.read_text())
+            return Receipt(words["job"], words["study"], words["inputs"], words["outputs"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InvalidFile(f"{path}: expected a job's receipt, got a file that cannot be read; remove it") from error
+
+
+def receipt_path(receipts: Path, job: str) -> Path:
+    """Where a job's receipt lies."""
+    # A sign that no name holds: of two jobs none may have the other's.
+    return receipts / f"{job.replace('/', '+')}.json"
+
+
+def sha256(path: Path) -> str:
+    """Of a file's contents."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_file_of(path: Path, sum_: str) -> bool:
+    try:
+        return sha256(path) == sum_
+    except OSError:
+        return False

@@ -1,0 +1,106 @@
+"""Tasks: picklable pieces of work in a folder, and what becomes of one wherever it is carried out."""
+
+from __future__ import annotations
+
+import abc
+import json
+import time
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from animat.errors import AnimatError, out_of_memory
+from animat.execution.receipts import sha256
+from animat.progress import Progress
+
+UNFINISHED = ".unfinished"
+"""Of a folder: checkpoints, and what tasks tell while they run; gone when everything is done."""
+
+
+class Task(abc.ABC):
+    """A piece of work: a picklable value without any state, which is carried out in any process."""
+
+    @property
+    @abc.abstractmethod
+    def grows_with(self) -> Mapping[str, object]:
+        """The settings that its memory grows with, and what they are."""
+
+    @abc.abstractmethod
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        """Do it and return the files that it left, each written whole; done again, they are the same bytes.
+
+        Args:
+            folder: in which all its files are.
+            progress: told how far it is.
+        """
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came of a task: SHA-256 of each file that it left, by its place in the folder; processor seconds."""
+
+    files: dict[str, str]
+    cpu_s: float
+
+
+def carry_out(task: Task, folder: Path, notice: Path) -> Done:
+    """Run a task, which tells in a file how far it is (`told`): what an executor is handed, in whatever process.
+
+    Raises:
+        AnimatError: if it fails; in one line, also where nobody foresaw it.
+    """
+
+    progress = _Notice(notice)
+    progress.update(0, 1)
+    began_s = time.process_time()
+    try:
+        files = sorted(task.run(folder, progress))
+    except AnimatError:
+        raise
+    except Exception as error:
+        memory = out_of_memory(error)
+        raise AnimatError(_unforeseen(error) if memory is None else f"{memory}: {memory_of(task)}") from error
+    sums = {file.relative_to(folder).as_posix(): sha256(file) for file in files}
+    return Done(sums, time.process_time() - began_s)
+
+
+class _Notice:
+    """A progress in a file, which is whole whenever it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        tell(self._path, (done / total, note))
+
+
+def tell(path: Path, words: Any) -> None:
+    """Put something into a file for other processes to see (`told`); where that cannot be written, no work is lost."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_suffix(".new")
+        beside.write_text(json.dumps(words))
+        beside.replace(path)
+
+
+def told(path: Path) -> Any:
+    """What was told last (`tell`); None if nothing was."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def memory_of(task: Task) -> str:
+    """What memory is needed for, as a sentence's end."""
+    settings = ", ".join(f"{name} ({value!r})" for name, value in task.grows_with.items())
+    return f"it grows with {settings}: ask for less, or use a machine with more memory"
+
+
+def _unforeseen(error: Exception) -> str:
+    lines = str(error).strip().splitlines() or ["no more is known"]
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {lines[0]} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"

@@ -1,0 +1,160 @@
+"""Training of several policies: groups of them as tasks, into a folder that can be gone on with."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from animat.errors import InvalidArgument
+from animat.execution.jobs import Job, Jobs, expect_workers
+from animat.execution.task import UNFINISHED, Task
+from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Part, Progress, Silent
+from animat.robots.registry import register_robot
+from animat.training.folder import MANIFEST, describe, expect_trainable, groups_of, is_ours, write_description
+from animat.training.group import CHECKPOINT_S, Group, save_policies, train_group
+from animat.training.policy import Policy
+from animat.training.specification import CHUNKS, Training
+from animat.writing import alone_in, clear_away
+
+
+def train(
+    training: Training,
+    timeline: SimulatorTimeline | None,
+    folder: str | os.PathLike[str] | None,
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    checkpoint_s: float = CHECKPOINT_S,
+    sources: Sequence[str] = (),
+) -> dict[str, Policy]:
+    """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which says what they are.
+
+    Stopped at any moment, also by SIGKILL, and called again, it goes on from the last chunk and ends in the same bits
+    as if it had not been stopped, with any number of workers. On a finished folder it reads the policies and returns.
+
+    Args:
+        training: what is trained.
+        timeline: the culture's simulators; None for a training without neurons.
+        folder: where the policies go; made where it is missing. None: nowhere; they are trained in this process, and
+            a training that is stopped begins anew. So can robots that are not registered, and mappings of one's own,
+            which no file can name.
+        workers: processes to use, each pinned to a core of its own; None: as many as there are cores. Not with an
+            executor.
+        executor: where groups of policies are trained, in view of the folder; it stays open. None: processes on this
+            machine.
+        progress: told how far it is.
+        checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
+        sources: names of the recordings, for the manifest.
+
+    Returns:
+        The policies by name, `p0` first.
+
+    Raises:
+        InvalidArgument: if neurons are missing for a mapping or given without one, for fewer workers than one or any
+            beside an executor, or as `expect_trainable` does.
+        Mismatch: if the folder holds another training, or another run is at work in it.
+        InvalidFile: if a file cannot be read or written.
+        AnimatError: if a process that trains ends before its time.
+    """
+    if (timeline is None) != (training.mapping is None):
+        raise InvalidArgument(
+            "timeline: expected the culture's simulators with a mapping, and None without, got "
+            f"{'none' if timeline is None else 'some'} with mapping {training.mapping and training.mapping.name}"
+        )
+    expect_workers(workers, executor)
+    expect_trainable(training, is_saved=folder is not None)
+    progress = progress or Silent()
+    training = training.over(timeline)
+    manifest = describe(training, timeline, sources)
+    groups = groups_of(training, timeline, manifest, fewest=2)
+    if folder is None:
+        return _in_memory(groups, progress)
+    folder = Path(folder).absolute()
+    # Seen before it is touched: somebody else's folder stays as it is.
+    is_ours(folder, manifest)
+    with alone_in(folder):
+        if not is_ours(folder, manifest):
+            write_description(folder, manifest)
+        left = [
+            Job(_names(group), TrainGroup(group, checkpoint_s), cost_s=CHUNKS * len(group.members))
+            for group in groups
+            if not _is_trained(group, folder)
+        ]
+        if left:
+            jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
+            jobs.run(workers=workers, executor=executor, progress=progress)
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
+            clear_away(leftover)
+    return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TrainGroup(Task):
+    """Train a group of policies, going on from its checkpoint.
+
+    Attributes:
+        group: what is trained.
+        checkpoint_s: seconds between checkpoints.
+    """
+
+    group: Group
+    checkpoint_s: float
+
+    @property
+    def grows_with(self) -> dict[str, object]:
+        return {"algorithm": self.group.training.algorithm}
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        register_robot(type(self.group.training.robot))
+        checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
+        return train_into(folder, self.group, checkpoint, progress, checkpoint_s=self.checkpoint_s)
+
+
+def train_into(
+    folder: Path, group: Group, checkpoint: Path, progress: Progress, *, checkpoint_s: float = CHECKPOINT_S
+) -> list[Path]:
+    """Train a group of policies, going on from its checkpoint; returns their files.
+
+    Args:
+        folder: for the policies.
+        group: what is trained.
+        checkpoint: file to write now and then; gone at the end.
+        progress: told how far it is.
+        checkpoint_s: seconds between checkpoints.
+    """
+    policies = train_group(group, checkpoint, progress, checkpoint_s=checkpoint_s)
+    files = save_policies(group, policies, folder)
+    checkpoint.unlink(missing_ok=True)
+    return files
+
+
+def _names(group: Group) -> str:
+    first, last = group.members[0], group.members[-1]
+    return f"p{first}" if first == last else f"p{first} to p{last}"
+
+
+def _is_trained(group: Group, folder: Path) -> bool:
+    for member in group.members:
+        path = folder / f"p{member}.safetensors"
+        if not path.exists() or Policy.load(path).provenance.get("fingerprint") != group.fingerprint:
+            return False
+    return True
+
+
+def _in_memory(groups: Sequence[Group], progress: Progress) -> dict[str, Policy]:
+    """Train the groups in this process, one after the other."""
+    trained: dict[str, Policy] = {}
+    for number, group in enumerate(groups):
+        part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
+        policies = train_group(group, None, part)
+        trained |= {f"p{member}": policy for member, policy in zip(group.members, policies, strict=True)}
+    return trained

@@ -1,0 +1,62 @@
+"""A process that does what it is told on one core: `python -m animat.execution.worker CPU`, of `PinnedProcesses`.
+
+Calls come pickled on standard input, from the process that started it; what they return or raise goes out so too.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import pickle
+import signal
+import sys
+from typing import BinaryIO
+
+
+def main() -> int:
+    """Answer calls until standard input ends."""
+    answers = settle_on(int(sys.argv[1]))
+
+    from animat.compilation import keep_compilations
+
+    keep_compilations()
+    while True:
+        try:
+            work: bytes = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return 0
+        pickle.dump(answer(work), answers)
+        answers.flush()
+
+
+def answer(work: bytes) -> bytes:
+    """Pickled: what a call returned, and no error; or nothing, and the error."""
+    try:
+        function, args, kwargs = pickle.loads(work)
+        return pickle.dumps((function(*args, **kwargs), None))
+    except Exception as error:
+        return pickle.dumps((None, error))
+
+
+def settle_on(core: int) -> BinaryIO:
+    """Make this process a worker: on one core, without an accelerator, and gone when the one that started it is.
+
+    To be called before JAX or BLAS are loaded.
+
+    Returns:
+        Where answers go: what libraries and robots print goes to standard error from now on.
+    """
+    # They size their threads by the cores they may use, and one pinned core beats two shared ones.
+    os.sched_setaffinity(0, {core})
+    # Networks of 64 units keep a core busy and no GPU, and workers, one a core, would all take the same one.
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    # However the parent ends, the kernel then kills this process.
+    PR_SET_PDEATHSIG = 1
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return answers
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+"""Parts of a study as tasks, each of which leaves files that follow from the study and from the jobs it needs."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import ClassVar
+
+from animat.execution.task import Task
+from animat.progress import Progress
+from animat.studies.specification import Study
+
+
+@dataclass(frozen=True)
+class StudyTask(Task):
+    """A task that is told what to do by a study's specification.
+
+    Attributes:
+        study: the specification.
+    """
+
+    sizes: ClassVar[tuple[str, ...]] = ("policies", "episodes")
+    """Settings of the study that its memory grows with."""
+
+    study: Study
+
+    @property
+    def grows_with(self) -> dict[str, object]:
+        return {name: attrgetter(name)(self.study) for name in self.sizes}
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        for body in self.study.robots:
+            body.robot()  # It registers one that is imported, for policies to be loaded.
+        return self.make(folder, progress)
+
+    @abc.abstractmethod
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        """Do it, as `Task.run`, with all robots of the study registered."""

@@ -1,0 +1,161 @@
+"""A training's folder: whose it is, by a description of all that decides how its policies come out."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from animat.coding.mapping import check_mapping, expect_loadable_mapping
+from animat.differences import first_difference
+from animat.errors import InvalidFile, Mismatch
+from animat.neurons.timeline import SimulatorTimeline
+from animat.robots.checking import check_robot
+from animat.robots.registry import expect_loadable_robot
+from animat.training.group import Group, split_groups
+from animat.training.specification import Training
+from animat.writing import written_whole
+
+MANIFEST = "training.json"
+_NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
+"""Where a folder is another training's: they differ with the responses."""
+
+
+def expect_trainable(training: Training, *, is_saved: bool) -> None:
+    """Refuse, before the first iteration, what cannot be trained, or could not be loaded once it is.
+
+    Args:
+        training: what is to be trained.
+        is_saved: whether its policies go to files.
+
+    Raises:
+        InvalidArgument: naming what of the robot or the mapping was expected, what came, and what can be done.
+    """
+    check_robot(training.robot)
+    if training.mapping is not None:
+        check_mapping(training.mapping)
+    if is_saved:
+        expect_loadable_robot(training.robot, in_workers=True)
+        if training.mapping is not None:
+            expect_loadable_mapping(training.mapping)
+
+
+def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
+    """What decides how policies come out, as plain data, with a fingerprint over all of it."""
+    manifest: dict[str, Any] = {
+        "training": training.to_dict(),
+        "simulators": None if timeline is None else _described(timeline),
+        "versions": {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")},
+    }
+    # By way of JSON, in which a tuple and a list are the same.
+    manifest = json.loads(json.dumps(manifest))
+    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode())
+    for leaf in jax.tree.leaves(timeline.simulators if timeline else ()):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    # Names of files are told but do not decide: the same recordings in another place are the same.
+    return manifest | {"sources": list(sources), "fingerprint": digest.hexdigest()}
+
+
+def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
+    """Where the simulators came from, as far as it is not the responses themselves."""
+    return {
+        **timeline.fitted,
+        "conditions": [condition.label for condition in timeline.conditions],
+        "window_ms": timeline.window_ms,
+        "presentation": None if timeline.presentation is None else str(timeline.presentation),
+        "recorded_at_min": timeline.start_min.tolist(),
+    }
+
+
+def expect_folder_for(training: Training, folder: Path) -> None:
+    """Refuse a folder of another training by its settings, which are known before any recording is read.
+
+    Raises:
+        Mismatch, InvalidFile: as `train` does.
+    """
+    if (found := _description_in(folder)) is not None:
+        as_long_as_recordings = training.duration_min is None and training.mapping is not None
+        unknown = ("simulators", "sources", "fingerprint", *(("duration_min",) if as_long_as_recordings else ()))
+        if difference := _first_difference(found, describe(training, None), unknown):
+            raise _of_another(folder, difference)
+
+
+def is_finished(training: Training, folder: Path) -> bool:
+    """Whether a training's folder has all of its policies."""
+    return (folder / MANIFEST).exists() and all(
+        (folder / f"p{i}.safetensors").exists() for i in range(training.policies)
+    )
+
+
+def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
+    """Make a folder this training's."""
+    with written_whole(folder / MANIFEST) as beside:
+        beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+    return folder / MANIFEST
+
+
+def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
+    """Whether the training is already in the folder; not if it is free for it.
+
+    Raises:
+        Mismatch: if it is another training's, or holds policies that no description tells of.
+        InvalidFile: if its description cannot be read, or it is a file.
+    """
+    found = _description_in(folder)
+    if found is not None and found["fingerprint"] != manifest["fingerprint"]:
+        raise _of_another(folder, _first_difference(found, manifest, _NOT_TOLD) or "other responses")
+    return found is not None
+
+
+def _description_in(folder: Path) -> dict[str, Any] | None:
+    """What a folder says it holds; None if it is free."""
+    path = folder / MANIFEST
+    if path.exists():
+        try:
+            found: dict[str, Any] = json.loads(path.read_text())
+            _ = found["fingerprint"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
+        return found
+    if folder.exists() and not folder.is_dir():
+        raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
+    if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
+        raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
+    return None
+
+
+def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
+    # What follows from the robot, such as the usual iterations, is not what differs.
+    there, now = (each.get("training", {}).get("robot", {}).get("name") for each in (found, manifest))
+    return first_difference(there, now, "training.robot.name") or first_difference(found, manifest, ignoring=ignoring)
+
+
+def _of_another(folder: Path, difference: str) -> Mismatch:
+    return Mismatch(
+        f"{folder}: expected a folder of this training, got one of another ({difference}); "
+        "give another folder, or remove this one"
+    )
+
+
+def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
+    """What of a training's description its policies carry: all that decides how they come out."""
+    return {key: value for key, value in manifest.items() if key != "sources"}
+
+
+def groups_of(
+    training: Training, timeline: SimulatorTimeline | None, manifest: dict[str, Any], *, fewest: int = 1
+) -> list[Group]:
+    """All policies of a training in groups, `fewest` at least, that go to other processes; `manifest` describes both."""
+    if timeline is not None:
+        timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
+    return [
+        Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
+        for members in split_groups(training.policies, fewest=fewest)
+    ]

@@ -1,0 +1,195 @@
+"""Jobs: in order on any executor, done once, and what becomes of those that fail or die."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import random
+import re
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from animat.errors import AnimatError, InvalidFile
+from animat.execution.jobs import Job, Jobs, in_order
+from animat.execution.pinned import PinnedProcesses
+from animat.execution.receipts import Receipt, receipt_path
+from animat.execution.task import Task, carry_out, told
+from animat.progress import Silent
+from worker_tasks import Die, Fail, Join, Starve, Stumble
+
+CORE = min(os.sched_getaffinity(0))
+
+
+class Kept:
+    """A progress that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[float, float, str]] = []
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        self.told.append((done, total, note))
+
+
+def run(
+    jobs: list[Job], folder: Path, executor: Executor | None = None, progress: Any = None, of: str = "study"
+) -> Any:
+    """Which jobs were run."""
+    left = Jobs(jobs, folder, folder / "jobs", of)
+    return set(left.run(workers=None, executor=executor or ThreadPoolExecutor(2), progress=progress or Silent()))
+
+
+@pytest.fixture(scope="module")
+def ours() -> Iterator[Executor]:
+    with PinnedProcesses([CORE, CORE]) as executor:
+        yield executor
+
+
+def joined(name: str, *of: str, cost_s: float = 1.0, **more: Any) -> Job:
+    return Job(name, Join(name, of, **more), of, cost_s)
+
+
+def test_jobs_come_after_what_they_need_and_long_chains_first() -> None:
+    jobs = [
+        joined("short", cost_s=1.0),
+        joined("end", "long", cost_s=5.0),
+        joined("long", cost_s=2.0),
+        joined("middle", cost_s=4.0),
+    ]
+    assert [job.name for job in in_order(jobs)] == ["long", "end", "middle", "short"]
+
+
+@pytest.mark.parametrize("which", ["ours", "threads", "processes"])
+def test_on_any_executor_each_comes_after_what_it_needs(which: str, ours: Executor, tmp_path: Path) -> None:
+    spawning = multiprocessing.get_context("spawn")
+    executor = {"ours": ours, "threads": ThreadPoolExecutor(3), "processes": ProcessPoolExecutor(1, spawning)}[which]
+    rng = random.Random(1)
+    needs: dict[str, tuple[str, ...]] = {}
+    for i in range(12):
+        needs[f"j{i}"] = tuple(rng.sample(sorted(needs), min(len(needs), rng.randrange(3))))
+
+    def held(name: str) -> str:
+        return f"({name}{''.join(held(other) for other in needs[name])})"
+
+    jobs = [joined(name, *of) for name, of in needs.items()]
+    rng.shuffle(jobs)
+    assert run(jobs, tmp_path, executor) == set(needs)
+    assert executor.submit(len, "left open").result() == 9
+    assert {name: (tmp_path / name).read_text() for name in needs} == {name: held(name) for name in needs}
+    assert run(jobs, tmp_path) == set()
+
+
+def test_what_is_lost_or_changed_is_done_again_and_what_rests_on_other_bytes(tmp_path: Path) -> None:
+    jobs = [joined("a"), joined("b", "a"), joined("c", "b")]
+    assert run(jobs, tmp_path) == {"a", "b", "c"}
+    (tmp_path / "a").unlink()
+    (tmp_path / "c").write_text("changed")
+    # The same bytes as before: b stands on them as it did.
+    assert run(jobs, tmp_path) == {"a", "c"}
+    other = [Job("a", Join("a", ("x",))), *jobs[1:]]
+    (tmp_path / "x").write_text("!")
+    (tmp_path / "a").unlink()
+    assert run(other, tmp_path) == {"a", "b", "c"}
+    assert (tmp_path / "c").read_text() == "(c(b(a!)))"
+    assert run(other, tmp_path, of="another study") == {"a", "b", "c"}
+
+
+def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
+    # A run that was killed left its last words.
+    stale = receipt_path(tmp_path / ".unfinished" / "told", "b")
+    stale.parent.mkdir(parents=True)
+    stale.write_text(json.dumps([0.9, "nearly"]))
+    kept = Kept()
+    run([joined("a", cost_s=3.0, takes_s=0.5), joined("b", "a", takes_s=0.5)], tmp_path, progress=kept)
+    done = [told[0] for told in kept.told]
+    assert done == sorted(done)
+    assert (done[-1], {told[1] for told in kept.told}) == (4.0, {4.0})
+    notes = {told[2] for told in kept.told}
+    assert {"0 of 2 jobs; a 50 % half", "1 of 2 jobs; b 50 % half"} <= notes
+    assert not any("nearly" in note for note in notes)
+
+
+def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
+    assert told(tmp_path / "notice.json") is None
+    done = carry_out(Join("a"), tmp_path, tmp_path / "notice.json")
+    assert told(tmp_path / "notice.json") == [0.5, "half"]
+    assert list(done.files) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("task", "kind", "words"),
+    [
+        (Fail(), InvalidFile, "job: a.nwb: expected a recording, got none"),
+        (
+            Stumble(),
+            AnimatError,
+            r"job: TypeError: expected an int, got a float \(in run, worker_tasks\.py, line \d+\)",
+        ),
+        (
+            Starve(),
+            AnimatError,
+            r"job: out of memory \(256. PiB more were asked for\): it grows with policies \(10\), culture.channels "
+            r"\(256\): ask for less, or use a machine with more memory",
+        ),
+        (
+            Die(),
+            AnimatError,
+            r"job: its process ended with status 7 \(is there memory enough\? .*\); start again to go on",
+        ),
+    ],
+)
+def test_a_job_that_fails_is_named_with_why_in_one_line(
+    task: Task, kind: type[AnimatError], words: str, ours: Executor, tmp_path: Path
+) -> None:
+    with pytest.raises(AnimatError) as raised:
+        run([Job("job", task)], tmp_path, ours)
+    assert type(raised.value) is kind and re.fullmatch(words, str(raised.value))
+    assert run([joined("next")], tmp_path, ours) == {"next"}
+
+
+def test_the_first_that_fails_ends_all_and_a_lent_executor_is_waited_for(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    jobs = [Job("fails", Fail(), cost_s=9.0), joined("runs", log=log, takes_s=0.5), joined("waits", log=log)]
+    with ThreadPoolExecutor(2) as executor:
+        with pytest.raises(InvalidFile):
+            run([*jobs, *(joined(f"waits{i}", takes_s=0.2) for i in range(9))], tmp_path, executor)
+        # What ran has ended, and nothing is begun after it.
+        left = sorted(path.name for path in tmp_path.iterdir())
+        executor.submit(len, "").result()
+        assert sorted(path.name for path in tmp_path.iterdir()) == left
+    said = log.read_text().splitlines()
+    assert said.count("runs begins") == said.count("runs ends")
+    assert len(left) < 12
+
+
+def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
+    jobs = [Job("fails", Fail(), cost_s=9.0), joined("runs", takes_s=600.0)]
+    with pytest.raises(InvalidFile, match="fails: a"):
+        Jobs(jobs, tmp_path, tmp_path / "jobs", "study").run(workers=2, executor=None, progress=Silent())
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_receipt_of_the_first_plan_is_read(tmp_path: Path) -> None:
+    """As commit 5e75c96 wrote it, byte for byte: digests of later receipts rest on it."""
+    text = (
+        '{\n "inputs": {\n  "record": "00"\n },\n "job": "limit/cartpole",\n'
+        ' "outputs": {\n  "limits/a.csv": "11"\n },\n "study": "22"\n}\n'
+    )
+    (tmp_path / "limit+cartpole.json").write_text(text)
+    receipt = Receipt.load(tmp_path, "limit/cartpole")
+    assert receipt == Receipt("limit/cartpole", "22", {"record": "00"}, {"limits/a.csv": "11"})
+    receipt.save(tmp_path)
+    assert (tmp_path / "limit+cartpole.json").read_text() == text
+    (tmp_path / "limit+cartpole.json").write_text("{")
+    with pytest.raises(InvalidFile, match="expected a job's receipt"):
+        Receipt.load(tmp_path, "limit/cartpole")
+
+
+def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
+    """Names of robots and conditions may hold dots, spaces and dashes."""
+    jobs = ["limit/cartpole/over-time", "limit/cartpole.over-time", "limit.cartpole/over-time"]
+    assert len({receipt_path(tmp_path, job) for job in jobs}) == 3

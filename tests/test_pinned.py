@@ -1,0 +1,76 @@
+"""Pinned processes: an executor as the others of Python, one process a core, kept while it is small."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from animat.errors import UnsafeStimulus
+from animat.execution.pinned import PinnedProcesses
+from worker_tasks import die, refuse, rest, tell_process
+
+CORE = min(os.sched_getaffinity(0))
+
+
+@pytest.fixture(scope="module")
+def one() -> Iterator[Executor]:
+    with PinnedProcesses([CORE]) as executor:
+        yield executor
+
+
+@pytest.mark.parametrize("make", [lambda: PinnedProcesses([CORE]), lambda: ThreadPoolExecutor(1)])
+def test_it_keeps_to_the_contract_of_an_executor(make: Callable[[], Executor]) -> None:
+    with make() as executor:
+        assert list(executor.map(divmod, (7, 8, 9), (2, 3, 4))) == [(3, 1), (2, 2), (2, 1)]
+        with pytest.raises(ZeroDivisionError):
+            executor.submit(divmod, 1, 0).result()
+        with pytest.raises(UnsafeStimulus, match="charge: too much; nothing was delivered") as raised:
+            executor.submit(refuse, "charge").result()
+        assert raised.value.limit == "charge"
+        slow, waiting = executor.submit(rest, 0.3), executor.submit(rest, 60.0)
+        while not slow.running():
+            time.sleep(0.01)
+        assert waiting.cancel()
+        with pytest.raises(CancelledError):
+            waiting.result()
+        also = executor.submit(rest, 60.0)
+        executor.shutdown(cancel_futures=True)
+        assert slow.result() == 0.3 and also.cancelled()
+        with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
+            executor.submit(rest, 0.0)
+
+
+def test_a_process_stays_until_it_has_grown_large(one: Executor) -> None:
+    first, second, third = (one.submit(tell_process, mib).result() for mib in (0, 900, 0))
+    assert first == second
+    assert first[0] != third[0]
+    assert first[1] == third[1] == [CORE]
+
+
+def test_ctrl_c_of_the_terminal_does_not_reach_a_process(one: Executor) -> None:
+    process, _ = one.submit(tell_process).result()
+    assert os.getpgid(process) != os.getpgid(0)
+
+
+def test_work_whose_process_dies_is_told_apart_and_the_next_finds_another(one: Executor) -> None:
+    with pytest.raises(BrokenExecutor, match="its process ended with status 7"):
+        one.submit(die).result()
+    assert one.submit(rest, 0.0).result() == 0.0
+
+
+def test_left_by_an_error_it_ends_what_runs() -> None:
+    with pytest.raises(ValueError, match="no"), PinnedProcesses([CORE, CORE]) as executor:
+        process, _ = executor.submit(tell_process).result()
+        running = [executor.submit(rest, 600.0) for _ in range(2)]
+        waiting = executor.submit(rest, 600.0)
+        while not all(future.running() for future in running):
+            time.sleep(0.01)
+        raise ValueError("no")
+    assert waiting.cancelled()
+    assert all(isinstance(future.exception(), BrokenExecutor) for future in running)
+    assert not Path(f"/proc/{process}").exists()
