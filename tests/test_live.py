@@ -411,7 +411,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--speed", "0"], "speed: expected a number above 0, got 0"),
         (["--duration-min", "-1"], "duration_min"),
         (["--interval-min", "0.1"], "interval_min: expected at least"),
-        (["--presentations", "0"], "presentations: expected 1 to"),
+        (["--presentations", "0"], "presentations: expected at least 1"),
         (["--pulses", "0"], "at least 1 pulse"),
         (["--episodes", "0"], "episodes: expected at least 1"),
         (["--policies", "0"], "policies: expected a whole number from 1"),

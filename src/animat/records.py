@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
-from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError
+import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
@@ -12,10 +13,15 @@ from animat.errors import InvalidArgument, shown
 
 T = TypeVar("T")
 
-Whole = Annotated[int, Strict()]
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+Whole = Annotated[int, Strict(), BeforeValidator(_plain)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False), BeforeValidator(_plain)]
 Flag = Annotated[bool, Strict()]
-"""As they stand in a file: a whole number is good for a number, and nothing else is turned into anything."""
+"""As a file has them, or numpy: a whole number is good for a number, and nothing else is turned into anything."""
 Positive = Annotated[Number, Field(gt=0)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Seed = Annotated[Whole, Field(ge=0, le=2**32 - 1)]
@@ -35,7 +41,7 @@ _EXPECTED = {
     "literal_error": "{expected}",
     "string_type": "text",
     "too_long": "at most {max_length:,} entries",
-    "too_short": "at least {min_length:,} entries",
+    "too_short": "at least {min_length:,}",
     "tuple_type": "a list",
 }
 """What a field is expected to be, by the type of pydantic's error."""
@@ -61,8 +67,13 @@ def record(kind: type[T]) -> type[T]:
     return made  # type: ignore[no-any-return]
 
 
-def read_record(kind: type[T], data: Any) -> T:
+def read_record(kind: type[T], data: Any, where: str = "") -> T:
     """A record, or any other type, from plain data as a file holds them; what is left out has its default.
+
+    Args:
+        kind: its type.
+        data: dictionaries, lists, texts and numbers.
+        where: what a message calls the whole.
 
     Raises:
         InvalidArgument: naming the key, what was expected and what came.
@@ -70,14 +81,17 @@ def read_record(kind: type[T], data: Any) -> T:
     try:
         return TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
-        raise InvalidArgument(_told(error, kind)) from error
+        raise InvalidArgument(_told(error, kind, where)) from error
 
 
-def _told(error: ValidationError, kind: Any) -> str:
+def _told(error: ValidationError, kind: Any, within: str = "") -> str:
     """The first mistake: where it is, what was expected, and what came."""
     mistake = error.errors(include_url=False)[0]
     loc = mistake["loc"]
-    where = ".".join(_key(part) for part in loc if isinstance(part, str))
+    if loc and isinstance(loc[0], int) and hasattr(kind, "__pydantic_fields__"):
+        # An argument that was given by its place.
+        loc = (list(kind.__pydantic_fields__)[loc[0]], *loc[1:])
+    where = ".".join([within] * bool(within) + [_key(part) for part in loc if isinstance(part, str)])
     if mistake["type"] == "unexpected_keyword_argument":
         for part in loc[:-1]:
             kind = get_args(kind)[0] if isinstance(part, int) else kind.__pydantic_fields__[part].annotation
@@ -87,7 +101,7 @@ def _told(error: ValidationError, kind: Any) -> str:
         said = mistake["ctx"]["error"]
         # That of a record within this one begins with the field's name.
         return f"{where}{'.' if isinstance(said, InvalidArgument) else ': '}{said}" if where else str(said)
-    return f"{where}: expected {_expected(mistake)}"
+    return f"{where}{': ' if where else ''}expected {_expected(mistake)}"
 
 
 def _expected(mistake: ErrorDetails) -> str:
