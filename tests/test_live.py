@@ -412,7 +412,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--duration-min", "-1"], "duration_min"),
         (["--interval-min", "0.1"], "interval_min: expected at least"),
         (["--presentations", "0"], "presentations: expected at least 1"),
-        (["--pulses", "0"], "at least 1 pulse"),
+        (["--pulses", "0"], "pulses: expected at least 1"),
         (["--episodes", "0"], "episodes: expected at least 1"),
         (["--policies", "0"], "policies: expected a whole number from 1"),
         (["--seed", "-1"], "seed"),

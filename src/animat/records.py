@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
 import numpy as np
@@ -36,6 +37,7 @@ _EXPECTED = {
     "greater_than": "more than {gt:,}",
     "greater_than_equal": "at least {ge:,}",
     "int_type": "a whole number",
+    "less_than": "less than {lt:,}",
     "less_than_equal": "at most {le:,}",
     "list_type": "a list",
     "literal_error": "{expected}",
@@ -82,6 +84,15 @@ def read_record(kind: type[T], data: Any, where: str = "") -> T:
         return TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
         raise InvalidArgument(_told(error, kind, where)) from error
+
+
+def as_json(value: Any) -> Any:
+    """The same plain data with None for numbers that JSON has no word for (NaN, infinite)."""
+    if isinstance(value, dict):
+        return {key: as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _told(error: ValidationError, kind: Any, within: str = "") -> str:

@@ -8,7 +8,6 @@ import importlib.metadata
 import io
 import itertools
 import json
-import math
 import os
 import sys
 from collections.abc import Sequence
@@ -124,7 +123,9 @@ def _run(given: list[str]) -> int:
         print(f"animat: {words}: {remedy}", file=sys.stderr)
         return 1
     if command.json:
-        print(json.dumps(_as_json(results)))
+        from animat.records import as_json
+
+        print(json.dumps(as_json(results)))
     # Of several files, some of which could not be read or used, as was said on the way.
     return 1 if results.get("unreadable") or results.get("unusable") else 0
 
@@ -207,12 +208,3 @@ def _say_notes(error: BaseException) -> None:
     """What went wrong besides, such as a device that could not be switched off."""
     for note in getattr(error, "__notes__", ()):
         print(f"animat: {' '.join(note.split())}", file=sys.stderr)
-
-
-def _as_json(value: Any) -> Any:
-    """The same with null for numbers that JSON has no word for (NaN, infinite)."""
-    if isinstance(value, dict):
-        return {key: _as_json(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_as_json(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
