@@ -145,7 +145,7 @@ def algorithm() -> Any:
     """Our default settings, at eight iterations an update whatever the default is."""
     from dataclasses import replace
 
-    from animat.training.sac import SAC
+    from animat.training.settings import SAC
 
     default = SAC()
     return replace(default, updates=max(1, default.environments // 8))

@@ -39,7 +39,7 @@ from animat.robots import Navigation
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.training.policy import load_policies
-from animat.training.sac import SAC
+from animat.training.settings import SAC
 from animat.training.specification import Training
 from cultures import small_culture
 from fake_culture import FakeCulture

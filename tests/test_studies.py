@@ -758,7 +758,7 @@ COMPARED = (
             "culture.pulses: expected only for a culture that",
         ),
         ("[[robots]]\nname = 'cartpole'\nparameters = { name = 1 }", "expected parameters among"),
-        ("[algorithm]\nhiden = 8", "algorithm: expected settings among"),
+        ("[algorithm]\nhiden = 8", "hiden: no such setting in [algorithm]; expected some of environments"),
         ("[algorithm]\nhidden = 'x'", "algorithm.hidden: expected a number"),
         ("[algorithm]\nhidden = 64.0", "algorithm.hidden: expected a whole number, got 64.0"),
         ("seed = 9999999999", "seed: expected at most 4,294,967,295, got 9999999999"),

@@ -21,7 +21,7 @@ from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.training.group import Group, split_groups, train_group
 from animat.training.policy import Policy
-from animat.training.sac import SAC
+from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.training.trainer import describe, train
 from animat.writing import alone_in

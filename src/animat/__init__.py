@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     from animat.studies.toml import read_study as read_study
     from animat.training.policy import Policy as Policy
     from animat.training.policy import load_policies as load_policies
-    from animat.training.sac import SAC as SAC
+    from animat.training.settings import SAC as SAC
     from animat.training.specification import Training as Training
     from animat.training.trainer import train as train
 
@@ -103,7 +103,7 @@ _WHERE = {
     "mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
-    "training.sac": ("SAC",),
+    "training.settings": ("SAC",),
     "training.specification": ("Training",),
     "training.trainer": ("train",),
     "training.policy": ("Policy", "load_policies"),

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, AliasChoices, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
@@ -15,11 +15,11 @@ from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
 from animat.mapping import MAPPING_NAMES
 from animat.recordings.made_up import MadeUpCulture
-from animat.records import Flag, Number, Positive, Seed, Share, Whole, record
+from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import is_ours, place_of, robot_named
 from animat.stimulation.protocol import Protocol
-from animat.training.bounds import MOST_ITERATIONS, MOST_POLICIES
+from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
 MAPPINGS = (*MAPPING_NAMES, "none")
 """Names of mappings that a condition may have; none is the baseline without neurons."""
@@ -259,7 +259,7 @@ class Study:
         actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
         limit_resolution: steps of the grid of the best possible return, as a multiple; 0.6 is fast and rough.
         limit_episodes: episodes in which that controller's return is checked.
-        algorithm: settings of `animat.training.sac.SAC` in place of its defaults.
+        algorithm: settings of `animat.training.settings.SAC` in place of its defaults.
         paper: whether the paper's own figures are printed beside comparisons of the same name and robot.
 
     Raises:
@@ -319,8 +319,7 @@ class Study:
         if self.culture.kind != "files" and self.needs_neurons:
             for compared in self.comparisons:
                 self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
-        if self.algorithm:
-            _check_algorithm(self.algorithm)
+        read_record(SAC, self.algorithm, "algorithm")
 
     def condition(self, name: str) -> StudyCondition:
         """The condition of this name."""
@@ -385,19 +384,3 @@ def _expect_unlike(what: str, names: Sequence[str]) -> None:
     for name, times in Counter(names).items():
         if times > 1:
             raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times")
-
-
-def _check_algorithm(settings: dict[str, float]) -> None:
-    from animat.training.sac import SAC
-
-    known = get_type_hints(SAC)
-    for name, value in settings.items():
-        if name not in known:
-            raise InvalidArgument(f"algorithm: expected settings among {', '.join(known)}, got {shown(name)}")
-        # 64.0 is as large as 64, but no shape of an array.
-        if known[name] is int and not isinstance(value, int):
-            raise InvalidArgument(f"algorithm.{name}: expected a whole number, got {shown(value)}")
-    try:
-        SAC(**settings)  # type: ignore[arg-type]
-    except InvalidArgument as error:
-        raise InvalidArgument(f"algorithm.{error}") from error

@@ -16,7 +16,7 @@ from animat.studies.places import TIMELINE, UNFINISHED, policies_folder
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Body, Study, StudyCondition
 from animat.training.group import Group, train_group, untrained_policies
-from animat.training.sac import SAC
+from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.training.trainer import MANIFEST, describe, provenance_of
 from animat.writing import written_whole
