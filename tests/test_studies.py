@@ -766,7 +766,7 @@ COMPARED = (
         ("[simulators]\nbins = 0", "simulators.bins: expected 1 to"),
         ("[simulators]\nrange_hz = -5", "simulators.range_hz: expected a positive frequency in Hz, got -5"),
         ("[simulators]\nwindow_ms = [10, 2]", "simulators.window_ms: expected 0 <= start < end"),
-        ("[simulators]\nburst_threshold = 7", "simulators.burst_threshold: expected at most 1.0, got 7"),
+        ("[simulators]\nburst_threshold = 7", "simulators.burst_threshold: expected at most 1, got 7"),
         (
             "[simulators]\ndespite = ['drift']\nallow = []",
             "despite: no such setting in [simulators]; expected some of kind",
