@@ -42,7 +42,7 @@ from animat.cultures.base import Culture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.recordings.recording import Channels
-from animat.responses.conditions import Condition
+from animat.responses.condition import Condition
 from animat.robots import Cartpole
 from animat.training.policy import Policy
 

@@ -145,7 +145,7 @@ def algorithm() -> Any:
     """Our default settings, at eight iterations an update whatever the default is."""
     from dataclasses import replace
 
-    from animat.training.sac import SAC
+    from animat.training.settings import SAC
 
     default = SAC()
     return replace(default, updates=max(1, default.environments // 8))
@@ -220,7 +220,7 @@ def timeline() -> Any:
 
     from animat.neurons.made_up import LABELS, made_up_simulator
     from animat.neurons.timeline import SimulatorTimeline
-    from animat.responses.conditions import Condition
+    from animat.responses.condition import Condition
 
     return SimulatorTimeline(
         simulators=jax.tree.map(lambda leaf: leaf[None], made_up_simulator()),
@@ -269,7 +269,7 @@ def forward(calls: int) -> dict[str, Any]:
     import numpy as np
 
     from animat.coding.mapping import mapping_named
-    from animat.responses.conditions import Condition
+    from animat.responses.condition import Condition
     from animat.robots.cartpole import Cartpole
     from animat.training.policy import Policy
     from animat.training.sac import Layer

@@ -473,6 +473,7 @@ def test_inspect_refuses_its_options_before_the_files(
         (["train", "cartpole", "--policies", "many"], 2, ["--policies", "many", "animat train --help"]),
         (["train", "unicycle"], 1, ["robot: expected one of cartpole, navigation, got 'unicycle'", "module:Class"]),
         (["train", "cartpole", "--polices", "3"], 2, ["--polices"]),
+        (["train", "--window-ms", "2"], 2, ["animat: --window-ms: expected two numbers, got '2'; see animat train"]),
         (["trian"], 2, ["trian", "train, evaluate"]),
         ([], 2, ["record, inspect"]),
     ],

@@ -425,7 +425,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     [
         ({"percentiles": [1, 2]}, "11 rising"),
         ({"percentiles": PERCENTILES[::-1]}, "11 rising"),
-        ({"pulses": 0}, "at least 1 pulse"),
+        ({"pulses": 0}, "pulses: expected at least 1"),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),
         ({"conditions": (Condition("electrode 5", 0.0),)}, "tell the frequency of its pulses"),
@@ -528,7 +528,7 @@ def test_a_budget_is_kept_to_the_pulse() -> None:
     for _ in range(2):
         account.check(pair)
         account.spend(pair)
-    assert account.per_electrode == {1: 2, 2: 4, 3: 2}
+    assert account._on == {1: 2, 2: 4, 3: 2}
     with pytest.raises(BudgetSpent, match="electrode 2 had 4 of 4"):
         account.check(pair)
     account.take_back(pair)

@@ -201,7 +201,7 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
 
 
 def test_a_scan_that_cannot_be_is_refused() -> None:
-    with pytest.raises(UnusableData, match=r"scan.rate_hz: expected one value an electrode"):
+    with pytest.raises(UnusableData, match=r"rate_hz: expected \d+ values in the scan, got shape"):
         scanned(SMALL, rate_hz=np.zeros(3))
     with pytest.raises(UnusableData, match="each electrode once"):
         scanned(SMALL, electrode=np.zeros(200))

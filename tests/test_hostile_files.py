@@ -52,14 +52,14 @@ def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"array": SELECTION["array"] | {"columns": 10**30}}, "array.columns: expected a whole number"),
-        ({"array": SELECTION["array"] | {"pitch_um": "a"}}, "array.pitch_um: expected a distance"),
-        ({"recording": ["1", "2"]}, "expected whole numbers of electrodes"),
-        ({"recording": [1.5]}, "expected whole numbers of electrodes"),
-        ({"recording": [10**30]}, "expected whole numbers of electrodes"),
-        ({"recording": {}}, "expected whole numbers of electrodes"),
-        ({"patterns": [[1], [1, 2]]}, "expected what Selection.to_dict writes"),
-        ({"rule": {"spacing_um": "a"}}, "rule.spacing_um: expected a finite number"),
+        ({"array": SELECTION["array"] | {"columns": 10**30}}, "array.columns: expected at most 1,000,000"),
+        ({"array": SELECTION["array"] | {"pitch_um": "a"}}, "array.pitch_um: expected a number"),
+        ({"recording": ["1", "2"]}, "selection.recording: expected a whole number, got '1'"),
+        ({"recording": [1.5]}, "selection.recording: expected a whole number, got 1.5"),
+        ({"recording": [10**30]}, "selection.recording: expected at most"),
+        ({"recording": {}}, "selection.recording: expected a list"),
+        ({"patterns": [[1], [1, 2]]}, "selection.patterns: expected as many electrodes in each"),
+        ({"rule": {"spacing_um": "a"}}, "selection.rule.spacing_um: expected a number"),
         ({"seed": 1.5}, "expected a whole number, got 1.5"),
     ],
 )

@@ -12,7 +12,18 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
-GROUND = ("brief", "compilation", "ctrl_c", "differences", "errors", "plain_file", "progress", "tables", "writing")
+GROUND = (
+    "brief",
+    "compilation",
+    "ctrl_c",
+    "differences",
+    "errors",
+    "plain_file",
+    "progress",
+    "records",
+    "tables",
+    "writing",
+)
 """What stands under the story and may be used by all of it."""
 
 STORY = (

@@ -39,7 +39,7 @@ from animat.robots import Navigation
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.training.policy import load_policies
-from animat.training.sac import SAC
+from animat.training.settings import SAC
 from animat.training.specification import Training
 from cultures import small_culture
 from fake_culture import FakeCulture
@@ -411,8 +411,8 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--speed", "0"], "speed: expected a number above 0, got 0"),
         (["--duration-min", "-1"], "duration_min"),
         (["--interval-min", "0.1"], "interval_min: expected at least"),
-        (["--presentations", "0"], "presentations: expected 1 to"),
-        (["--pulses", "0"], "at least 1 pulse"),
+        (["--presentations", "0"], "presentations: expected at least 1"),
+        (["--pulses", "0"], "pulses: expected at least 1"),
         (["--episodes", "0"], "episodes: expected at least 1"),
         (["--policies", "0"], "policies: expected a whole number from 1"),
         (["--seed", "-1"], "seed"),

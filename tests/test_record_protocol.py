@@ -88,7 +88,11 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
             [],
             "mine.json: protocol: expected JSON, got a mistake in line 2, column 9",
         ),
-        ('{"frequency_hz": [5]}', [], "mine.json: protocol: expected settings among frequencies_hz"),
+        (
+            '{"frequency_hz": [5]}',
+            [],
+            "mine.json: frequency_hz: no such setting at the top; expected some of frequencies_hz",
+        ),
         ('{"pulses": 0}', [], "mine.json: pulses: expected at least 1"),
         ('{"setup_s": 700}', ["--sessions", "2"], "interval_min: expected at least"),
         (MINE.to_json(), ["--order", "mixed"], "--protocol: expected it alone, got --order too"),

@@ -85,7 +85,7 @@ def test_a_stimulus_table_refuses_what_cannot_be(changes: dict[str, Any], messag
 
 
 def test_a_presentation_refuses_what_cannot_be() -> None:
-    with pytest.raises(InvalidArgument, match="pulses: expected at least 1 pulse"):
+    with pytest.raises(InvalidArgument, match="pulses: expected at least 1, got 0"):
         Presentation("mixed", 0)
     with pytest.raises(InvalidArgument, match="order: expected 'blocked' or 'mixed'"):
         Presentation("shuffled")  # type: ignore[arg-type]

@@ -19,7 +19,6 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.training.sac import (
-    SAC,
     Batch,
     Finished,
     Learner,
@@ -32,6 +31,7 @@ from animat.training.sac import (
     forward,
     train_chunk,
 )
+from animat.training.settings import SAC
 from sac_toys import Follower, Payer
 
 SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)

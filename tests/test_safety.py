@@ -338,7 +338,7 @@ def test_limits_that_cannot_be_are_refused() -> None:
         (lambda: Phase(100, amplitude_mv=math.inf), "finite number, got inf"),
         (lambda: Pulse(()), "at least one, got none"),
         (lambda: Pulse((Phase(1, amplitude_mv=1), Phase(1, amplitude_ua=1))), "got both in one pulse"),
-        (lambda: Pulse.from_list([{"duration_ms": 1}]), "expected phases with duration_us"),
+        (lambda: Pulse.from_list([{"duration_ms": 1}]), "phases: expected a list, each with duration_us"),
     ],
 )
 def test_pulses_that_cannot_be_are_refused(make: Any, words: str) -> None:

@@ -25,7 +25,7 @@ from animat.robots import Cartpole, Navigation
 from animat.training.folder import describe
 from animat.training.group import Group, split_groups, train_group
 from animat.training.policy import Policy
-from animat.training.sac import SAC
+from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.writing import alone_in
 from test_simulator import responses_of

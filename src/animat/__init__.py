@@ -78,7 +78,7 @@ if TYPE_CHECKING:
     from animat.studies.toml import read_study as read_study
     from animat.training.policy import Policy as Policy
     from animat.training.policy import load_policies as load_policies
-    from animat.training.sac import SAC as SAC
+    from animat.training.settings import SAC as SAC
     from animat.training.specification import Training as Training
 
 _WHERE = {
@@ -106,7 +106,7 @@ _WHERE = {
     "coding.mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
-    "training.sac": ("SAC",),
+    "training.settings": ("SAC",),
     "training.specification": ("Training",),
     "execution.training": ("train",),
     "training.policy": ("Policy", "load_policies"),

@@ -8,16 +8,21 @@ import importlib.metadata
 import io
 import itertools
 import json
-import math
 import os
-import re
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, get_args
 
 import tyro
 from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from animat.cli.convert import Convert
 from animat.cli.evaluate import Evaluate
@@ -120,7 +125,9 @@ def _run(given: list[str]) -> int:
         print(f"animat: {words}: {remedy}", file=sys.stderr)
         return 1
     if command.json:
-        print(json.dumps(_as_json(results)))
+        from animat.records import as_json
+
+        print(json.dumps(as_json(results)))
     # Of several files, some of which could not be read or used, as was said on the way.
     return 1 if results.get("unreadable") or results.get("unusable") else 0
 
@@ -149,11 +156,12 @@ def _parse(arguments: list[str]) -> Command:
         lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()[1:]]
         parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
         what = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
-        raise InvalidArgument(f"{_told(what)}; see animat {' '.join(arguments[:1])} --help") from None
+        told = what.removeprefix("Error parsing ")
+        raise InvalidArgument(f"{told}; see animat {arguments[0]} --help") from None
 
 
 def _options() -> ConstructorRegistry:
-    """Rules by which options are read and told: of one that need not be given, the help says what is done without."""
+    """A rule by which the options of every command are read and told."""
     registry = ConstructorRegistry()
     within = False
 
@@ -167,51 +175,36 @@ def _options() -> ConstructorRegistry:
         within = False
         if not isinstance(spec, StructConstructorSpec):
             return None
-        fields = (
-            dataclasses.replace(field, type=cast(Any, Annotated[field.type, arg(help_behavior_hint="")]))
-            if field.default is None or field.default == ()
-            else field
-            for field in spec.fields
-        )
-        return dataclasses.replace(spec, fields=tuple(fields))
+        return dataclasses.replace(spec, fields=tuple(map(_option, spec.fields)))
 
     return registry
 
 
-_WORDS = (
-    (
-        r"Error parsing (\S+): (?:no type matching INT .*? from|invalid literal .*? 10:) \[?('[^']*').*",
-        "whole number",
-    ),
-    (
-        r"Error parsing (\S+): (?:no type matching FLOAT .*? from|could not convert .*?:) \[?('[^']*').*",
-        "number",
-    ),
-)
+_NUMBERS = {"INT": "a whole number", "FLOAT": "a number", "FLOAT FLOAT": "two numbers"}
 
 
-def _told(what: str) -> str:
-    """What the parser says, in the words of all other errors: the argument, what was expected, what came."""
-    if wrong := re.fullmatch(r"invalid choice (.+) for argument '(.+)'. Expected one of \((.+)\)\.", what):
-        # The parser lists them in any order.
-        choices = sorted(set(re.findall(r"'([^']+)'", wrong[3])) - {"None"})
-        return f"{wrong[2]}: expected one of {', '.join(choices)}, got {wrong[1]}"
-    for words, kind in _WORDS:
-        if wrong := re.fullmatch(words, what):
-            return f"{wrong[1]}: expected a {kind}, got {wrong[2]}"
-    return what
+def _option(option: StructFieldSpec) -> StructFieldSpec:
+    """The same in our words: an error says what was expected and what came, help what is done without the option."""
+    kind: Any = Annotated[option.type, DisallowNone]
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, set()))
+    if option.type is not bool and isinstance(spec, PrimitiveConstructorSpec):
+        among = sorted(spec.metavar.strip("{}").split(","))
+        expected = f"one of {', '.join(among)}" if spec.choices else _NUMBERS.get(spec.metavar.strip("{}"))
+
+        def read(words: list[str]) -> Any:
+            with contextlib.suppress(ValueError):
+                if not spec.choices or set(words) <= set(among):
+                    return spec.instance_from_str(words)
+            raise ValueError(f"expected {expected}, got {' '.join(map(repr, words))}")
+
+        if expected is not None:
+            kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None)]
+    if option.default is None or option.default == ():
+        kind = Annotated[kind, arg(help_behavior_hint="")]
+    return dataclasses.replace(option, type=kind)
 
 
 def _say_notes(error: BaseException) -> None:
     """What went wrong besides, such as a device that could not be switched off."""
     for note in getattr(error, "__notes__", ()):
         print(f"animat: {' '.join(note.split())}", file=sys.stderr)
-
-
-def _as_json(value: Any) -> Any:
-    """The same with null for numbers that JSON has no word for (NaN, infinite)."""
-    if isinstance(value, dict):
-        return {key: _as_json(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_as_json(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

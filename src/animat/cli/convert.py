@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -82,19 +82,7 @@ class Convert:
             recovery_ms=max(20.0, self.blank_ms[1]),
             engine=self.engine,
         )
-        origin = Origin(
-            subject_id=self.subject_id,
-            species=self.species,
-            sex=self.sex,
-            age=self.age,
-            subject_description=self.subject_description,
-            experimenter=self.experimenter,
-            institution=self.institution,
-            lab=self.lab,
-            keywords=self.keywords,
-            recorded_at=self.recorded_at,
-            experiment_description=self.experiment_description,
-        )
+        origin = Origin(**{each.name: getattr(self, each.name) for each in fields(Origin)})
         with Bar("finding spikes") as progress:
             recording = convert_recording(
                 self.recording,

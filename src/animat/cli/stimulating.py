@@ -41,13 +41,8 @@ class Stimulating:
 
     def _of_the_loop(self) -> dict[str, Any]:
         """Settings of the closed loop."""
-        return {
-            "on_burst": self.on_burst,
-            "on_late": self.on_late,
-            "pause_s": self.pause_s,
-            "lead_in": self.lead_in,
-            "patience_s": self.patience_s,
-        }
+        names = ("on_burst", "on_late", "pause_s", "lead_in", "patience_s")
+        return {name: getattr(self, name) for name in names}
 
 
 def expect_no_fault(session: Session, folder: Path) -> None:

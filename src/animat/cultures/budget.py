@@ -53,11 +53,6 @@ class Account:
         """Pulses on the electrode that had most."""
         return max(self._on.values(), default=0)
 
-    @property
-    def per_electrode(self) -> dict[int, int]:
-        """Pulses that each electrode had."""
-        return dict(sorted(self._on.items()))
-
     def check(self, stimuli: Sequence[Stimulus]) -> None:
         """Raise unless the budget holds these stimuli too.
 

@@ -27,7 +27,7 @@ from animat.responses.condition import other_stimulus
 from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
 from animat.stimulation.protocol import Presentation
-from animat.training.policy import Policy
+from animat.training.policy import Policy, first_of_alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,13 +224,8 @@ def evaluate(
         InvalidArgument: for no policies, fewer episodes than one, or an `at_min`, a seed or a resolution that is none.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
-    if not policies:
-        raise InvalidArgument("policies: expected at least one, got none")
-    first_name, first = next(iter(policies.items()))
-    for name, policy in policies.items():
-        for attribute in ("robot", "mapping", "conditions", "commands", "percentiles", "delivery"):
-            if getattr(policy, attribute) != getattr(first, attribute):
-                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; evaluate it alone")
+    alike = ("robot", "mapping", "conditions", "commands", "percentiles", "delivery")
+    first = first_of_alike(policies, alike, "evaluate it alone")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, which the policies were trained on, got {robot.name}")
     body = robot or first.robot

@@ -20,7 +20,7 @@ from animat.closed_loop.session import Session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
 from animat.evaluation.resampling import too_few
@@ -37,7 +37,7 @@ from animat.recordings.findings import Finding
 from animat.responses.condition import other_stimulus
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
-from animat.training.policy import Policy
+from animat.training.policy import Policy, first_of_alike
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
@@ -246,14 +246,8 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
         Mismatch: if they differ in robot, mapping, conditions, presentation, response window, or in how the simulators
             were made that they were trained on.
     """
-    if not policies:
-        raise InvalidArgument("policies: expected at least one, got none")
-    first_name, first = next(iter(policies.items()))
-    for name, policy in policies.items():
-        for attribute in ("robot", "mapping", "conditions", "presentation", "window_ms", "fitted"):
-            if getattr(policy, attribute) != getattr(first, attribute):
-                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; run it alone")
-    return first
+    alike = ("robot", "mapping", "conditions", "presentation", "window_ms", "fitted")
+    return first_of_alike(policies, alike, "run it alone")
 
 
 def check_conditions(first: Policy, calibration: Calibration) -> None:

@@ -17,6 +17,7 @@ from animat.evaluation.verdict import Beside, Verdict
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
 from animat.recordings.findings import Finding
+from animat.records import as_json
 
 LARGE_SHARE = 0.1
 """Of the range from random to the best possible return: a gap that is worth a word though it may be none."""
@@ -84,9 +85,9 @@ class Row:
             "name": self.name,
             "meaning": self.meaning,
             "predicted": float(self.predicted.mean()),
-            "prediction": _finite(self.prediction),
+            "prediction": as_json(self.prediction.to_dict()),
             "lived": float(self.lived.mean()) if lived else None,
-            "gap": _finite(self.gap) if lived else None,
+            "gap": as_json(self.gap.to_dict()) if lived else None,
             "episodes": len(self.lived),
             "lived_returns": self.lived.tolist(),
             "pulses_per_action": self.pulses_per_action,
@@ -240,11 +241,6 @@ def _between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
     # Of a hundred draws the usual interpolation would hold 93 %.
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
     return Interval(float(value), float(low), float(high), CONFIDENCE)
-
-
-def _finite(interval: Interval) -> dict[str, float | None]:
-    """As plain data; JSON knows no infinity."""
-    return {name: value if np.isfinite(value) else None for name, value in interval.to_dict().items()}
 
 
 def _resampled_means(

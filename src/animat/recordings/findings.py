@@ -33,6 +33,12 @@ class Finding:
         return {"name": self.name, "severity": self.severity, "sentence": self.sentence}
 
 
+def left_out_of(what: str, names: Sequence[str], file: str = "") -> Finding:
+    """The finding on keys or columns of a file that nobody knows."""
+    sentence = f"{what}{f' of {file}' if file else ''} that are not known were left out: {', '.join(names)}"
+    return Finding(f"{what}-left-out", "note", sentence, float(len(names)))
+
+
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
     """What all but notes say; what is found in several recordings once, where it is worst, with how many others."""
     warnings: dict[str, list[Finding]] = {}

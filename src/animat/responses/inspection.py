@@ -13,6 +13,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.records import as_json
 from animat.responses.conditions import Conditions, default_conditions
 from animat.responses.extraction import extract_responses, responses_of_table
 from animat.responses.network_bursts import NetworkBursts, find_network_bursts
@@ -113,7 +114,7 @@ class Inspection:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data for JSON; what is not known is None."""
         responses = self.responses
-        return {
+        told = {
             "name": self.name,
             "verdict": self.verdict,
             "spikes": self.n_spikes,
@@ -122,40 +123,38 @@ class Inspection:
             "presentations": self.n_presentations,
             "presentation": self.presentation,
             "start_min": self.start_min,
-            "duration_s": _known(self.duration_s),
+            "duration_s": self.duration_s,
             "window_ms": list(responses.window_ms),
-            "mean_spikes_per_stimulus": _known(self.mean_spikes_per_stimulus),
-            "spontaneous_rate_hz": _known(self.spontaneous_rate_hz),
+            "mean_spikes_per_stimulus": self.mean_spikes_per_stimulus,
+            "spontaneous_rate_hz": self.spontaneous_rate_hz,
             "response_ms": [self.response.start_ms, self.response.end_ms] if self.response else None,
             "by": self.by,
             "by_default": self.by_default,
             "responses": len(responses),
-            "median_rate_hz": _known(responses.median_rate_hz),
-            "burst_threshold": _known(responses.threshold),
-            "burst_separability": _known(responses.separability),
+            "median_rate_hz": responses.median_rate_hz,
+            "burst_threshold": responses.threshold,
+            "burst_separability": responses.separability,
             "bursts": self.n_bursts,
             "network_bursts": None
             if self.network_bursts is None
             else {
                 "bursts": len(self.network_bursts),
-                "median_s": _known(self.network_bursts.median_s),
-                "share_of_spikes": _known(self.network_bursts.share),
+                "median_s": self.network_bursts.median_s,
+                "share_of_spikes": self.network_bursts.share,
             },
             "conditions": [
                 {
                     "label": c.label,
                     "responses": c.n_responses,
                     "non_burst": c.n_non_burst,
-                    "median_rate_hz": _known(c.median_rate_hz),
-                    "share_above_median": _known(c.share_above_median),
+                    "median_rate_hz": c.median_rate_hz,
+                    "share_above_median": c.share_above_median,
                 }
                 for c in self.conditions
             ],
-            "findings": [
-                {**finding.to_dict(), "value": None if finding.value is None else _known(finding.value)}
-                for finding in self.findings
-            ],
+            "findings": [{**finding.to_dict(), "value": finding.value} for finding in self.findings],
         }
+        return as_json(told)  # type: ignore[no-any-return]
 
 
 def inspect_recording(
@@ -257,7 +256,3 @@ def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> t
     findings |= {f.name + f.sentence: f for f in noticed(source) if f.name not in names}
     gravity = {"refuse": 0, "warning": 1, "note": 2}
     return tuple(sorted(findings.values(), key=lambda finding: gravity[finding.severity]))
-
-
-def _known(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

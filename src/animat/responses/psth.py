@@ -52,12 +52,10 @@ class ResponseTime:
 
     Attributes:
         start_ms, end_ms: the first stretch of time in which it fires clearly above its spontaneous rate.
-        searched_ms: how far the search went.
     """
 
     start_ms: float
     end_ms: float
-    searched_ms: float
 
 
 def post_stimulus_histogram(
@@ -159,7 +157,7 @@ def find_response(
         return None
     ends = np.flatnonzero(_successive(~above[begins[0] :]))
     last = begins[0] + ends[0] if len(ends) else n_bins
-    return ResponseTime(float(histogram.edges_ms[begins[0]]), float(histogram.edges_ms[last]), to_ms)
+    return ResponseTime(float(histogram.edges_ms[begins[0]]), float(histogram.edges_ms[last]))
 
 
 def _successive(flags: Bool[np.ndarray, " bins"]) -> Bool[np.ndarray, " starts"]:

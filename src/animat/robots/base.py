@@ -5,11 +5,12 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, final
 
 from jaxtyping import Bool, Float
+from pydantic import BeforeValidator, Field
 
-from animat.errors import InvalidArgument, shown
+from animat.records import Number, Whole
 
 if TYPE_CHECKING:
     from jax import Array
@@ -19,6 +20,17 @@ State = TypeVar("State")
 
 LONGEST_EPISODE = 1_000_000
 """Iterations of an episode at most: each has a random key of its own, drawn before the first."""
+
+
+def _whole(given: Any) -> Any:
+    # The command line and files have 120.0 for 120.
+    return int(given) if isinstance(given, float) and given.is_integer() else given
+
+
+EpisodeLimit = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_whole)]
+Size = Annotated[Number, Field(ge=1e-9, le=1e9)]
+Amount = Annotated[Number, Field(ge=0, le=1e9)]
+"""Parameters of a robot: a size is never 0."""
 
 MOST_AT_ONCE = 5_000_000
 """Episodes side by side at most: each takes some 300 bytes."""
@@ -125,30 +137,3 @@ class Robot(abc.ABC, Generic[State]):
     def departures(self) -> tuple[tuple[str, str], ...]:
         """Where it departs from a paper's print: each with a title, for the report of a study; mostly nothing."""
         return ()
-
-
-def check_parameters(robot: Any, **allowed: tuple[float, float]) -> None:
-    """Turn a robot's parameters into the plain numbers they are declared as, and check them.
-
-    Args:
-        robot: a frozen dataclass; fields declared `int` become int, all others float.
-        allowed: the smallest and the largest value of a field, both allowed; others need only be finite.
-
-    Raises:
-        InvalidArgument: for a parameter that is no finite number, or outside what is allowed.
-    """
-    for field in dataclasses.fields(robot):
-        value = getattr(robot, field.name)
-        is_whole = field.type in ("int", int)
-        low, high = allowed.get(field.name, (-math.inf, math.inf))
-        expected = f"a {'whole' if is_whole else 'finite'} number" + (
-            f" from {low:g} to {high:g}" if field.name in allowed else ""
-        )
-        try:
-            number = float(value)
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
-        is_number = math.isfinite(number) and not isinstance(value, bool | str)
-        if not is_number or not low <= number <= high or (is_whole and number != int(number)):
-            raise InvalidArgument(f"{robot.name}: {field.name}: expected {expected}, got {shown(value)}")
-        object.__setattr__(robot, field.name, int(number) if is_whole else number)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
-from animat.robots.base import LONGEST_EPISODE, Quantity, Robot, check_parameters
+from animat.records import Number, record
+from animat.robots.base import Amount, EpisodeLimit, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, INK, PAPER, RAIL, Canvas, Picture
 from animat.robots.registry import register_robot
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 FORESIGHT_S = 0.1
 """The rule made by hand goes by where the pole will lean so much later, at the speed it falls with now."""
-
-_TINY, _HUGE = 1e-9, 1e9
 
 
 class CartpoleState(NamedTuple):
@@ -38,7 +36,7 @@ class CartpoleState(NamedTuple):
 
 @final
 @register_robot
-@dataclass(frozen=True)
+@record
 class Cartpole(Robot[CartpoleState]):
     """A pole hinged on a cart, pushed left or right; +1 an iteration, -100 when it falls or leaves the track.
 
@@ -66,39 +64,23 @@ class Cartpole(Robot[CartpoleState]):
     Source: Sawada et al. 2022, the cartpole task and its table of constants.
     """
 
-    gravity_m_per_s2: float = 9.8
-    cart_mass_kg: float = 0.31
-    pole_mass_kg: float = 0.055
-    pole_length_m: float = 0.4
-    track_length_m: float = 1.0
-    angle_limit_rad: float = math.radians(12.0)
-    force_n: float = 1.0
-    force_noise: float = 0.02
-    step_s: float = 0.02
-    reward_upright: float = 1.0
-    reward_failed: float = -100.0
-    episode_limit: int = 120
+    gravity_m_per_s2: Amount = 9.8
+    cart_mass_kg: Size = 0.31
+    pole_mass_kg: Size = 0.055
+    pole_length_m: Size = 0.4
+    track_length_m: Size = 1.0
+    angle_limit_rad: Size = math.radians(12.0)
+    force_n: Amount = 1.0
+    force_noise: Amount = 0.02
+    step_s: Size = 0.02
+    reward_upright: Number = 1.0
+    reward_failed: Number = -100.0
+    episode_limit: EpisodeLimit = 120
 
     name: ClassVar[str] = "cartpole"
     noise_size: ClassVar[int] = 1
     paper_iterations: ClassVar[int] = 800_000
     baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        positive = (_TINY, _HUGE)
-        check_parameters(
-            self,
-            gravity_m_per_s2=(0.0, _HUGE),
-            cart_mass_kg=positive,
-            pole_mass_kg=positive,
-            pole_length_m=positive,
-            track_length_m=positive,
-            angle_limit_rad=positive,
-            force_n=(0.0, _HUGE),
-            force_noise=(0.0, _HUGE),
-            step_s=positive,
-            episode_limit=(1, LONGEST_EPISODE),
-        )
 
     @property
     def return_range(self) -> tuple[float, float]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pydantic import Field
 
-from animat.robots.base import LONGEST_EPISODE, Quantity, Robot, check_parameters
+from animat.errors import InvalidArgument
+from animat.records import Number, record
+from animat.robots.base import Amount, EpisodeLimit, Quantity, Robot, Size
 from animat.robots.drawing import (
     ACCENT,
     AIM,
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
 
     from animat.robots.grid import Grid
 
-_TINY, _HUGE = 1e-9, 1e9
-
 
 class NavigationState(NamedTuple):
     """Where the robot is and where it looks, seen from above: x to the right, y down from the top-left corner.
@@ -49,7 +49,7 @@ class NavigationState(NamedTuple):
 
 @final
 @register_robot
-@dataclass(frozen=True)
+@record
 class Navigation(Robot[NavigationState]):
     """A robot that turns by the command, then moves ahead; 50 at the goal, else a small cost that falls as it nears.
 
@@ -72,33 +72,25 @@ class Navigation(Robot[NavigationState]):
     Source: Sawada et al. 2022, the navigation task.
     """
 
-    arena_width_m: float = 1.0
-    arena_height_m: float = 1.0
-    stride_m: float = 0.025
-    turn_rad: float = math.pi / 10
-    goal_x_m: float = 0.7
-    goal_y_m: float = 0.7
-    goal_radius_m: float = 0.1
-    reward_goal: float = 50.0
-    episode_limit: int = 100
+    arena_width_m: Size = 1.0
+    arena_height_m: Size = 1.0
+    stride_m: Size = 0.025
+    # One turn never passes half a circle, so one correction brings the heading back into (-pi, pi].
+    turn_rad: Annotated[Number, Field(ge=0, le=math.pi)] = math.pi / 10
+    goal_x_m: Amount = 0.7
+    goal_y_m: Amount = 0.7
+    goal_radius_m: Size = 0.1
+    reward_goal: Number = 50.0
+    episode_limit: EpisodeLimit = 100
 
     name: ClassVar[str] = "navigation"
     noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 500_000
 
     def __post_init__(self) -> None:
-        positive = (_TINY, _HUGE)
-        check_parameters(self, arena_width_m=positive, arena_height_m=positive)
-        check_parameters(
-            self,
-            stride_m=positive,
-            # One turn never passes half a circle, so one correction brings the heading back into (-pi, pi].
-            turn_rad=(0.0, math.pi),
-            goal_x_m=(0.0, self.arena_width_m),
-            goal_y_m=(0.0, self.arena_height_m),
-            goal_radius_m=positive,
-            episode_limit=(1, LONGEST_EPISODE),
-        )
+        for name, most_m in (("goal_x_m", self.arena_width_m), ("goal_y_m", self.arena_height_m)):
+            if getattr(self, name) > most_m:
+                raise InvalidArgument(f"{name}: expected at most {most_m:g}, got {getattr(self, name):g}")
 
     @property
     def return_range(self) -> tuple[float, float]:

@@ -93,8 +93,8 @@ def robot_named(name: str, /, **parameters: float) -> Robot[Any]:
             raise InvalidArgument(f"{name}: expected parameters among {', '.join(known)}, got {shown(parameter)}")
     try:
         return kind(**parameters)
-    except InvalidArgument:
-        raise
+    except InvalidArgument as error:
+        raise InvalidArgument(f"{name}: {error}") from error
     except Exception as error:
         raise InvalidArgument(f"{name}: expected it to be made of {parameters}, got {_said(error)}") from error
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from pydantic import Field
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument
+from animat.records import Number, Whole, record
 
 _MOST = 1_000_000
 
+Count = Annotated[Whole, Field(ge=1, le=_MOST)]
 
-@dataclass(frozen=True)
+
+@record
 class ElectrodeArray:
     """A grid of electrodes numbered row by row: electrode = row x columns + column, from 0.
 
@@ -29,22 +32,11 @@ class ElectrodeArray:
     """
 
     name: str
-    columns: int
-    rows: int
-    pitch_um: float
-    channels: int
-    stimulation_units: int
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str):
-            raise InvalidArgument(f"array.name: expected text, got {shown(self.name)}")
-        for name in ("columns", "rows", "channels", "stimulation_units"):
-            count: Any = getattr(self, name)
-            if not isinstance(count, int | np.integer) or isinstance(count, bool) or not 1 <= count <= _MOST:
-                raise InvalidArgument(f"array.{name}: expected a whole number from 1 to {_MOST:,}, got {shown(count)}")
-        pitch_um: Any = self.pitch_um
-        if not isinstance(pitch_um, int | float) or not 0 < pitch_um <= _MOST:
-            raise InvalidArgument(f"array.pitch_um: expected a distance above 0 um, got {shown(pitch_um)}")
+    columns: Count
+    rows: Count
+    pitch_um: Annotated[Number, Field(gt=0, le=_MOST)]
+    channels: Count
+    stimulation_units: Count
 
     def __len__(self) -> int:
         return self.columns * self.rows

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import fields, replace
+from typing import Annotated, Any, Literal
 
-import numpy as np
+from pydantic import BeforeValidator, Field, SkipValidation
 
-from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
+from animat.records import Number, Whole, record
 from animat.stimulation.places import Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
@@ -21,8 +22,13 @@ _LONGEST_S = 86_400
 _LONGEST_RECORDING_S = 7 * 86_400
 _MOST_BYTES = 2**20
 
+Count = Annotated[Whole, Field(ge=1, le=1_000_000)]
+Pulses = Annotated[Whole, Field(ge=1, le=_MOST_PULSES)]
+Seconds = Annotated[Number, Field(ge=0, le=_LONGEST_S)]
+Frequency = Annotated[Number, Field(gt=0, le=10_000)]
 
-@dataclass(frozen=True)
+
+@record
 class Presentation:
     """The order of the stimulus frequencies and the pulses of one presentation; it travels with the data.
 
@@ -39,24 +45,13 @@ class Presentation:
     """
 
     order: Order
-    pulses: int = 1
-
-    def __post_init__(self) -> None:
-        if self.order not in get_args(Order):
-            raise InvalidArgument(f"order: expected 'blocked' or 'mixed', got {shown(self.order)}")
-        pulses: Any = self.pulses
-        if not isinstance(pulses, int | np.integer) or isinstance(pulses, bool):
-            raise InvalidArgument(f"pulses: expected a whole number, got {shown(pulses)}")
-        if pulses < 1:
-            raise InvalidArgument(f"pulses: expected at least 1 pulse a presentation, got {shown(pulses)}")
-        if pulses > _MOST_PULSES:
-            raise InvalidArgument(f"pulses: expected at most {_MOST_PULSES:,} in a recording, got {shown(pulses)}")
+    pulses: Pulses = 1
 
     def __str__(self) -> str:
         return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} a presentation"
 
 
-@dataclass(frozen=True)
+@record
 class Protocol:
     """What is done in one recording; with patterns and a seed it becomes a `Schedule` (`animat.stimulation.schedule`).
 
@@ -84,36 +79,21 @@ class Protocol:
     Source: the paper's methods; 38.75 s of stimulation in about 120 s with set-up.
     """
 
-    frequencies_hz: tuple[float, ...] = (5.0, 10.0, 20.0, 40.0, 80.0)
+    frequencies_hz: Annotated[tuple[Frequency, ...], Field(min_length=1)] = (5.0, 10.0, 20.0, 40.0, 80.0)
     order: Order = "blocked"
-    pulses: int = 1
-    patterns: int = 100
-    presentations: int = 100
-    places: Places = ()
-    setup_s: float = 14.0
-    pause_s: float = 2.0
-    tail_s: float = 0.1
-    pulse: Pulse = PUBLISHED_PULSE
+    pulses: Pulses = 1
+    patterns: Count = 100
+    presentations: Count = 100
+    places: Annotated[Places, SkipValidation] = ()
+    setup_s: Seconds = 14.0
+    pause_s: Seconds = 2.0
+    tail_s: Seconds = 0.1
+    pulse: Annotated[Pulse, BeforeValidator(Pulse.from_list)] = PUBLISHED_PULSE
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frequencies_hz", tuple(float(f) for f in self.frequencies_hz))
-        if not self.frequencies_hz or not all(0 < f <= 10_000 for f in self.frequencies_hz):
-            raise InvalidArgument(f"frequencies_hz: expected some, above 0 Hz to 10 kHz, got {self.frequencies_hz}")
         if len(set(self.frequencies_hz)) < len(self.frequencies_hz):
             raise InvalidArgument(f"frequencies_hz: expected each once, got {self.frequencies_hz}")
-        for name in ("patterns", "presentations"):
-            if not 1 <= getattr(self, name) <= 1_000_000:
-                raise InvalidArgument(f"{name}: expected 1 to 1,000,000, got {shown(getattr(self, name))}")
         object.__setattr__(self, "places", check_places(self.places))
-        for name in ("setup_s", "pause_s", "tail_s"):
-            if not 0 <= getattr(self, name) <= _LONGEST_S:
-                raise InvalidArgument(
-                    f"{name}: expected seconds from 0 to a day ({_LONGEST_S}), got {getattr(self, name)}"
-                )
-            # A series knows its own protocol by its text, in which 14 is not 14.0.
-            object.__setattr__(self, name, float(getattr(self, name)))
-        # The order and the number of pulses are checked there.
-        _ = self.presentation
         of_each = self.presentations * self.pulses * max(1, self.n_places)
         pulses = len(self.frequencies_hz) * of_each
         if pulses > _MOST_PULSES:
@@ -170,13 +150,9 @@ class Protocol:
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}") from error
         if not isinstance(data, dict):
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
-        known = [each.name for each in fields(Protocol)]
-        for name in data:
-            if name not in known:
-                raise InvalidArgument(f"protocol: expected settings among {', '.join(known)}, got {name!r}")
         if defaults is None and "pulse" not in data:
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
-        return replace(defaults or PAPER, **{name: _setting(name, value) for name, value in data.items()})
+        return replace(defaults or PAPER, **data)
 
 
 def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
@@ -203,33 +179,6 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise InvalidArgument(f"{name}: expected once, got it twice")
         data[name] = value
     return data
-
-
-def _setting(name: str, value: Any) -> Any:
-    """A value of JSON as its attribute is; what it may be beyond its type is checked where a `Protocol` is made."""
-    if name == "frequencies_hz":
-        if not isinstance(value, list):
-            raise InvalidArgument(f"{name}: expected a list of numbers, got {value!r}")
-        return tuple(_number(name, each) for each in value)
-    if name == "pulse":
-        if not isinstance(value, list) or not all(isinstance(phase, dict) for phase in value):
-            raise InvalidArgument(f"{name}: expected a list of phases with duration_us and an amplitude, got {value!r}")
-        return Pulse.from_list([{key: _number(f"pulse.{key}", x) for key, x in phase.items()} for phase in value])
-    if name in ("patterns", "presentations", "pulses"):
-        if not isinstance(value, int) or isinstance(value, bool):
-            raise InvalidArgument(f"{name}: expected a whole number, got {value!r}")
-        return value
-    return value if name in ("order", "places") else _number(name, value)
-
-
-def _number(name: str, value: Any) -> float:
-    # As a float always, as it is in a `Protocol`: a series knows its own by its text.
-    try:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
-    except OverflowError:
-        pass
-    raise InvalidArgument(f"{name}: expected a number, got {str(value)[:40]!r}")
 
 
 PAPER = Protocol()

@@ -119,17 +119,19 @@ class Pulse:
         return [phase.to_dict() for phase in self.phases]
 
     @staticmethod
-    def from_list(phases: Sequence[Mapping[str, Any]]) -> Pulse:
-        """From what `to_list` gave.
+    def from_list(phases: Pulse | Sequence[Mapping[str, Any]]) -> Pulse:
+        """From what `to_list` gave; a pulse is one already.
 
         Raises:
             InvalidArgument: for anything else.
         """
+        if isinstance(phases, Pulse):
+            return phases
         try:
             return Pulse(tuple(Phase(**phase) for phase in phases))
         except TypeError as error:
             raise InvalidArgument(
-                f"pulse: expected phases with duration_us and an amplitude, got {phases!r} ({error})"
+                f"phases: expected a list, each with duration_us and an amplitude, got {phases!r} ({error})"
             ) from error
 
     def __str__(self) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
+from animat.tables import freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +32,7 @@ class ScannedActivity:
     recovery_ms: Float64[np.ndarray, " electrodes"]
 
     def __post_init__(self) -> None:
-        rows = np.shape(self.electrode)
-        for name, dtype in {**dict.fromkeys(_MEASURED, np.float64), "electrode": np.int64}.items():
-            column = np.array(getattr(self, name), dtype=dtype)
-            if column.ndim != 1 or column.shape != rows:
-                raise UnusableData(f"scan.{name}: expected one value an electrode {rows}, got shape {column.shape}")
-            column.setflags(write=False)
-            object.__setattr__(self, name, column)
+        freeze(self, "the scan", electrode=np.int64, **dict.fromkeys(_MEASURED, np.float64))
         if len(np.unique(self.electrode)) != len(self.electrode):
             raise UnusableData("scan.electrode: expected each electrode once, got some twice or more")
 

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from pydantic import Field
 
 from animat.brief import briefly
-from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
+from animat.records import Number, Whole, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
 from animat.writing import written_whole
 
-FORMAT = "animat electrode selection 1"
 _MOST_BYTES = 2**24
 
 
-@dataclass(frozen=True)
+@record
 class SelectionRule:
     """What is asked of a selection; the defaults are the paper's where it gives them.
 
@@ -36,19 +36,31 @@ class SelectionRule:
         patterns, pattern_size, pattern_spacing_um: see `draw_patterns`.
     """
 
-    recording_sites: int = 1024
-    signal_to_noise: float = 6.0
-    spacing_um: float = 18.0
-    stimulation_sites: int = 32
-    patterns: int = 100
-    pattern_size: int = 5
-    pattern_spacing_um: float = 100.0
+    recording_sites: Whole = 1024
+    signal_to_noise: Number = 6.0
+    spacing_um: Number = 18.0
+    stimulation_sites: Whole = 32
+    patterns: Whole = 100
+    pattern_size: Whole = 5
+    pattern_spacing_um: Number = 100.0
 
-    def __post_init__(self) -> None:
-        value: Any
-        for name, value in vars(self).items():
-            if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not math.isfinite(value):
-                raise InvalidArgument(f"rule.{name}: expected a finite number, got {shown(value)}")
+
+Electrode = Annotated[Whole, Field(ge=0, le=2**63 - 1)]
+
+
+@record
+class _Saved:
+    """A selection as its file holds it."""
+
+    format: Literal["animat electrode selection 1"]
+    array: ElectrodeArray
+    rule: SelectionRule
+    seed: Electrode
+    scanned: Electrode
+    passed: Electrode
+    stimulation: tuple[Electrode, ...]
+    patterns: tuple[tuple[Electrode, ...], ...]
+    recording: tuple[Electrode, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +115,7 @@ class Selection:
     def to_dict(self) -> dict[str, Any]:
         """As data for JSON."""
         return {
-            "format": FORMAT,
+            "format": "animat electrode selection 1",
             "array": dict(vars(self.array)),
             "rule": dict(vars(self.rule)),
             "seed": self.seed,
@@ -121,26 +133,19 @@ class Selection:
         Raises:
             InvalidArgument: for anything else.
         """
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            found = data.get("format") if isinstance(data, dict) else type(data).__name__
-            raise InvalidArgument(f"selection: expected {FORMAT!r}, got {found!r}")
-        try:
-            return Selection(
-                array=ElectrodeArray(**data["array"]),
-                recording=_electrodes(data["recording"], 1),
-                stimulation=_electrodes(data["stimulation"], 1),
-                patterns=_electrodes(data["patterns"], 2),
-                rule=SelectionRule(**data["rule"]),
-                seed=_whole(data["seed"]),
-                scanned=_whole(data["scanned"]),
-                passed=_whole(data["passed"]),
-            )
-        except InvalidArgument:
-            raise
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InvalidArgument(
-                f"selection: expected what Selection.to_dict writes, got {shown(error, 200)}"
-            ) from error
+        saved = read_record(_Saved, data, "selection")
+        if len(set(map(len, saved.patterns))) > 1:
+            raise InvalidArgument("selection.patterns: expected as many electrodes in each, got other numbers in some")
+        return Selection(
+            saved.array,
+            np.array(saved.recording, np.int64),
+            np.array(saved.stimulation, np.int64),
+            np.array(saved.patterns or np.empty((0, 0)), np.int64),
+            saved.rule,
+            saved.seed,
+            saved.scanned,
+            saved.passed,
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
@@ -160,21 +165,6 @@ class Selection:
             # Text that is no JSON and data that is no selection both raise a ValueError.
             said = str(error).partition(";")[0]
             raise InvalidFile(f"{path}: expected an electrode selection in JSON: {said}") from error
-
-
-def _electrodes(data: Any, dimensions: int) -> Int64[np.ndarray, "..."]:
-    """Numbers of electrodes as JSON holds them: a list of them, or of lists as long as each other."""
-    values = np.array(data) if data else np.empty((0,) * dimensions, np.int64)
-    # A part of a number, or a text of one, would be made whole in silence.
-    if not isinstance(data, list) or values.dtype.kind != "i":
-        raise InvalidArgument(f"selection: expected whole numbers of electrodes, got {shown(data)}")
-    return values.astype(np.int64)
-
-
-def _whole(data: Any) -> int:
-    if not isinstance(data, int) or isinstance(data, bool) or not 0 <= data < 2**63:
-        raise InvalidArgument(f"selection: expected a whole number, got {shown(data)}")
-    return data
 
 
 def select_electrodes(

@@ -3,39 +3,59 @@
 from __future__ import annotations
 
 import itertools
-import math
+import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal
+from dataclasses import asdict, fields, replace
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, AliasChoices, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
 from animat.coding.mapping import MAPPING_NAMES
 from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
 from animat.recordings.made_up import MadeUpCulture
+from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import is_ours, place_of, robot_named
 from animat.stimulation.protocol import Protocol
-from animat.studies.bounds import (
-    MOST_PRESENTATIONS,
-    MOST_SESSIONS,
-    check_algorithm,
-    check_name,
-    expect_at_once,
-    expect_choices,
-    expect_counts,
-    expect_positive,
-    expect_resolution,
-    expect_seed,
-    expect_trained,
-    expect_unlike,
-)
-from animat.training.bounds import MOST_ITERATIONS, MOST_POLICIES
+from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
 MAPPINGS = (*MAPPING_NAMES, "none")
 """Names of mappings that a condition may have; none is the baseline without neurons."""
+MOST_SESSIONS, MOST_PRESENTATIONS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
+"""Recordings, presentations in each, and entries of a list; `docs/studies.md` states them."""
+MOST_TRAINED = 20_000
+"""Policies of all conditions on all robots: each is a file, and five are a job."""
+FINEST_RESOLUTION = 2.0
+"""Of the best possible return's grid: the cartpole's tables are of 2 GiB there, and grow with its fourth power."""
+
+_LISTED = Field(max_length=MOST_ENTRIES)
 
 
-@dataclass(frozen=True)
+def _name(given: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,60}", given):
+        raise ValueError(f"expected letters, digits, spaces, dots and dashes, got {shown(given)}")
+    try:
+        float(given)
+    except ValueError:
+        return given
+    raise ValueError(f"expected a name, got {given!r}, which in a table would be a number")
+
+
+def _as_given(given: float, checked: ValidatorFunctionWrapHandler) -> float:
+    checked(given)
+    return given
+
+
+Name = Annotated[str, AfterValidator(_name)]
+Numbers = dict[str, Annotated[float, Strict(), WrapValidator(_as_given)]]
+"""By name, each as it is given: 64 stays a whole number."""
+Episodes = Annotated[Whole, Field(ge=1, le=MOST_AT_ONCE)]
+Resolution = Annotated[Number, Field(ge=0.1, le=FINEST_RESOLUTION)]
+
+
+@record
 class Source:
     """Where the recordings come from: files, or a culture that is recorded for the study.
 
@@ -49,56 +69,42 @@ class Source:
     """
 
     kind: Literal["virtual", "made-up", "files"] = "virtual"
-    files: tuple[str, ...] = ()
-    seed: int = 1
-    sessions: int = 15
-    interval_min: float = 10.0
+    files: Annotated[tuple[str, ...], _LISTED] = ()
+    seed: Seed = 1
+    sessions: Annotated[Whole, Field(ge=1, le=MOST_SESSIONS)] = 15
+    interval_min: Positive = 10.0
     order: Literal["blocked", "mixed"] = "blocked"
-    pulses: int = 1
-    presentations: int = 100
-    channels: int = 256
+    pulses: Annotated[Whole, Field(ge=1, le=MOST_PRESENTATIONS)] = 1
+    presentations: Annotated[Whole, Field(ge=2, le=MOST_PRESENTATIONS)] = 100
+    channels: Annotated[Whole, Field(ge=1, le=1024)] = 256
 
     def __post_init__(self) -> None:
         if (self.kind == "files") != bool(self.files):
-            raise InvalidArgument(f"culture.files: expected some for kind = 'files' only, got {len(self.files)}")
-        expect_choices("culture", self)
-        expect_seed("culture.seed", self.seed)
-        expect_counts(
-            "culture",
-            self,
-            sessions=(1, MOST_SESSIONS),
-            pulses=(1, MOST_PRESENTATIONS),
-            presentations=(2, MOST_PRESENTATIONS),
-            channels=(1, 1024),
-        )
-        expect_positive("culture.interval_min", self.interval_min)
+            raise InvalidArgument(f"files: expected some for kind = 'files' only, got {len(self.files)}")
         if self.sessions * self.interval_min > LONGEST_MIN:
             raise InvalidArgument(
-                f"culture.sessions, culture.interval_min: expected recordings within a year, got {self.sessions} every "
+                f"sessions, interval_min: expected recordings within a year, got {self.sessions} every "
                 f"{self.interval_min:g} min"
             )
         for file in self.files:
             if not file or not file.isprintable():
-                raise InvalidArgument(f"culture.files: expected names of files, got {shown(file)}")
+                raise InvalidArgument(f"files: expected names of files, got {shown(file)}")
         if self.kind == "files":
             for each in fields(self):
                 if each.name not in ("kind", "files") and getattr(self, each.name) != each.default:
                     raise InvalidArgument(
-                        f"culture.{each.name}: expected only for a culture that is recorded, got one of files"
+                        f"{each.name}: expected only for a culture that is recorded, got one of files"
                     )
         if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
-            raise InvalidArgument("culture.order: a made-up culture is recorded blocked with one pulse, got otherwise")
+            raise InvalidArgument("order: a made-up culture is recorded blocked with one pulse, got otherwise")
         # What the recordings themselves refuse is refused before there is a folder.
-        try:
-            if self.kind == "virtual":
-                Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations)
-            elif self.kind == "made-up":
-                MadeUpCulture(self.seed, patterns=self.presentations, channels=self.channels)
-        except InvalidArgument as error:
-            raise InvalidArgument(f"culture.{error}") from error
+        if self.kind == "virtual":
+            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations)
+        elif self.kind == "made-up":
+            MadeUpCulture(self.seed, patterns=self.presentations, channels=self.channels)
 
 
-@dataclass(frozen=True)
+@record
 class Simulators:
     """How responses are read and neuron simulators made of them; as the options of `animat train`.
 
@@ -112,39 +118,29 @@ class Simulators:
     """
 
     kind: Literal["histogram", "empirical", "memory"] = "histogram"
-    bins: int = 20
-    range_hz: float | None = None
+    bins: Whole = 20
+    range_hz: Number | None = None
     conditions: str = ""
-    window_ms: tuple[float, float] = (2.0, 10.0)
-    burst_threshold: float | None = None
-    allow: tuple[str, ...] = ()
+    window_ms: tuple[Number, Number] = (2.0, 10.0)
+    burst_threshold: Share | None = None
+    # What it was called in files that are still read.
+    allow: Annotated[tuple[str, ...], _LISTED, Field(validation_alias=AliasChoices("allow", "despite"))] = ()
 
     def __post_init__(self) -> None:
-        from animat.neurons.simulator import LARGEST_BINS
+        from animat.neurons.simulator import check_binning
         from animat.responses.conditions import conditions_named
         from animat.responses.series import check_allowed
         from animat.responses.windows import check_window
 
         # All before anything is recorded: whoever corrects it later needs another folder.
-        expect_choices("simulators", self)
-        if not 1 <= self.bins <= LARGEST_BINS:
-            raise InvalidArgument(f"simulators.bins: expected 1 to {LARGEST_BINS}, got {self.bins}")
-        if self.range_hz is not None:
-            expect_positive("simulators.range_hz", self.range_hz)
-        if self.burst_threshold is not None and not 0 <= self.burst_threshold <= 1:
-            raise InvalidArgument(
-                f"simulators.burst_threshold: expected a share of channels from 0 to 1, got {self.burst_threshold:g}"
-            )
-        try:
-            check_window(self.window_ms)
-            check_allowed(self.allow)
-            if self.conditions:
-                conditions_named(self.conditions)
-        except InvalidArgument as error:
-            raise InvalidArgument(f"simulators.{error}") from error
+        check_binning(self.bins, self.range_hz)
+        check_window(self.window_ms)
+        check_allowed(self.allow)
+        if self.conditions:
+            conditions_named(self.conditions)
 
 
-@dataclass(frozen=True)
+@record
 class Body:
     """A robot of the study.
 
@@ -158,21 +154,16 @@ class Body:
         limit_resolution: of its best possible return, in place of the study's.
     """
 
-    name: str
-    iterations: int | None = None
-    limit_resolution: float | None = None
-    parameters: dict[str, float] = field(default_factory=dict)
+    name: Name
+    iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] | None = None
+    limit_resolution: Resolution | None = None
+    parameters: Numbers = Field(default_factory=dict)
     kind: str = ""
 
     def __post_init__(self) -> None:
-        if self.iterations is not None:
-            expect_counts("robots", self, iterations=(1, MOST_ITERATIONS))
-        if self.limit_resolution is not None:
-            expect_resolution("robots.limit_resolution", self.limit_resolution)
         robot = self.robot()
-        check_name("robots.name", self.name)
         if self.name == "culture":
-            raise InvalidArgument("robots.name: expected another name than the culture's figures have, got 'culture'")
+            raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
         if not is_ours(robot):
             # Workers know it by that.
             object.__setattr__(self, "kind", place_of(type(robot)))
@@ -187,7 +178,7 @@ class Body:
         return self.robot().paper_iterations if self.iterations is None else self.iterations
 
 
-@dataclass(frozen=True)
+@record
 class StudyCondition:
     """One way to train policies, on each robot.
 
@@ -200,18 +191,16 @@ class StudyCondition:
         trained: false for policies as they are before training.
     """
 
-    name: str
+    name: Name
     mapping: str = "1-threshold"
-    shadowing: bool = True
+    shadowing: Flag = True
     delivery: Literal["chosen", "shuffled"] = "chosen"
     percentiles: Literal["moving", "first"] = "moving"
-    trained: bool = True
+    trained: Flag = True
 
     def __post_init__(self) -> None:
-        check_name("conditions.name", self.name)
-        expect_choices("conditions", self)
         if self.mapping not in MAPPINGS:
-            raise InvalidArgument(f"conditions.mapping: expected one of {', '.join(MAPPINGS)}, got {self.mapping!r}")
+            raise InvalidArgument(f"mapping: expected one of {', '.join(MAPPINGS)}, got {shown(self.mapping)}")
 
     @property
     def slug(self) -> str:
@@ -229,7 +218,7 @@ class StudyCondition:
         return self.trained and self.through_neurons and not self.shadowing and self.delivery == "chosen"
 
 
-@dataclass(frozen=True)
+@record
 class Compared:
     """Two conditions that are compared on every robot, by the policies' mean returns.
 
@@ -240,25 +229,20 @@ class Compared:
         episodes: of each policy.
     """
 
-    name: str
+    name: Name
     first: str
     second: str
-    at_min: float | None = None
-    episodes: int = 100
+    at_min: Number | None = None
+    episodes: Episodes = 100
 
     def __post_init__(self) -> None:
-        check_name("comparisons.name", self.name)
         if self.first == self.second:
             raise InvalidArgument(
-                f"comparisons.second: expected another condition than the first, got {self.second!r} twice in "
-                f"{self.name!r}"
+                f"second: expected another condition than the first, got {self.second!r} twice in {self.name!r}"
             )
-        expect_counts("comparisons", self, episodes=(1, MOST_AT_ONCE))
-        if self.at_min is not None and not math.isfinite(self.at_min):
-            raise InvalidArgument(f"comparisons.at_min: expected finite minutes, got {self.at_min:g}")
 
 
-@dataclass(frozen=True)
+@record
 class Study:
     """Everything that decides how a study comes out, but for the recordings in files.
 
@@ -275,7 +259,7 @@ class Study:
         actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
         limit_resolution: steps of the grid of the best possible return, as a multiple; 0.6 is fast and rough.
         limit_episodes: episodes in which that controller's return is checked.
-        algorithm: settings of `animat.training.sac.SAC` in place of its defaults.
+        algorithm: settings of `animat.training.settings.SAC` in place of its defaults.
         paper: whether the paper's own figures are printed beside comparisons of the same name and robot.
 
     Raises:
@@ -283,48 +267,46 @@ class Study:
     """
 
     title: str = "Study"
-    culture: Source = field(default_factory=Source)
-    simulators: Simulators = field(default_factory=Simulators)
-    robots: tuple[Body, ...] = (Body("cartpole"), Body("navigation"))
-    conditions: tuple[StudyCondition, ...] = (StudyCondition("1 threshold"),)
-    comparisons: tuple[Compared, ...] = ()
-    policies: int = 10
-    seed: int = 1
-    training_min: float = 60.0
-    episodes: int = 100
-    episodes_over_time: int = 30
+    culture: Source = Field(default_factory=Source)
+    simulators: Simulators = Field(default_factory=Simulators)
+    robots: Annotated[tuple[Body, ...], _LISTED] = (Body("cartpole"), Body("navigation"))
+    conditions: Annotated[tuple[StudyCondition, ...], _LISTED] = (StudyCondition("1 threshold"),)
+    comparisons: Annotated[tuple[Compared, ...], _LISTED] = ()
+    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
+    seed: Seed = 1
+    training_min: Positive = 60.0
+    episodes: Episodes = 100
+    episodes_over_time: Episodes = 30
     actions: Literal["most probable", "drawn"] = "most probable"
-    limit_resolution: float = 1.0
-    limit_episodes: int = 4000
-    algorithm: dict[str, float] = field(default_factory=dict)
-    paper: bool = False
+    limit_resolution: Resolution = 1.0
+    limit_episodes: Annotated[Whole, Field(ge=2, le=MOST_AT_ONCE)] = 4000
+    algorithm: Numbers = Field(default_factory=dict)
+    paper: Flag = False
 
     def __post_init__(self) -> None:
         for what in ("robots", "conditions"):
             if not getattr(self, what):
                 raise InvalidArgument(f"{what}: expected at least one, got none")
-        expect_unlike("robots", [body.name for body in self.robots])
-        expect_unlike("conditions", [condition.slug for condition in self.conditions])
-        expect_unlike("comparisons", [compared.name for compared in self.comparisons])
-        expect_choices("", self)
-        expect_seed("seed", self.seed)
-        expect_counts(
-            "",
-            self,
-            policies=(1, MOST_POLICIES),
-            episodes=(1, MOST_AT_ONCE),
-            episodes_over_time=(1, MOST_AT_ONCE),
-            limit_episodes=(2, MOST_AT_ONCE),
-        )
+        _expect_unlike("robots", [body.name for body in self.robots])
+        _expect_unlike("conditions", [condition.slug for condition in self.conditions])
+        _expect_unlike("comparisons", [compared.name for compared in self.comparisons])
+        # All policies are evaluated side by side.
         for name, episodes in (
             ("episodes", self.episodes),
             ("episodes_over_time", self.episodes_over_time),
             *(("comparisons.episodes", compared.episodes) for compared in self.comparisons),
         ):
-            expect_at_once(name, episodes, self.policies)
-        expect_trained(len(self.robots) * len(self.conditions) * self.policies)
-        expect_positive("training_min", self.training_min)
-        expect_resolution("limit_resolution", self.limit_resolution)
+            if episodes * self.policies > MOST_AT_ONCE:
+                raise InvalidArgument(
+                    f"{name}: expected at most {MOST_AT_ONCE:,} of all policies together, got {episodes:,} of each of "
+                    f"{self.policies}"
+                )
+        trained = len(self.robots) * len(self.conditions) * self.policies
+        if trained > MOST_TRAINED:
+            raise InvalidArgument(
+                f"policies: expected at most {MOST_TRAINED:,} in a study, got {trained:,} (robots x conditions x "
+                "policies)"
+            )
         known = [condition.name for condition in self.conditions]
         for compared in self.comparisons:
             for side in ("first", "second"):
@@ -337,8 +319,7 @@ class Study:
         if self.culture.kind != "files" and self.needs_neurons:
             for compared in self.comparisons:
                 self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
-        if self.algorithm:
-            check_algorithm(self.algorithm)
+        read_record(SAC, self.algorithm, "algorithm")
 
     def condition(self, name: str) -> StudyCondition:
         """The condition of this name."""
@@ -397,3 +378,9 @@ class Study:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
         return asdict(self)
+
+
+def _expect_unlike(what: str, names: Sequence[str]) -> None:
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times")

@@ -18,7 +18,7 @@ from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.task import StudyTask
 from animat.training.folder import describe, provenance_of, write_description
 from animat.training.group import Group, save_policies, untrained_policies
-from animat.training.sac import SAC
+from animat.training.settings import SAC
 from animat.training.specification import Training
 
 

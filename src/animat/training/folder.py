@@ -152,7 +152,7 @@ def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
 def groups_of(
     training: Training, timeline: SimulatorTimeline | None, manifest: dict[str, Any], *, fewest: int = 1
 ) -> list[Group]:
-    """All policies of a training in groups, `fewest` at least, that go to other processes; `manifest` describes both."""
+    """All policies of a training in groups, `fewest` at least, that can go to other processes."""
     if timeline is not None:
         timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
     return [

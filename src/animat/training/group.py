@@ -21,7 +21,8 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.training.policy import Policy
-from animat.training.sac import SAC, Learner, begin, train_chunk
+from animat.training.sac import Learner, begin, train_chunk
+from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.writing import written_whole
 

@@ -7,24 +7,27 @@ import json
 import math
 import os
 from collections.abc import Mapping as Dict
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Float32
+from pydantic import Field
 
 from animat.brief import briefly
 from animat.coding.mapping import Mapping, expect_loadable_mapping, mapping_named
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, shown
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file, is_folder
+from animat.records import Number, read_record
 from animat.responses.condition import Condition
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import expect_loadable_robot, robot_from_dict, robot_to_dict
 from animat.stimulation.protocol import Presentation
-from animat.training.provenance import expect_provenance, is_number
+from animat.training.provenance import expect_provenance
 from animat.writing import written_whole
 
 FORMAT = "animat-policy-1"
@@ -35,6 +38,8 @@ _ARRAYS = ("scales", "learning_curve", *(f"layer{i}.{part}" for i in range(_LAYE
 _MOST_BYTES = 2**28
 _LARGEST = 1e6
 """Trained weights are of order one; with larger ones than this the outputs overflow, and the actions mean nothing."""
+
+Command = Annotated[Number, Field(ge=-1, le=1)]
 
 FITTED = ("kind", "bins", "range_hz", "by", "burst_threshold")
 """What of `SimulatorTimeline.fitted` decides what a simulator of a recording is."""
@@ -77,15 +82,9 @@ class Policy:
     def __post_init__(self) -> None:
         self._expect_network()
         if self.window_ms is not None:
-            if not (
-                isinstance(self.window_ms, tuple) and len(self.window_ms) == 2 and all(map(is_number, self.window_ms))
-            ):
-                raise InvalidArgument(f"window_ms: expected a start and a later end, got {shown(self.window_ms)}")
-            check_window(self.window_ms)
-        if self.commands is not None and not (
-            isinstance(self.commands, tuple) and all(is_number(u) and abs(u) <= 1 for u in self.commands)
-        ):
-            raise InvalidArgument(f"commands: expected numbers from -1 to 1, got {shown(self.commands)}")
+            check_window(read_record(tuple[Number, Number], self.window_ms, "window_ms"))
+        if self.commands is not None:
+            read_record(tuple[Command, ...], self.commands, "commands")
         if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
             raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
         expect_provenance(self.provenance)
@@ -288,6 +287,23 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
     if activation != HIDDEN_ACTIVATION:
         raise InvalidFile(f"{path}: expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
     return arrays, described
+
+
+def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
+    """The first of several policies, which stands for all.
+
+    Raises:
+        InvalidArgument: for none.
+        Mismatch: if they differ in one of the attributes, with the advice.
+    """
+    if not policies:
+        raise InvalidArgument("policies: expected at least one, got none")
+    first_name, first = next(iter(policies.items()))
+    for name, policy in policies.items():
+        for attribute in attributes:
+            if getattr(policy, attribute) != getattr(first, attribute):
+                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; {advice}")
+    return first
 
 
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:

@@ -5,55 +5,43 @@ The rest of it is for people and is kept as it is. JAX is not imported here: pol
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from animat.errors import InvalidArgument, shown
+from pydantic import Field
+from typing_extensions import TypedDict
 
-Expected = tuple[str, Callable[[Any], bool]]
+from animat.errors import InvalidArgument
+from animat.records import Flag, Number, Positive, Share, Whole, read_record
 
-
-def is_number(value: Any) -> bool:
-    """Whether it is a finite number, as JSON has them."""
-    # For a whole number beyond all floats math.isfinite raises an error.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+Count = Annotated[Whole, Field(ge=1, le=10**9)]
 
 
-def _whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 10**9
+class Trained(TypedDict, total=False):
+    """How it was trained; what is left out is not known."""
+
+    shadowing: Flag
+    duration_min: Positive | None
+    chunks: Count
+    percentiles: Literal["moving", "first"]
+    delivery: Literal["chosen", "shuffled"]
 
 
-def _one_of(*words: str) -> Expected:
-    return f"one of {', '.join(words)}", lambda value: isinstance(value, str) and value in words
+class Simulated(TypedDict, total=False):
+    """The simulators that it was trained on; what is left out is not known."""
+
+    kind: Literal["histogram", "empirical", "memory"]
+    bins: Count | None
+    range_hz: Positive | None
+    by: str | None
+    burst_threshold: Share | None
+    recorded_at_min: list[Number]
 
 
-_POSITIVE: Expected = "a positive number", lambda value: is_number(value) and value > 0
+class Provenance(TypedDict, total=False):
+    """All that is read of a provenance."""
 
-READ: Mapping[str, Mapping[str, Expected]] = {
-    "training": {
-        "shadowing": ("true or false", lambda value: isinstance(value, bool)),
-        "duration_min": ("a positive number, or none", lambda value: value is None or _POSITIVE[1](value)),
-        "chunks": ("a whole number from 1 on", _whole),
-        "percentiles": _one_of("moving", "first"),
-        "delivery": _one_of("chosen", "shuffled"),
-    },
-    "simulators": {
-        "kind": _one_of("histogram", "empirical", "memory"),
-        "bins": ("a whole number from 1 on, or none", lambda value: value is None or _whole(value)),
-        "range_hz": ("a positive number, or none", lambda value: value is None or _POSITIVE[1](value)),
-        "by": ("text, or none", lambda value: value is None or isinstance(value, str)),
-        "burst_threshold": (
-            "a share of channels from 0 to 1, or none",
-            lambda value: value is None or (is_number(value) and 0 <= value <= 1),
-        ),
-        "recorded_at_min": (
-            "minutes",
-            lambda value: isinstance(value, list) and all(is_number(minute) for minute in value),
-        ),
-    },
-}
-"""All that is read of a provenance: what each may be, in words and as a check; what is left out is not known."""
+    training: Trained | None
+    simulators: Simulated | None
 
 
 def expect_provenance(provenance: Any) -> None:
@@ -62,17 +50,7 @@ def expect_provenance(provenance: Any) -> None:
     Raises:
         InvalidArgument: naming it, what was expected and what came.
     """
-    if not isinstance(provenance, Mapping):
-        raise InvalidArgument(f"provenance: expected named data, got {shown(provenance)}")
-    for part, entries in READ.items():
-        told = provenance.get(part)
-        if told is None:
-            continue
-        if not isinstance(told, Mapping):
-            raise InvalidArgument(f"provenance.{part}: expected named data, got {shown(told)}")
-        for name, (expected, is_good) in entries.items():
-            if name in told and not is_good(told[name]):
-                raise InvalidArgument(f"provenance.{part}.{name}: expected {expected}, got {shown(told[name])}")
-        # From when on a simulator was the last one in training takes both.
-        if told.get("duration_min") is not None and "chunks" not in told:
-            raise InvalidArgument(f"provenance.{part}: expected chunks beside duration_min, got none")
+    trained = read_record(Provenance, provenance, "provenance").get("training") or {}
+    # From when on a simulator was the last one in training takes both.
+    if trained.get("duration_min") is not None and "chunks" not in trained:
+        raise InvalidArgument("provenance.training: expected chunks beside duration_min, got none")

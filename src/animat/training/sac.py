@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -28,68 +27,8 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from animat.animat import Environment, EpisodeState
-from animat.errors import InvalidArgument, shown
 from animat.neurons.simulator import NeuronSimulator
-from animat.training.bounds import MOST_OF
-
-
-@dataclass(frozen=True)
-class SAC:
-    """The algorithm's settings; all of them static under jit.
-
-    Attributes:
-        environments: episodes run side by side by one policy.
-        updates: gradient updates after each step of all of them; updates / environments is the replay ratio.
-        batch: transitions in one update.
-        replay: transitions remembered; the oldest are forgotten first.
-        hidden: width of each of the two hidden layers of actor and critics.
-        learning_rate: of Adam, for actor, critics and alpha.
-        discount: gamma.
-        follow: share of the critics that the target critics take over at each update (tau).
-        reward_scale: rewards are multiplied by it inside the learner only.
-        averaging: the deployed actor is an average over about the last 1 / (averaging + 1) of its training so far.
-        first_alpha: weight of the entropy bonus at the start.
-        entropy_share: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
-        entropy_nats: the entropy that a continuous action keeps.
-
-    Raises:
-        InvalidArgument: for a count below 1 or beyond what fits, a rate or a share outside what it may be, or a replay
-            that is no multiple of the environments.
-    """
-
-    environments: int = 32
-    updates: int = 4
-    batch: int = 64
-    replay: int = 131_072
-    hidden: int = 64
-    learning_rate: float = 1e-3
-    discount: float = 0.99
-    follow: float = 0.005
-    reward_scale: float = 0.1
-    averaging: int = 3
-    first_alpha: float = 0.1
-    entropy_share: float = 0.1
-    entropy_nats: float = -1.0
-
-    def __post_init__(self) -> None:
-        for name, most in MOST_OF.items():
-            count: Any = getattr(self, name)
-            if not (count >= 1 and count % 1 == 0):
-                raise InvalidArgument(f"{name}: expected a whole number from 1 on, got {shown(count)}")
-            if count > most:
-                raise InvalidArgument(f"{name}: expected at most {most}, got {shown(count)}")
-        for name in ("learning_rate", "reward_scale", "first_alpha"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")
-        for name in ("discount", "follow", "entropy_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InvalidArgument(f"{name}: expected a number from 0 to 1, got {getattr(self, name)}")
-        if not math.isfinite(self.entropy_nats):
-            raise InvalidArgument(f"entropy_nats: expected a finite number, got {self.entropy_nats}")
-        if self.replay % self.environments:
-            raise InvalidArgument(
-                f"replay: expected a multiple of environments ({self.environments}), got {self.replay}"
-            )
+from animat.training.settings import SAC
 
 
 class Layer(NamedTuple):

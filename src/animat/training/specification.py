@@ -15,8 +15,7 @@ from animat.errors import InvalidArgument, shown
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.base import Robot
 from animat.robots.registry import robot_named, robot_to_dict
-from animat.training.bounds import MOST_ITERATIONS, MOST_POLICIES
-from animat.training.sac import SAC
+from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
 Percentiles = Literal["moving", "first"]
 

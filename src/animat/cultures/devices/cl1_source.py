@@ -46,14 +46,6 @@ class StimulusEvent(Protocol):
     phase_currents_uA: tuple[float, ...]
 
 
-class Spike(Protocol):
-    """A spike for the SDK: frame, channel, waveform."""
-
-    timestamp: int
-    channel: int
-    samples: Float32[np.ndarray, " samples"]
-
-
 class SimulatedCL1:
     """A tissue under the CL1's 8 x 8 electrodes, read in frames; knows nothing of the SDK.
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from animat.errors import InvalidArgument
+from animat.records import Number, Positive, record
 
 Engine = Literal["auto", "scipy", "spikeinterface"]
 
 
-@dataclass(frozen=True)
+Milliseconds = Annotated[Number, Field(ge=0, le=1000)]
+
+
+@record
 class Detection:
     """How spikes are found in raw traces.
 
@@ -31,30 +35,17 @@ class Detection:
         InvalidArgument: naming the setting, what was expected and what came.
     """
 
-    band_hz: tuple[float, float] | None = (100.0, 3000.0)
-    threshold: float = 5.0
-    dead_time_ms: float = 1.0
-    blank_ms: tuple[float, float] = (0.5, 1.5)
-    saturation_uv: float | None = None
-    recovery_ms: float = 20.0
-    chunk_s: float = 0.5
+    band_hz: tuple[Positive, Positive] | None = (100.0, 3000.0)
+    threshold: Annotated[Positive, Field(lt=1000)] = 5.0
+    dead_time_ms: Annotated[Number, Field(ge=0, le=100)] = 1.0
+    blank_ms: tuple[Milliseconds, Milliseconds] = (0.5, 1.5)
+    saturation_uv: Positive | None = None
+    recovery_ms: Milliseconds = 20.0
+    chunk_s: Annotated[Number, Field(ge=0.1, le=60)] = 0.5
     engine: Engine = "auto"
 
     def __post_init__(self) -> None:
-        if self.band_hz is not None:
-            low, high = self.band_hz
-            _expect(0 < low < high < math.inf, "band_hz", "0 < low < high in Hz", self.band_hz)
-        _expect(0 < self.threshold < 1000, "threshold", "0 to 1,000 standard deviations", self.threshold)
-        _expect(0 <= self.dead_time_ms <= 100, "dead_time_ms", "0 to 100 ms", self.dead_time_ms)
-        _expect(all(0 <= ms <= 1000 for ms in self.blank_ms), "blank_ms", "0 to 1,000 ms, twice", self.blank_ms)
-        _expect(self.saturation_uv is None or self.saturation_uv > 0, "saturation_uv", "above 0", self.saturation_uv)
-        _expect(self.blank_ms[1] <= self.recovery_ms <= 1000, "recovery_ms", "from blank_ms to 1 s", self.recovery_ms)
-        _expect(0.1 <= self.chunk_s <= 60, "chunk_s", "0.1 to 60 s", self.chunk_s)
-        _expect(
-            self.engine in ("auto", "scipy", "spikeinterface"), "engine", "auto, scipy, spikeinterface", self.engine
-        )
-
-
-def _expect(is_right: bool, name: str, expected: str, got: object) -> None:
-    if not is_right:
-        raise InvalidArgument(f"{name}: expected {expected}, got {got}")
+        if self.band_hz is not None and not self.band_hz[0] < self.band_hz[1]:
+            raise InvalidArgument(f"band_hz: expected 0 < low < high in Hz, got {self.band_hz}")
+        if not self.blank_ms[1] <= self.recovery_ms:
+            raise InvalidArgument(f"recovery_ms: expected from blank_ms to 1 s, got {self.recovery_ms}")

@@ -23,10 +23,10 @@ import numpy as np
 
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, left_out_of
+from animat.recordings.formats.stimulus_text import padded
 from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
-from animat.tables import UNKNOWN
 
 SPIKE_COLUMNS = {
     "spike_time_s": ("spike_time_s", "time_s", "time"),
@@ -121,8 +121,7 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
     columns = {name: plain_column(table, i, name) for name, i in place.items()}
     left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
     if left_out:
-        sentence = f"columns of {table.path.name} that are not known were left out: {', '.join(left_out)}"
-        table.findings.append(Finding("columns-left-out", "note", sentence, float(len(left_out))))
+        table.findings.append(left_out_of("columns", left_out, table.path.name))
     return columns, table.findings
 
 
@@ -190,7 +189,4 @@ def _electrodes(table: TextTable, place: int) -> Column:
         raise InvalidFile(
             f"{table.path}: stimulus_electrodes: expected a few electrodes a stimulus, got {width} in one line"
         )
-    electrodes = np.full((len(lists), width), UNKNOWN)
-    for row_of, numbers in zip(electrodes, lists, strict=True):
-        row_of[: len(numbers)] = numbers
-    return electrodes
+    return padded(lists)

@@ -21,7 +21,7 @@ import numpy as np
 
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding
+from animat.recordings.findings import left_out_of
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -75,11 +75,8 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
         columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
-    findings = []
-    if left_out:
-        sentence = f"keys that are not known were left out: {', '.join(left_out)}"
-        findings.append(Finding("keys-left-out", "note", sentence, float(len(left_out))))
-    return PlainColumns(**columns).to_recording(provenance, tuple(findings))
+    findings = (left_out_of("keys", left_out),) if left_out else ()
+    return PlainColumns(**columns).to_recording(provenance, findings)
 
 
 def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Column], list[str]]:

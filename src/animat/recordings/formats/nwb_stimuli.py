@@ -30,7 +30,6 @@ from animat.recordings.formats.stimulus_text import padded
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")
 SPEAKS_OF_STIMULI = re.compile(r"stim|pulse|trigger|ttl", re.IGNORECASE)
-NEWER_EVENTS = "EventsTable"
 COLUMNS = {
     "stimulus_frequency_hz": ("frequency_hz", "frequency", "stimulus_frequency", "stim_frequency"),
     "stimulus_pattern": ("pattern", "stimulus_pattern", "stimulus_type", "stimulus_name", "condition", "label"),

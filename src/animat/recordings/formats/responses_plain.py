@@ -22,7 +22,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, left_out_of
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, plain_column
 from animat.recordings.formats.npz import load_columns
 from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
@@ -95,10 +95,7 @@ def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
     window = arrays.pop("response_window_ms", None)
     if window is not None and np.shape(window) != (2,):
         raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
-    findings = []
-    if left_out:
-        sentence = f"keys that are not known were left out: {', '.join(left_out)}"
-        findings.append(Finding("keys-left-out", "note", sentence, float(len(left_out))))
+    findings = [left_out_of("keys", left_out)] if left_out else []
     labels = arrays.pop("channel_label", np.arange(values.shape[1]))
     return _table(
         values,
@@ -135,8 +132,7 @@ def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
         columns["start_min"] = single["start_min"]
     left_out = [name for i, name in enumerate(table.header) if i not in used]
     if left_out:
-        sentence = f"columns of {table.path.name} that are not known were left out: {', '.join(left_out)}"
-        table.findings.append(Finding("columns-left-out", "note", sentence, float(len(left_out))))
+        table.findings.append(left_out_of("columns", left_out, table.path.name))
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
     return _table(values, kind, labels, columns, window_ms, provenance, table.findings)

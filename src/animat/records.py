@@ -1,0 +1,128 @@
+"""Records that go to files: pydantic checks every field by its annotation, and the first mistake is told in a line."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
+
+import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+from pydantic_core import ErrorDetails
+
+from animat.errors import InvalidArgument, shown
+
+T = TypeVar("T")
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+Whole = Annotated[int, Strict(), BeforeValidator(_plain)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False), BeforeValidator(_plain)]
+Flag = Annotated[bool, Strict()]
+"""As a file has them, or numpy: a whole number is good for a number, and nothing else is turned into anything."""
+Positive = Annotated[Number, Field(gt=0)]
+Share = Annotated[Number, Field(ge=0, le=1)]
+Seed = Annotated[Whole, Field(ge=0, le=2**32 - 1)]
+"""JAX takes 32 bits of a seed: beyond them two seeds would give the same draws."""
+
+_EXPECTED = {
+    "bool_type": "true or false",
+    "dataclass_type": "a table",
+    "dict_type": "a table",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "greater_than": "more than {gt:,}",
+    "greater_than_equal": "at least {ge:,}",
+    "int_type": "a whole number",
+    "less_than": "less than {lt:,}",
+    "less_than_equal": "at most {le:,}",
+    "list_type": "a list",
+    "literal_error": "{expected}",
+    "string_type": "text",
+    "too_long": "at most {max_length:,} entries",
+    "too_short": "at least {min_length:,}",
+    "tuple_type": "a list",
+}
+"""What a field is expected to be, by the type of pydantic's error."""
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(Field,))
+def record(kind: type[T]) -> type[T]:
+    """A decorator: makes a class a frozen dataclass whose fields are checked whoever makes it, Python or a file.
+
+    Making one raises InvalidArgument, naming the field, what was expected and what came. What no annotation says is
+    checked in `__post_init__`, which raises InvalidArgument too.
+    """
+    made: Any = dataclass(frozen=True, config=ConfigDict(extra="forbid"))(kind)
+    checked = made.__init__
+
+    def __init__(self: Any, *arguments: Any, **named: Any) -> None:
+        try:
+            checked(self, *arguments, **named)
+        except ValidationError as error:
+            raise InvalidArgument(_told(error, made)) from error
+
+    made.__init__ = __init__
+    return made  # type: ignore[no-any-return]
+
+
+def read_record(kind: type[T], data: Any, where: str = "") -> T:
+    """A record, or any other type, from plain data as a file holds them; what is left out has its default.
+
+    Args:
+        kind: its type.
+        data: dictionaries, lists, texts and numbers.
+        where: what a message calls the whole.
+
+    Raises:
+        InvalidArgument: naming the key, what was expected and what came.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(data)
+    except ValidationError as error:
+        raise InvalidArgument(_told(error, kind, where)) from error
+
+
+def as_json(value: Any) -> Any:
+    """The same plain data with None for numbers that JSON has no word for (NaN, infinite)."""
+    if isinstance(value, dict):
+        return {key: as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _told(error: ValidationError, kind: Any, within: str = "") -> str:
+    """The first mistake: where it is, what was expected, and what came."""
+    mistake = error.errors(include_url=False)[0]
+    loc = mistake["loc"]
+    if loc and isinstance(loc[0], int) and hasattr(kind, "__pydantic_fields__"):
+        # An argument that was given by its place.
+        loc = (list(kind.__pydantic_fields__)[loc[0]], *loc[1:])
+    where = ".".join([within] * bool(within) + [_key(part) for part in loc if isinstance(part, str)])
+    if mistake["type"] == "unexpected_keyword_argument":
+        for part in loc[:-1]:
+            kind = get_args(kind)[0] if isinstance(part, int) else kind.__pydantic_fields__[part].annotation
+        place = f"in [{where.rpartition('.')[0]}]" if "." in where else "at the top"
+        return f"{_key(str(loc[-1]))}: no such setting {place}; expected some of {', '.join(kind.__pydantic_fields__)}"
+    if mistake["type"] == "value_error":
+        said = mistake["ctx"]["error"]
+        # That of a record within this one begins with the field's name.
+        return f"{where}{'.' if isinstance(said, InvalidArgument) else ': '}{said}" if where else str(said)
+    return f"{where}{': ' if where else ''}expected {_expected(mistake)}"
+
+
+def _expected(mistake: ErrorDetails) -> str:
+    if mistake["type"] == "missing":
+        last = mistake["loc"][-1]
+        return "to be given, got nothing" if isinstance(last, str) else f"at least {last + 1} values"
+    words = _EXPECTED.get(mistake["type"], mistake["msg"])
+    return f"{words.format(**mistake.get('ctx', {}))}, got {shown(mistake['input'])}"
+
+
+def _key(key: str) -> str:
+    """A key as a message names it; in quotes a file lets it be any text."""
+    return key if key.isprintable() and len(key) < 60 else shown(key)
