@@ -530,15 +530,19 @@ def test_the_example_of_the_page_runs(
 ) -> None:
     page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
-    assert len(blocks) == 1
+    plain, lent = blocks
     # The paper's study takes minutes; whether its example is right is seen on one that is there.
     shutil.copytree(finished, tmp_path / "study-2")
     monkeypatch.chdir(tmp_path)
     asked: dict[str, Any] = {}
     monkeypatch.setattr("animat.studies.paper.paper_study", lambda **given: asked.update(given) or read_study(TINY))
-    exec(compile(blocks[0], "studies.md", "exec"), {})
+    exec(compile(plain, "studies.md", "exec"), {})
     assert capsys.readouterr().out.strip() == str(tmp_path / "study-2" / "report.html")
     assert paper_study(**asked).culture.seed == 2
+    # Nothing is left to do in a finished folder: no process is begun.
+    shutil.copytree(finished, tmp_path / "study")
+    exec(compile(lent, "studies.md", "exec"), {"__name__": "__main__"})
+    assert asked == {"culture_seed": 2, "quick": True}
 
 
 # --- the report -----------------------------------------------------------------------------------------------------
