@@ -180,7 +180,7 @@ def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
     assert len(told) == 2 and "0.55 kg, chosen" in told[1]
     with pytest.raises(InvalidArgument, match="expected each name once"):
         Study(robots=(Body("cartpole"), Body("cartpole", parameters={"pole_mass_kg": 0.55})))
-    with pytest.raises(InvalidArgument, match="^name: expected letters"):
+    with pytest.raises(InvalidArgument, match=r"^name: expected letters"):
         Body("a/b", kind="cartpole")
     with pytest.raises(InvalidArgument, match="culture"):
         Body("culture", kind="cartpole")
