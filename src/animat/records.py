@@ -59,7 +59,7 @@ def record(kind: type[T]) -> type[T]:
     made: Any = dataclass(frozen=True, config=ConfigDict(extra="forbid"))(kind)
     checked = made.__init__
 
-    def __init__(self: Any, *arguments: Any, **named: Any) -> None:
+    def __init__(self: Any, /, *arguments: Any, **named: Any) -> None:
         try:
             checked(self, *arguments, **named)
         except ValidationError as error:
@@ -99,6 +99,8 @@ def _told(error: ValidationError, kind: Any, within: str = "") -> str:
     """The first mistake: where it is, what was expected, and what came."""
     mistake = error.errors(include_url=False)[0]
     loc = mistake["loc"]
+    if mistake["type"] == "unexpected_positional_argument":
+        return f"{within}{': ' if within else ''}expected at most {len(kind.__pydantic_fields__)} values"
     if loc and isinstance(loc[0], int) and hasattr(kind, "__pydantic_fields__"):
         # An argument that was given by its place.
         loc = (list(kind.__pydantic_fields__)[loc[0]], *loc[1:])

@@ -20,21 +20,22 @@ class Robots:
     def run(self) -> dict[str, Any]:
         """List them."""
         from animat.errors import InvalidArgument
-        from animat.robots import robot_named
         from animat.robots.registry import robot_names
 
         listed, unusable = {}, {}
         for name in self.names or robot_names():
             try:
-                listed[name] = _told(robot_named(name))
-            except InvalidArgument as error:
-                # One that was asked for is an error; of all that packages announce, the others are listed.
+                listed[name] = _told(name)
+            except Exception as error:
+                # Anything may go wrong in somebody else's robot. Of all that packages announce the others are listed.
+                wrong = f"{name}: expected a robot, got {type(error).__name__}: {error}"
+                said = error if isinstance(error, InvalidArgument) else InvalidArgument(wrong)
                 if self.names:
-                    raise
-                unusable[name] = str(error)
+                    raise said from error
+                unusable[name] = str(said)
         for name, robot in listed.items():
             observed = ", ".join(f"{each['name']} ({each['unit']})" for each in robot["observes"])
-            parameters = " ".join(f"{key}={value:g}" for key, value in robot["parameters"].items())
+            parameters = " ".join(f"{key}={_short(value)}" for key, value in robot["parameters"].items())
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             for sentence in (*robot["lacks"].values(), *robot["caveats"]):
                 print(f"  {sentence}")
@@ -43,10 +44,15 @@ class Robots:
         return {"robots": listed, "unusable": unusable}
 
 
-def _told(robot: Any) -> dict[str, Any]:
-    from animat.robots import robot_to_dict
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _told(name: str) -> dict[str, Any]:
+    from animat.robots import robot_named, robot_to_dict
     from animat.robots.capabilities import WITHOUT, lacking
 
+    robot = robot_named(name)
     lacks = lacking(robot)
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],

@@ -89,7 +89,7 @@ class Jobs:
         Raises:
             AnimatError: if a job failed; its message names the job.
         """
-        notices = self._folder / UNFINISHED / "told"
+        notices = self._folder / UNFINISHED / ".told"
         # Of a run that was killed.
         shutil.rmtree(notices, ignore_errors=True)
         total_s = sum(job.cost_s for job in self.waiting)
@@ -116,7 +116,8 @@ class Jobs:
                         notice = receipt_path(notices, job.name)
                         running[at.submit(carry_out, job.task, self._folder, notice)] = job
                 tell()
-                for future in wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done:
+                # Those that succeeded first: their receipts are kept, whatever the others raise.
+                for future in sorted(wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done, key=_has_failed):
                     done = _done(future, running[future])
                     job = running.pop(future)
                     receipt = Receipt(job.name, self._fingerprint, self._inputs(job), done.files)
@@ -155,6 +156,10 @@ def _running_on(executor: Executor | None, workers: int | None, running: dict[Fu
         # The folder is let go of only when nobody writes to it any more.
         wait([future for future in running if not future.cancel()])
         raise
+
+
+def _has_failed(future: Future[Done]) -> bool:
+    return future.cancelled() or future.exception() is not None
 
 
 def _done(future: Future[Done], job: Job) -> Done:

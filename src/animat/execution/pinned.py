@@ -76,6 +76,7 @@ class PinnedProcesses(ThreadPoolExecutor):
                     raise BrokenExecutor("its process was ended before it began")
                 if process is not None:
                     self._processes.remove(process)
+                    self._mine.process = None
                     process.end()
                 process = self._mine.process = _Process(self._mine.core)
                 self._processes.append(process)
@@ -108,6 +109,8 @@ class _Process:
             self._popen.stdin.flush()
             answer = pickle.load(self._popen.stdout)
         except (BrokenPipeError, EOFError, pickle.UnpicklingError) as error:
+            if isinstance(error, pickle.UnpicklingError):
+                self.kill()  # It may well go on, with nobody to hear it.
             raise BrokenExecutor(f"its process ended with status {self._popen.wait()}") from error
         value, raised = pickle.loads(answer)
         return value, raised

@@ -74,16 +74,21 @@ class _Notice:
         self._path = path
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        tell(self._path, (done / total, note))
+        # Where it cannot be written, no work is lost.
+        with suppress(OSError):
+            tell(self._path, (done / total, note))
 
 
 def tell(path: Path, words: Any) -> None:
-    """Put something into a file for other processes to see (`told`); where that cannot be written, no work is lost."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_suffix(".new")
-        beside.write_text(json.dumps(words))
-        beside.replace(path)
+    """Put something into a file for other processes to see (`told`).
+
+    Raises:
+        OSError: where that cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".new")
+    beside.write_text(json.dumps(words))
+    beside.replace(path)
 
 
 def told(path: Path) -> Any:

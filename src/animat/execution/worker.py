@@ -35,7 +35,10 @@ def answer(work: bytes) -> bytes:
         function, args, kwargs = pickle.loads(work)
         return pickle.dumps((function(*args, **kwargs), None))
     except Exception as error:
-        return pickle.dumps((None, error))
+        try:
+            return pickle.dumps((None, error))
+        except Exception:
+            return pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
 def settle_on(core: int) -> BinaryIO:

@@ -31,7 +31,7 @@ class Trainers:
     def __init__(self, groups: Sequence[Group], exchange: Exchange, folder: Path) -> None:
         self._exchange, self._folder = exchange, folder
         self._groups = {group.members[0]: group for group in groups}
-        self._futures: list[Future[Done]] = []
+        self._futures: dict[Future[Done], Group] = {}
         self._told: dict[int, dict[str, Any]] = {}
 
     def __enter__(self) -> Trainers:
@@ -41,7 +41,7 @@ class Trainers:
         for first, group in self._groups.items():
             task = TrainAlongside(group, self._exchange, KEEP_S)
             notice = self._exchange.folder / f"progress-p{first}.json"
-            self._futures.append(self._executor.submit(carry_out, task, self._folder, notice))
+            self._futures[self._executor.submit(carry_out, task, self._folder, notice)] = group
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -68,8 +68,9 @@ class Trainers:
             try:
                 future.result()
             except BrokenExecutor as error:
+                names = " and ".join(f"p{member}" for member in self._futures[future].members)
                 raise AnimatError(
-                    f"training: {error} while the culture was recorded; the recordings are kept"
+                    f"training {names}: {error} while the culture was recorded; the recordings are kept"
                 ) from error
         swaps: list[dict[str, Any]] = []
         for first, group in self._groups.items():

@@ -19,6 +19,7 @@ from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
+from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import Mismatch
 from animat.evaluation.hand_made import hand_made
@@ -147,7 +148,7 @@ def run_policies(
         contenders.append(random_control(len(loop.conditions)))
 
     # Beside the prediction, on another core. Nothing else runs any more when a loop in real time does.
-    limit: Callable[[], float] | None = None
+    limit: Future[float] | None = None
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
@@ -166,7 +167,7 @@ def run_policies(
         progress=progress,
     )
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
-    if in_real_time:
+    if in_real_time and limit is not None:
         _wait_for(limit, progress)
     of_each = planned_episodes(len(policies), len(contenders) - len(policies), episodes)
     plan = [
@@ -179,7 +180,13 @@ def run_policies(
     session = run_session(
         culture, loop, contenders, folder, episodes=of_each, seed=seed, account=account, progress=progress
     )
-    best = _wait_for(limit, progress)
+    best = None
+    # Whoever stopped the session does not wait for it.
+    if limit is not None and (limit.done() or session.ending.by == "plan"):
+        try:
+            best = _wait_for(limit, progress)
+        except Exception as error:
+            findings += (Finding("no-limit", "note", f"no best possible return: {in_words(error)}"),)
     rows = _rows(contenders, tuple(policies), predicted, session)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
@@ -214,8 +221,8 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _meanwhile(compute: Callable[[], float]) -> Callable[[], float]:
-    """Begin to compute in a thread of its own; what is returned waits for the result, or raises what was raised."""
+def _meanwhile(compute: Callable[[], float]) -> Future[float]:
+    """Begin to compute in a thread of its own."""
     found: Future[float] = Future()
 
     def work() -> None:
@@ -226,16 +233,13 @@ def _meanwhile(compute: Callable[[], float]) -> Callable[[], float]:
 
     # A daemon: whoever stops while it computes need not wait for it.
     threading.Thread(target=work, name="best possible return", daemon=True).start()
-    return found.result
+    return found
 
 
-def _wait_for(limit: Callable[[], float] | None, progress: Progress | None) -> float | None:
-    """What `_meanwhile` returned, once it is known; at once where it is not asked for, or known already."""
-    if limit is None:
-        return None
+def _wait_for(limit: Future[float], progress: Progress | None) -> float:
     if progress is not None:
         progress.update(0, 1, "best possible return")
-    return limit()
+    return limit.result()
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

@@ -273,10 +273,9 @@ def conditions_named(text: str) -> Conditions:
 def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]) -> Assignment:
     """An assignment whose conditions say what their stimuli were, where they do not say it yet."""
     last = np.flatnonzero(stimuli.is_last_of_presentation)
-    pulses, of = np.diff(last, prepend=-1), index[last]
-    # Pulses before the last one that are of another condition than the presentation.
-    strays = np.repeat(of, pulses) != index
-    has_others = set(np.repeat(of, pulses)[strays].tolist())
+    of = index[last]
+    presented = np.repeat(of, np.diff(last, prepend=-1))
+    presented[last] = NO_CONDITION  # what is left are the pulses before the last one
     found = []
     for i, condition in enumerate(conditions):
         rows = last[of == i]
@@ -286,7 +285,9 @@ def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions
         if electrodes == ():
             sets = {frozenset(row) - {UNKNOWN} for row in stimuli.electrodes[rows].tolist()}
             electrodes = () if frozenset() in sets else tuple(sorted(tuple(sorted(one)) for one in sets))
-        only_last = electrodes is not None and i in has_others
+        before = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
+        ours = {frozenset(one) for one in electrodes or ()}
+        only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in before)
         found.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
     return Assignment(index, tuple(found))
 

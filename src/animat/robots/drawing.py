@@ -84,12 +84,16 @@ class Canvas:
             self.disc(point, width / 2, colour)
 
     def disc(self, centre: Point, radius: float, colour: Colour) -> None:
-        """A filled circle."""
+        """A filled circle; one too small to be seen is left out."""
+        if radius * self._scale <= 0.5:
+            return
         self._draw.circle(self._placed(centre), radius * self._scale - 0.5, colour)
 
     def box(self, low: Point, high: Point, corner: float, colour: Colour) -> None:
         """A filled rectangle from corner to corner, its corners rounded by the radius `corner`."""
-        self._draw.rounded_rectangle((self._placed(low), self._placed(high)), corner * self._scale, colour)
+        (left, top), (right, bottom) = self._placed(low), self._placed(high)
+        if left <= right and top <= bottom:
+            self._draw.rounded_rectangle((left, top, right, bottom), max(0.0, corner) * self._scale, colour)
 
     def picture(self) -> Picture:
         """What was drawn so far."""

@@ -50,7 +50,10 @@ def read_places(text: str | os.PathLike[str]) -> Places:
     if text in NAMED:
         return str(text)
     try:
-        return check_places(json.loads(read_plain_text(text, _MOST_BYTES)))
+        places = check_places(json.loads(read_plain_text(text, _MOST_BYTES)))
+        if not places:
+            raise InvalidArgument("places: expected groups of electrodes as [[1, 2], [3, 4]], got none")
+        return places
     except (ValueError, RecursionError) as error:
         said = (
             error if isinstance(error, InvalidArgument) else f"places: expected JSON as [[1, 2], [3, 4]], got {error}"
