@@ -256,7 +256,8 @@ def memory(folder: str) -> dict[str, Any]:
 
     from animat.execution.training import train
 
-    train(training(5, 50_000), timeline(), folder, workers=1)
+    # Ten are two groups of five.
+    train(training(10, 50_000), timeline(), folder, workers=1)
     of_worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     # A child starts from its parent's figure, so it says something only where it passed that.
     of_parent = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

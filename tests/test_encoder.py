@@ -79,6 +79,14 @@ def test_the_last_pulse_alone_may_be_the_condition(leading: list[int], only_last
     assert of["pattern 0"].frequencies_hz == (10.0,)
 
 
+def test_a_train_of_pulses_on_one_place_is_no_condition_of_the_last_alone() -> None:
+    # The first pulse of a recording has no interval before it, and so no condition by interval.
+    stimuli = table([np.nan] * 6, [[1, 2]] * 3 + [[3, 4, 5]] * 3, [0, 0, 0, 1, 1, 1])
+    assigned = conditions_named("interval:10 x electrode").assign(stimuli)
+    assert assigned.condition.tolist()[0] == -1
+    assert [(c.electrodes, c.only_last) for c in assigned.conditions] == [(((1, 2),), False), (((3, 4, 5),), False)]
+
+
 def test_products_are_the_combinations_that_occur() -> None:
     stimuli = table([5, 10, 5, 10, np.nan], [[1, 2], [1, 2], [3, 4, 5], [1, 2], [1, 2]])
     by = conditions_named("frequency x pattern")
@@ -110,6 +118,17 @@ def test_conditions_of_before_are_equal_and_tell_nothing_of_their_stimuli() -> N
     assert other_stimulus([known], [other]) == (
         "expected pattern 1 at 5 Hz on the electrodes 3+4+5, got pattern 1 at 5 Hz on the electrodes 1+2"
     )
+
+
+@pytest.mark.parametrize(
+    ("one_hz", "other_hz", "is_other"),
+    [((5.1,), (float(np.float32(5.1)),), False), ((10.0, 20.0), (5.0, 20.0), False), ((5.0,), (5.01,), True)],
+)
+def test_a_condition_met_at_other_frequencies_too_is_no_other(
+    one_hz: tuple[float, ...], other_hz: tuple[float, ...], is_other: bool
+) -> None:
+    one, other = (Condition("pattern 0", 0.0, "", at_hz, ((1, 2),)) for at_hz in (one_hz, other_hz))
+    assert (other_stimulus([one], [other]) is not None) is is_other
 
 
 @pytest.mark.parametrize(

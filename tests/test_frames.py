@@ -60,6 +60,16 @@ def test_a_disc_covers_its_area_with_soft_edges() -> None:
     assert cover.sum() == pytest.approx(math.pi * 20**2, rel=0.005)
 
 
+def test_what_is_too_small_to_be_seen_is_left_out_without_harm() -> None:
+    canvas = Canvas(20, 20, (10.0, 10.0), 1.0)
+    for radius in (0.1, 0.0, -1.0):
+        canvas.disc((0.0, 0.0), radius, INK)
+    canvas.box((1.0, 1.0), (-1.0, 2.0), 0.1, INK)
+    assert np.all(canvas.picture() == PAPER)
+    # The goal's edge is wider than the goal.
+    assert draw_robot(Navigation(arena_width_m=20, arena_height_m=20), np.zeros(3), height_px=30).shape == (30, 30, 3)
+
+
 def test_what_lies_outside_the_picture_is_left_out_without_harm() -> None:
     canvas = Canvas(20, 20, (0.0, 0.0), 1.0)
     canvas.stroke([(-50.0, -50.0), (-30.0, -20.0)], 2.0, INK)

@@ -63,6 +63,9 @@ def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, t
     file.write_text(json.dumps(given_))
     with pytest.raises(InvalidFile, match=r"places\.json: places: expected"):
         read_places(str(file))
+    file.write_text("[]")
+    with pytest.raises(InvalidFile, match=r"places\.json: places: expected groups of electrodes .*, got none"):
+        read_places(str(file))
     file.write_text("[[1, 2]")
     with pytest.raises(InvalidFile, match=r"places\.json: places: expected JSON as"):
         read_places(str(file))

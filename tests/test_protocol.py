@@ -174,6 +174,7 @@ NOT_PROTOCOLS = {
     "[5, 10]": "protocol: expected what Protocol.to_json writes",
     "[" * 100_000: "protocol: expected what Protocol.to_json writes",
     '{"pulse_s": 1}': "pulse_s: no such setting at the top; expected some of frequencies_hz",
+    '{"self": 1}': "self: no such setting at the top",
     '{"pulses": 1, "pulses": 2}': "pulses: expected once",
     '{"pulses": 0}': "pulses: expected at least 1",
     '{"pulses": 2.5}': "pulses: expected a whole number, got 2.5",

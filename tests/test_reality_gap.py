@@ -183,6 +183,25 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     assert sentence in gap.to_text() and "best possible return on this" not in gap.to_text()
 
 
+def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
+    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise MemoryError("no room")
+
+    monkeypatch.setattr("animat.reality_gap.running.best_return", fail)
+    of = {"p0": policy_of(0, series)}, FakeCulture(), Calibration.of_series(series)
+    # On a device it is known before the loop begins.
+    with of[1], pytest.raises(MemoryError):
+        run_policies(*of, tmp_path / "device", episodes=1, with_controls=False)
+    assert not (tmp_path / "device").exists()
+    monkeypatch.setattr("animat.reality_gap.running.VirtualCulture", FakeCulture)
+    with of[1]:
+        gap = run_policies(*of, tmp_path / "simulation", episodes=1, with_controls=False)
+    assert gap.session.ending.by == "plan"
+    assert "no best possible return: MemoryError: no room" in gap.to_text()
+
+
 def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may_come_from(
     tmp_path: Path, series: list[Responses]
 ) -> None:
