@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from animat.cli import main
+from animat.cli.record import Record
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
@@ -135,3 +136,13 @@ def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["record", "--culture", "made-up", "--places", "halves", "--out", str(out)]) == 1
     assert "no places; --culture virtual takes others" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_the_command_says_how_to_train_on_places(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Record, "_virtual", lambda *_: [])
+    assert main(["record", "--places", "halves"]) == 0
+    assert "train --conditions 'frequency x electrode';" in capsys.readouterr().out
+    assert main(["record"]) == 0
+    assert "--conditions" not in capsys.readouterr().out

@@ -81,6 +81,11 @@ class Record:
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
+        if self.culture != "made-up" and (protocol := self._protocol()).places:
+            conditions = "electrode" if len(protocol.frequencies_hz) == 1 else "'frequency x electrode'"
+            print(
+                f"each place is a condition for: animat train --conditions {conditions}; without it, places are mixed"
+            )
         return {"recordings": [str(file) for file in files]}
 
     def _made_up(self, progress: Progress) -> list[Path]:
