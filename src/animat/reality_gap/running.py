@@ -23,10 +23,11 @@ from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import Mismatch
 from animat.evaluation.hand_made import hand_made
-from animat.evaluation.optimum import best_return
+from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
 from animat.evaluation.verdict import beside
+from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
 from animat.reality_gap.answered import answered
 from animat.reality_gap.calibration import Calibration
@@ -37,7 +38,7 @@ from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding
 from animat.responses.condition import other_stimulus
 from animat.robots.capabilities import lacking
-from animat.robots.grid import no_grid
+from animat.robots.grid import grid_for, no_grid
 from animat.training.policy import Policy, first_of_alike
 
 FEWEST_OF_A_CONTROL = 5
@@ -155,7 +156,7 @@ def run_policies(
     if why_not is not None:
         findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no best possible return: {why_not}")),)
     else:
-        limit = _meanwhile(lambda: best_return(environment, simulator, resolution=LIMIT_RESOLUTION, episodes=0).value)
+        limit = _meanwhile(lambda: _best_return(environment, simulator))
     predicted = predict(
         [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
         environment,
@@ -219,6 +220,13 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     """
     of_a_control = max(FEWEST_OF_A_CONTROL, math.ceil(policies * episodes / controls))
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
+
+
+def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
+    """The value alone, which is told as "about": how well it is known would take a third as long again."""
+    grid = grid_for(environment.robot).scaled(LIMIT_RESOLUTION)
+    (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
+    return float(value)
 
 
 def _meanwhile(compute: Callable[[], float]) -> Future[float]:
