@@ -298,6 +298,9 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
     assert abs(after[0] - observation[0]) == pytest.approx(0.2, abs=1e-6)
     with pytest.raises(InvalidArgument, match="rover has no method `draw`"):
         gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, render_mode="rgb_array")
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(InvalidArgument, match=r"robot: expected one of .*, got ''"):
+            make("animat:Animat/Robot-v0")
 
     def drawing(returned: str) -> Callable[[], Any]:
         draw = f"\n    def draw(self, observation, command, earlier, height_px):\n        return {returned}\n"

@@ -36,7 +36,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's name and form
 
-    def __init__(self, robot: str, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self, robot: str = "", *, render_mode: str | None = None, **options: Any) -> None:
         self.setup = set_up(robot, **options)
         check_render_mode(render_mode, self.setup.animat.robot)
         self.render_mode = render_mode

@@ -39,7 +39,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    def __init__(self, robot: str, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self, robot: str = "", num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
         if num_envs < 1:
             raise InvalidArgument(f"num_envs: expected at least 1, got {num_envs}")
         self.setup = set_up(robot, **options)
