@@ -73,15 +73,16 @@ class Record:
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
-        if self.protocol is not None and self.culture != "made-up":
-            _say_too_fast(self._protocol())
+        protocol = None if self.culture == "made-up" else self._protocol()
+        if protocol is not None and self.protocol is not None:
+            _say_too_fast(protocol)
         with Bar("recording") as progress:
             if self.culture == "made-up":
                 files = self._made_up(progress)
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
-        if self.culture != "made-up" and (protocol := self._protocol()).places:
+        if protocol is not None and protocol.places:
             conditions = "electrode" if len(protocol.frequencies_hz) == 1 else "'frequency x electrode'"
             print(
                 f"each place is a condition for: animat train --conditions {conditions}; without it, places are mixed"

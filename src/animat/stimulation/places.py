@@ -50,7 +50,11 @@ def read_places(text: str | os.PathLike[str]) -> Places:
     if text in NAMED:
         return str(text)
     try:
-        places = check_places(json.loads(read_plain_text(text, _MOST_BYTES)))
+        written = read_plain_text(text, _MOST_BYTES)
+    except InvalidFile as error:
+        raise InvalidFile(f"{error}; places that have names are {' and '.join(NAMED)}") from error
+    try:
+        places = check_places(json.loads(written))
         if not places:
             raise InvalidArgument("places: expected groups of electrodes as [[1, 2], [3, 4]], got none")
         return places
