@@ -134,13 +134,15 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     np.testing.assert_array_equal(rolled.presented.sum(axis=1), rolled.lengths.sum(axis=1))
     low, high = rows["policies"].prediction.low, rows["policies"].prediction.high
     assert np.sum((anew.mean(axis=1) < low) | (anew.mean(axis=1) > high)) in (4, 5)
-    # Under the controls of the policies, all of them act.
+    # Under the controls of the policies all of them act in turn, and no choice of theirs is delivered.
     for name, in_, on in (
         ("silent", environment, silenced(calibration.simulator)),
         ("shuffled", replace(environment, delivery="shuffled"), calibration.simulator),
     ):
         rolled = roll_out(in_, on, both, 2, episodes=PREDICTED_EPISODES, seed=1)
-        np.testing.assert_array_equal(rows[name].predicted, rolled.returns.ravel())
+        error = np.hypot(rolled.returns.std() / np.sqrt(2 * PREDICTED_EPISODES), rows[name].predicted.std() / np.sqrt(PREDICTED_EPISODES))
+        assert abs(rolled.returns.mean() - rows[name].predicted.mean()) <= 4 * error
+    assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
     limit = best_return(environment, calibration.simulator, resolution=0.6, episodes=0).value
     assert gap.limit == pytest.approx(limit)
     won = rows["policies"].lived.mean() - rows["policies"].predicted.mean()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.animat import Animat
-from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, InTurn, OneCondition
+from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, OneCondition
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.progress import Progress, Silent
@@ -88,19 +90,18 @@ def predict(
     found: dict[str, Predicted] = {}
     for number, group in enumerate(groups):
         progress.update(number, len(groups), f"predicting {group[0].name}")
-        delivery = group[0].delivery
-        in_ = replace(environment, delivery="shuffled") if delivery == "shuffled" else environment
-        actor, many = _actor([contender.controller for contender in group], rule, greedy=greedy)
+        actor, many = _actor(group, rule, greedy=greedy)
 
         def rolled(simulator: NeuronSimulator, episodes: int, seed: int) -> Episodes:
-            on = silenced(simulator) if delivery == "silent" else simulator  # noqa: B023
-            return roll_out(in_, on, actor, many, episodes=episodes, seed=seed)  # noqa: B023
+            on = silenced(simulator) if group[0].delivery == "silent" else simulator  # noqa: B023
+            return roll_out(environment, on, actor, many, episodes=episodes, seed=seed)  # noqa: B023
 
-        predicted = rolled(calibration.simulator, PREDICTED_EPISODES, seed)
         # Seeds of their own: the spread is then also that of the episodes, and no interval is surer than they are.
-        redrawn = [
-            rolled(simulator, ANEW_EPISODES, (seed + 1 + i) % 2**32) for i, simulator in enumerate(calibration.redrawn)
-        ]
+        first = seed + number * (len(calibration.redrawn) + 1)
+        predicted = rolled(calibration.simulator, PREDICTED_EPISODES, first % 2**32)
+        seeds = [(first + 1 + i) % 2**32 for i in range(len(calibration.redrawn))]
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:
+            redrawn = list(side_by_side.map(rolled, calibration.redrawn, repeat(ANEW_EPISODES), seeds))
         anew = np.array([each.returns.mean(axis=1) for each in redrawn])
         passes = Passes(predicted.presented, predicted.passed)
         passes_anew = _stacked([Passes(each.presented, each.passed) for each in redrawn])
@@ -115,17 +116,17 @@ def predict(
     return found
 
 
-def _actor(controllers: Sequence[Any], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
-    """Who acts on the simulator as controllers do on the culture, and how many they are."""
-    first = controllers[0]
-    if isinstance(first, AnyCondition):
+def _actor(group: Sequence[Contender], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
+    """Who acts on the simulator as a group does on the culture, and how many they are."""
+    first = group[0].controller
+    # Without stimuli it makes no difference what is chosen, nor where each condition is delivered as often whatever is.
+    if isinstance(first, AnyCondition) or group[0].delivery != "chosen":
         return Uniform(), 1
     if isinstance(first, OneCondition):
         return Constant(jnp.array([first.condition])), 1
     if isinstance(first, HandMadeRule) and rule is not None:
         return rule, 1
-    acting: list[Any] = []
-    for controller in controllers:
-        acting += list(controller.by_name.values()) if isinstance(controller, InTurn) else [controller]
-    policies: list[Any] = [each.policy if isinstance(each, Greedy) else each for each in acting]
+    policies: list[Any] = [
+        each.policy if isinstance(each, Greedy) else each for each in (contender.controller for contender in group)
+    ]
     return networks_of(policies, greedy=greedy), len(policies)

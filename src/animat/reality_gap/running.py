@@ -148,15 +148,11 @@ def run_policies(
     else:
         contenders.append(random_control(len(loop.conditions)))
 
-    # Beside the prediction, on another core. Nothing else runs any more when a loop in real time does.
-    limit: Future[float] | None = None
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
         findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no best possible return: {why_not}")),)
-    else:
-        limit = _meanwhile(lambda: _best_return(environment, simulator))
     predicted = predict(
         [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
         environment,
@@ -167,6 +163,8 @@ def run_policies(
         seed=seed,
         progress=progress,
     )
+    # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
+    limit = _meanwhile(lambda: _best_return(environment, simulator)) if why_not is None else None
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and limit is not None:
         _wait_for(limit, progress)
