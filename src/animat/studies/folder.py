@@ -22,7 +22,10 @@ from animat.writing import LOCK, alone_in, clear_away, is_unfinished, written_wh
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
-_PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "matplotlib", "jinja2")
+_PACKAGES = (
+    "animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "pandas", "pillow", "matplotlib",
+    "jinja2",
+)  # fmt: skip
 _ABOUT_FILES = "# files: as seen from where the specification lay. To run it from here: files = ['recordings']\n"
 
 
