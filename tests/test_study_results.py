@@ -71,7 +71,7 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
     Tabulate(study).run(folder, Silent())
     results = read_typed(results_file(folder), Results)
     with table_file(folder, "comparisons").open(newline="") as file:
-        assert [row.u for row in csv.DictReader(file)] == [str(row.u) for row in results.comparisons]
+        assert [row["u"] for row in csv.DictReader(file)] == [str(row.u) for row in results.comparisons]
     return results.comparisons
 
 

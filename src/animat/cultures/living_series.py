@@ -136,7 +136,7 @@ def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interv
 
 def _expect_of(file: Path, there: Recording, culture: Culture, protocol: Protocol) -> None:
     told = {name: words for name, words in culture.provenance.items() if name not in _MAY_DIFFER}
-    if difference := difference_from({**told, "protocol": protocol.to_json()}, there):
+    if difference := difference_from(told, protocol, there):
         raise Mismatch(
             f"{file}: expected a recording of this culture by this protocol, got another ({difference}): choose "
             "another folder"

@@ -325,8 +325,7 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
             )
         )
     found += transfer.other_simulator(policy.fitted, timeline.fitted)
-    trained = policy.provenance.get("simulators") or {}
-    first_min = next(iter(trained.get("recorded_at_min", ())), None)
+    first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         found.append(
             Finding(

@@ -29,6 +29,7 @@ import numpy as np
 from animat import errors
 from animat.errors import AnimatError, InvalidFile
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.told import from_words, in_words
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 
@@ -156,7 +157,7 @@ def _packed(recording: Recording) -> bytes:
     words = {
         "numbers": {name: float(getattr(recording, name)) for name in _NUMBERS},
         "presentation": None if recording.presentation is None else asdict(recording.presentation),
-        "provenance": list(recording.provenance.items()),
+        "told": list(in_words(recording).items()),
     }
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)
@@ -173,7 +174,7 @@ def _unpacked(payload: bytes) -> Recording:
             stimuli=Stimuli(**{name: arrays[f"stimuli_{name}"] for name in _STIMULI}),
             **words["numbers"],
             presentation=None if presentation is None else Presentation(**presentation),
-            provenance=dict(words["provenance"]),
+            **from_words(dict(words["told"])),
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from animat.progress import Progress
 from animat.recordings.detection.finding_spikes import find_spikes
 from animat.recordings.detection.settings import Detection
-from animat.recordings.noticed import as_provenance
+from animat.recordings.findings import merged
 from animat.recordings.raw import RawTraces
 from animat.recordings.recording import Recording
 
@@ -69,5 +69,6 @@ def with_spikes_of(
         spike_times_s=time_s,
         spike_channels=found.channel,
         sampling_rate_hz=traces.sampling_rate_hz,
-        provenance={**base.provenance, "spikes": how, **as_provenance(found.findings)},
+        provenance={**base.provenance, "spikes": how},
+        findings=merged((*base.findings, *found.findings)),
     )
