@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import os
 import random
@@ -34,7 +33,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
 from animat.execution.jobs import in_order
-from animat.execution.receipts import Receipt
+from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
@@ -48,7 +47,6 @@ from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.folder import describe_study, sums_of
-from animat.studies.identity import settle_identity
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file, paths_file
@@ -76,11 +74,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files(folder: Path) -> dict[str, str]:
-    """Every file of a folder, hidden ones too, with a hash over its bytes."""
+    """Every file of a folder, hidden ones too, with a digest."""
     return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        path.relative_to(folder).as_posix(): digest_of(path) for path in sorted(folder.rglob("*")) if path.is_file()
     }
 
 
@@ -519,26 +515,6 @@ def test_simulators_are_kept_whole(finished: Path) -> None:
     (finished.parent / "cut").write_bytes((finished / "simulators/timeline.safetensors").read_bytes()[:50])
     with pytest.raises(InvalidFile, match="cut: expected a study's simulators"):
         load_timeline(finished.parent / "cut")
-
-
-def test_the_same_recording_is_the_same_file(tmp_path: Path) -> None:
-    recording = make_up_recording(1, patterns=5, channels=16)
-    for name in ("a.nwb", "b.nwb"):
-        write_nwb(recording, tmp_path / name)
-    assert (tmp_path / "a.nwb").read_bytes() != (tmp_path / "b.nwb").read_bytes()
-    for name in ("a.nwb", "b.nwb"):
-        settle_identity(tmp_path / name)
-    settled = (tmp_path / "a.nwb").read_bytes()
-    assert settled == (tmp_path / "b.nwb").read_bytes()
-    assert read_recording(tmp_path / "a.nwb").equals(recording)
-    settle_identity(tmp_path / "a.nwb")
-    assert (tmp_path / "a.nwb").read_bytes() == settled
-    other = make_up_recording(2, patterns=5, channels=16)
-    write_nwb(other, tmp_path / "c.nwb")
-    settle_identity(tmp_path / "c.nwb")
-    ids = [set(re.findall(rb"[0-9a-f]{8}-[0-9a-f]{4}-5[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}", data))
-           for data in (settled, (tmp_path / "c.nwb").read_bytes())]  # fmt: skip
-    assert ids[0] and not ids[0] & ids[1]
 
 
 def test_the_example_of_the_page_runs(

@@ -37,6 +37,7 @@ class StudyFile:
 
 def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
     """Run a study, whose files are named as seen from `base`, and print its comparisons."""
+    from animat.lined_up import lined_up
     from animat.progress import Bar
     from animat.studies.heuristic import not_outperforming
     from animat.studies.places import results_file
@@ -53,12 +54,15 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
     with Bar("study") as progress:
         ran = run_study(study, out, base=base, workers=workers, progress=progress)
     results = read_typed(results_file(ran.folder), Results)
+    cells = []
     for row in results.comparisons:
         paper = "" if row.paper_p is None else f"; the paper's p {row.paper_p:.3g}, which implies U {row.paper_u:g}"
-        print(
-            f"{row.robot:11} {row.comparison:28} {row.mean_first:8.1f} {row.mean_second:8.1f}  "
-            f"U {row.u:<4g} p {row.p_normal:<9.3g} {row.outcome}{paper}"
+        means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}"
+        cells.append(
+            [f"{row.robot}, {row.comparison}", *means, f"{row.u:g}", f"{row.p_normal:.3g}", row.outcome + paper]
         )
+    if cells:
+        print("\n".join(lined_up(["", "first", "second", "U", "p", ""], cells)))
     beside = not_outperforming(results)
     for sentence in beside:
         print(sentence)

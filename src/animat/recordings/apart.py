@@ -150,7 +150,8 @@ def _received(pipe: Any, size: int, until: float) -> bytes | None:
     return b"".join(parts)
 
 
-def _packed(recording: Recording) -> bytes:
+def packed(recording: Recording) -> bytes:
+    """All of a recording as bytes, the same for recordings that are equal."""
     arrays: dict[str, Any] = {name: getattr(recording, name) for name in _ARRAYS}
     arrays |= {f"channels_{name}": getattr(recording.channels, name) for name in _CHANNELS}
     arrays |= {f"stimuli_{name}": getattr(recording.stimuli, name) for name in _STIMULI}
@@ -208,7 +209,7 @@ def _serve(requests: BinaryIO, answers: BinaryIO) -> None:
         try:
             os.chdir(request["folder"])
             _limit(path)
-            kind, payload = b"R", _packed(read_hdf5(path, part=request["part"], stimuli=request["stimuli"]))
+            kind, payload = b"R", packed(read_hdf5(path, part=request["part"], stimuli=request["stimuli"]))
         except AnimatError as error:
             kind, payload = b"E", json.dumps({"kind": type(error).__name__, "message": str(error)}).encode()
         except (*DAMAGE, RecursionError, AssertionError) as error:

@@ -65,7 +65,7 @@ class Publish(StudyTask):
         colophon = [
             f"Made with {versions}.",
             f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study on the same "
-            "versions and machine is the same files, bit for bit.",
+            "versions and machine has the same results, bit for bit.",
             f"Study {manifest['fingerprint']}",
         ]
         return [write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
