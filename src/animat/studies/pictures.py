@@ -125,7 +125,7 @@ class RobotPictures(StudyTask):
             tables.append(write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
         figures["controls"] = draw_controls(
-            _controls([row for row in results.controls if row.robot == name]), f"{name}: controls"
+            _controls(study, [row for row in results.controls if row.robot == name]), f"{name}: controls"
         )
         recorded = {each.name: Paths.load(paths_file(folder, self.body, each)) for each in study.conditions}
         tables.append(write_paths(folder, name, [quantity.name for quantity in robot.quantities], recorded))
@@ -149,6 +149,7 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
 
 
 Rough: TypeAlias = dict[tuple[str, str, float], tuple[float, float | None]]
+"""By mapping, percentiles and minute: the mean return of random actions, and the limit on a rough grid if known."""
 
 
 def _curves(
@@ -251,7 +252,8 @@ def _courses(
     return panels
 
 
-def _controls(rows: list[ControlReturns]) -> list[Controls]:
+def _controls(study: Study, rows: list[ControlReturns]) -> list[Controls]:
+    trained = {f"{TRAINED}{condition.name}" for condition in study.conditions}
     of_panel: dict[tuple[str, str, float], list[ControlReturns]] = defaultdict(list)
     for row in rows:
         of_panel[row.mapping, row.percentiles, row.at_min].append(row)
@@ -262,7 +264,7 @@ def _controls(rows: list[ControlReturns]) -> list[Controls]:
             Controls(
                 f"{named_mapping(mapping, percentiles)}{at}",
                 tuple((row.control, row.mean_return, row.standard_error) for row in same),
-                sum(row.control.startswith(TRAINED) for row in same),
+                sum(row.control in trained for row in same),
                 same[0].random,
                 same[0].limit,
             )
