@@ -39,6 +39,7 @@ def test_all_that_was_seen_lies_within_and_at_its_sample(
         sampling_rate_hz=rate_hz,
         start_min=0.0,
         provenance={},
+        culture=None,
     )
     off_s = recording.spike_times_s - np.array(expected_ns) / 1e9
     assert np.all(np.abs(off_s) <= 0.5 / rate_hz + 1e-9)

@@ -101,7 +101,7 @@ def test_nwbinspector_finds_nothing_critical(kind: str, who: Origin | None, tmp_
 def test_the_command_finds_spikes_in_raw_traces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     voltage, truth = noisy(64, 0.5, step_uv=0.195)
     path = write_cl1(tmp_path / "a.h5", spikes=[], stims=None, samples=voltage)
-    arguments = ["convert", str(path), "--out", str(tmp_path / "out.nwb"), "--raw", "--engine", "scipy"]
+    arguments = ["convert", str(path), "--out", str(tmp_path / "out.nwb"), "--raw"]
     assert main([*arguments, "--subject-id", "c", "--experimenter", "Doe, Jane", "--json"]) == 0
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["spikes"] >= 0.5 * sum(map(len, truth))

@@ -18,7 +18,7 @@ from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
 from animat.recordings.detection.noise import median_noise_uv
-from animat.recordings.detection.settings import Detection, Engine
+from animat.recordings.detection.settings import Detection
 from animat.recordings.detection.troughs import find_troughs
 from animat.recordings.raw import ArrayTraces, in_microvolts
 from animat.recordings.recording import Channels
@@ -28,7 +28,6 @@ from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from rig_files import event_table, mapping_table, write_cl1, write_maxwell
 
-SCIPY = Detection(engine="scipy")
 RATE_HZ = 20_000.0
 SPIKE_UV = -60 * np.exp(-(((np.arange(-20, 41)) / 3.0) ** 2) / 2)
 
@@ -73,8 +72,8 @@ def known() -> tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]:
 
 def test_known_spikes_are_found_and_few_others(known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]) -> None:
     traces, truth = known
-    found = find_spikes(traces, None, SCIPY)
-    shifted = FoundSpikes(found.time_s + 1.0, found.channel, found.noise_uv, found.engine, found.findings)
+    found = find_spikes(traces)
+    shifted = FoundSpikes(found.time_s + 1.0, found.channel, found.noise_uv, found.findings)
     hit, missed, false = agreement(shifted, truth)
     assert hit > 1500
     assert missed + false <= 0.01 * hit
@@ -87,38 +86,14 @@ def test_known_spikes_are_found_and_few_others(known: tuple[ArrayTraces, list[In
 def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
     known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]], chunk_s: float, workers: int
 ) -> None:
-    whole = find_spikes(known[0], None, SCIPY, workers=1)
-    pieces = find_spikes(known[0], None, Detection(engine="scipy", chunk_s=chunk_s), workers=workers)
+    whole = find_spikes(known[0], workers=1)
+    pieces = find_spikes(known[0], None, Detection(chunk_s=chunk_s), workers=workers)
     # A trough at the threshold itself can fall on either side by the rounding of single precision.
     assert abs(len(pieces.time_s) - len(whole.time_s)) <= 2
     both = set(zip(whole.time_s.tolist(), whole.channel.tolist(), strict=True)) & set(
         zip(pieces.time_s.tolist(), pieces.channel.tolist(), strict=True)
     )
     assert len(both) >= len(whole.time_s) - 3
-
-
-@pytest.mark.parametrize("band_hz", [(100.0, 3000.0), (40.0, 2000.0), None])
-def test_spikeinterface_and_scipy_find_the_same_spikes(
-    known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]], band_hz: tuple[float, float] | None
-) -> None:
-    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
-    stimuli = np.arange(0.05, 4, 0.2)
-    ours = find_spikes(known[0], stimuli, Detection(engine="scipy", band_hz=band_hz))
-    theirs = find_spikes(known[0], stimuli, Detection(engine="spikeinterface", band_hz=band_hz))
-    assert (ours.engine, theirs.engine) == ("scipy", "SpikeInterface")
-    sets = [set(zip(np.rint(f.time_s * RATE_HZ).tolist(), f.channel.tolist(), strict=True)) for f in (ours, theirs)]
-    assert len(sets[0]) > 1000
-    assert len(sets[0] ^ sets[1]) <= 0.01 * len(sets[0])
-
-
-def test_without_spikeinterface_it_cannot_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    import importlib.util
-
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    traces = ArrayTraces(np.zeros((4000, 1), np.int16), channels(1), RATE_HZ)
-    with pytest.raises(InvalidArgument, match="spikeinterface: pip install 'spikeinterface>="):
-        find_spikes(traces, None, Detection(engine="spikeinterface"))
-    assert find_spikes(traces).engine == "scipy"
 
 
 def test_the_filter_is_the_two_pass_butterworth() -> None:
@@ -146,21 +121,26 @@ def test_troughs_are_those_of_the_definition(steps: list[int], apart: int, depth
     assert set(row.tolist()) <= {0}
 
 
-def test_troughs_by_spikeinterface_are_those_of_the_definition() -> None:
-    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
-    from animat.recordings.detection import with_spikeinterface
+def test_spikeinterface_finds_the_same_spikes(known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]) -> None:
+    core = pytest.importorskip("spikeinterface.core", reason="SpikeInterface is not installed (animat[raw])")
+    from spikeinterface.preprocessing import bandpass_filter
+    from spikeinterface.sortingcomponents.peak_detection import detect_peaks
 
-    rng = np.random.default_rng(4)
-    for _ in range(30):
-        # Whole numbers, so that many are equal; all of the trace, and a part of it.
-        trace = rng.integers(-9, 4, (3, 80)).astype(np.float32)
-        depth, apart = np.array([2, np.inf, 6], np.float32), int(rng.integers(1, 8))
-        for first, last in ((0, 80), (20, 50)):
-            expected = set(
-                zip(*(found.tolist() for found in find_troughs(trace, depth, apart, first, last)), strict=True)
-            )
-            got = with_spikeinterface.find_troughs(trace, depth, apart, first, last)
-            assert set(zip(*(found.tolist() for found in got), strict=True)) == expected
+    traces = known[0]
+    ours = find_spikes(traces)
+    recording = core.NumpyRecording([traces.voltage_uv * np.float32(traces.uv_per_step)], RATE_HZ)
+    recording.set_dummy_probe_from_locations(np.column_stack([np.arange(70) * 1e3, np.zeros(70)]))
+    peaks = detect_peaks(
+        bandpass_filter(recording, freq_min=100, freq_max=3000, filter_order=3, dtype="float32"),
+        method="by_channel",
+        method_kwargs={"detect_threshold": 1.0, "exclude_sweep_ms": 1.0, "noise_levels": 5.0 * ours.noise_uv},
+        job_kwargs={"n_jobs": 1, "progress_bar": False},
+    )
+    sample = np.rint((ours.time_s - traces.start_s) * RATE_HZ).astype(int)
+    found = set(zip(sample.tolist(), ours.channel.tolist(), strict=True))
+    theirs = set(zip(peaks["sample_index"].tolist(), peaks["channel_index"].tolist(), strict=True))
+    assert len(found) > 1000
+    assert len(found ^ theirs) <= 0.01 * len(found)
 
 
 @settings(deadline=None, max_examples=40)
@@ -210,14 +190,9 @@ def in_window(
     return (since_ms >= window_ms[0]) & (since_ms < window_ms[1])
 
 
-@pytest.mark.parametrize("engine", ["scipy", "spikeinterface"])
-def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(
-    stimulated: tuple[Traces, ArrayTraces], engine: Engine
-) -> None:
-    if engine == "spikeinterface":
-        pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
+def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, ArrayTraces]) -> None:
     traces, source = stimulated
-    found = find_spikes(source, traces.stimulus_time_s, Detection(engine=engine))
+    found = find_spikes(source, traces.stimulus_time_s, Detection())
     large = (traces.amplitude_uv > 8 * 2.4) & in_window(traces.spikes.time_s, traces.stimulus_time_s, (2, 10))
     kept = in_window(found.time_s, traces.stimulus_time_s, (2, 10))
     true_s, true_channel = traces.spikes.time_s, traces.spikes.channel
@@ -240,8 +215,8 @@ def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(
 
 def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, ArrayTraces]) -> None:
     traces, source = stimulated
-    naive = find_spikes(source, None, SCIPY)
-    removed = find_spikes(source, traces.stimulus_time_s, SCIPY)
+    naive = find_spikes(source)
+    removed = find_spikes(source, traces.stimulus_time_s, Detection())
     count = [np.count_nonzero(in_window(f.time_s, traces.stimulus_time_s, (0, 10))) for f in (naive, removed)]
     assert count[0] > 1.3 * count[1]
 
@@ -249,7 +224,7 @@ def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[T
 def test_a_window_is_not_eaten_unasked() -> None:
     assert Detection().blank_ms[1] <= 1.5
     traces = ArrayTraces(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
-    found = find_spikes(traces, np.array([0.5]), Detection(engine="scipy", blank_ms=(0.5, 3.0)))
+    found = find_spikes(traces, np.array([0.5]), Detection(blank_ms=(0.5, 3.0)))
     assert {f.name: f.severity for f in found.findings}["blanked"] == "warning"
 
 
@@ -279,7 +254,7 @@ def test_the_trough_of_a_spike_in_coarse_steps_is_no_saturation(amplitude: float
             at = pulse + round(ms * 20)
             voltage[at - 20 : at + 41, channel] += amplitude * SPIKE_UV
     traces = ArrayTraces(np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv)
-    found = find_spikes(traces, pulses / RATE_HZ, SCIPY)
+    found = find_spikes(traces, pulses / RATE_HZ, Detection())
     assert "saturated-channels" not in {finding.name for finding in found.findings}
     truth = [pulses + np.rint(late[:, channel] * 20).astype(np.int64) for channel in range(8)]
     hit, missed, _ = agreement(found, truth)
@@ -324,7 +299,7 @@ def test_a_decay_is_taken_away_and_spikes_on_it_are_left(tau_ms: float, size_uv:
 
 def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
     traces = ArrayTraces(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
-    found = find_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), SCIPY)
+    found = find_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), Detection())
     assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
 
 
@@ -332,7 +307,7 @@ def test_dead_and_noisy_channels_are_said() -> None:
     voltage, _ = noisy(30, 1.0)
     voltage[:, 3] = 7
     voltage[:, 8] *= 20
-    found = find_spikes(ArrayTraces(voltage, channels(30), RATE_HZ, uv_per_step=0.1), None, SCIPY)
+    found = find_spikes(ArrayTraces(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
     said = {finding.name: finding.value for finding in found.findings}
     assert (said["dead-channels"], said["noisy-channels"]) == (1, 1)
     assert 3 not in found.channel
@@ -340,7 +315,7 @@ def test_dead_and_noisy_channels_are_said() -> None:
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("band_hz", (300.0, 100.0)), ("threshold", 0.0), ("blank_ms", (0.0, -1.0)), ("chunk_s", 0.0), ("engine", "x")],
+    [("band_hz", (300.0, 100.0)), ("threshold", 0.0), ("blank_ms", (0.0, -1.0)), ("chunk_s", 0.0)],
 )
 def test_settings_that_cannot_be_are_refused(setting: str, value: object) -> None:
     with pytest.raises(InvalidArgument, match=setting):
@@ -350,7 +325,7 @@ def test_settings_that_cannot_be_are_refused(setting: str, value: object) -> Non
 def test_a_band_beyond_the_sampling_rate_is_refused() -> None:
     traces = ArrayTraces(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
     with pytest.raises(InvalidArgument, match="less than half the sampling rate of 5000 Hz, got 3000 Hz"):
-        find_spikes(traces, None, SCIPY)
+        find_spikes(traces)
 
 
 # --- from files ------------------------------------------------------------------------------------------------------
@@ -367,22 +342,22 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
         recorded=[3, 9, 40],
         raw=raw,
     )
-    recording = read_traces(path, SCIPY)
+    recording = read_traces(path, Detection())
     assert recording.channels.label.tolist() == ["3", "9", "40"]
     assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
     assert (recording.duration_s, len(recording.stimuli)) == (2.0, 1)
-    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), "", ())
+    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     hit, missed, false = agreement(found, [at[np.abs(at - 10_000) > 60] for at in truth])
     assert hit > 15
     assert missed == 0
     assert false <= 1
-    assert "by scipy" in recording.provenance["spikes"]
+    assert "5 x median noise" in recording.provenance["spikes"]
 
 
 def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
     voltage, _ = noisy(64, 0.5, step_uv=0.195)
     path = write_cl1(tmp_path / "a.h5", spikes=None, stims=[(5000, 9)], samples=voltage)
-    recording = read_traces(path, SCIPY)
+    recording = read_traces(path, Detection())
     assert len(recording.channels) == 59
     assert len(recording.spike_times_s) > 60
     assert recording.stimuli.electrodes.tolist() == [[9]]
@@ -398,10 +373,10 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
         series["data"].attrs["conversion"] = 1e-6
         series["starting_time"] = 0.0
         series["starting_time"].attrs["rate"] = RATE_HZ
-    recording = read_traces(tmp_path / "a.nwb", SCIPY)
-    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), "", ())
+    recording = read_traces(tmp_path / "a.nwb", Detection())
+    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     assert agreement(found, truth)[1] == 0
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
         del file["acquisition/traces/data"]
     with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
-        read_traces(tmp_path / "a.nwb", SCIPY)
+        read_traces(tmp_path / "a.nwb", Detection())

@@ -18,6 +18,7 @@ GROUND = (
     "ctrl_c",
     "differences",
     "errors",
+    "lined_up",
     "plain_file",
     "progress",
     "records",

@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import random
 import re
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,11 @@ import pytest
 from animat.errors import AnimatError, InvalidFile
 from animat.execution.jobs import Job, Jobs, in_order
 from animat.execution.pinned import PinnedProcesses
-from animat.execution.receipts import Receipt, receipt_path
+from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import Task, carry_out, told
 from animat.progress import Silent
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.made_up import make_up_recording
 from worker_tasks import Die, Fail, Join, Starve, Stumble
 
 CORE = min(os.sched_getaffinity(0))
@@ -40,7 +44,8 @@ def run(
 ) -> Any:
     """Which jobs were run."""
     left = Jobs(jobs, folder, folder / "jobs", of)
-    return set(left.run(workers=None, executor=executor or ThreadPoolExecutor(2), progress=progress or Silent()))
+    with ThreadPoolExecutor(2) as own:
+        return set(left.run(workers=None, executor=executor or own, progress=progress or Silent()))
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +70,12 @@ def test_jobs_come_after_what_they_need_and_long_chains_first() -> None:
 
 @pytest.mark.parametrize("which", ["ours", "threads", "processes"])
 def test_on_any_executor_each_comes_after_what_it_needs(which: str, ours: Executor, tmp_path: Path) -> None:
-    spawning = multiprocessing.get_context("spawn")
-    executor = {"ours": ours, "threads": ThreadPoolExecutor(3), "processes": ProcessPoolExecutor(1, spawning)}[which]
+    if which == "ours":
+        stays_open = nullcontext(ours)
+    elif which == "threads":
+        stays_open = ThreadPoolExecutor(3)
+    else:
+        stays_open = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
     rng = random.Random(1)
     needs: dict[str, tuple[str, ...]] = {}
     for i in range(12):
@@ -77,8 +86,9 @@ def test_on_any_executor_each_comes_after_what_it_needs(which: str, ours: Execut
 
     jobs = [joined(name, *of) for name, of in needs.items()]
     rng.shuffle(jobs)
-    assert run(jobs, tmp_path, executor) == set(needs)
-    assert executor.submit(len, "left open").result() == 9
+    with stays_open as executor:
+        assert run(jobs, tmp_path, executor) == set(needs)
+        assert executor.submit(len, "left open").result() == 9
     assert {name: (tmp_path / name).read_text() for name in needs} == {name: held(name) for name in needs}
     assert run(jobs, tmp_path) == set()
 
@@ -193,3 +203,18 @@ def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
     """Names of robots and conditions may hold dots, spaces and dashes."""
     jobs = ["limit/cartpole/over-time", "limit/cartpole.over-time", "limit.cartpole/over-time"]
     assert len({receipt_path(tmp_path, job) for job in jobs}) == 3
+
+
+def test_a_recording_is_known_by_what_it_says_not_by_what_nwb_adds(tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("again", 1), ("other", 2)):
+        write_nwb(make_up_recording(seed, patterns=5, channels=16), tmp_path / f"{name}.nwb")
+    made, again, other = (tmp_path / f"{name}.nwb" for name in ("a", "again", "other"))
+    assert made.read_bytes() != again.read_bytes()
+    assert digest_of(made) == digest_of(again) != digest_of(other)
+    receipt = Receipt("record", "22", {}, {"a.nwb": digest_of(made)})
+    shutil.copy(again, made)
+    assert receipt.changed(tmp_path) == []
+    shutil.copy(other, made)
+    assert receipt.changed(tmp_path) == ["a.nwb"]
+    made.write_bytes(made.read_bytes()[:1000])
+    assert receipt.changed(tmp_path) == ["a.nwb"]

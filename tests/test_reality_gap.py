@@ -40,7 +40,7 @@ from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.recording import Recording
+from animat.recordings.recording import RecordedCulture, Recording
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
@@ -720,10 +720,10 @@ class TestCommand:
 
 
 def test_a_cl1_is_stimulated_through_the_patterns_that_it_was_recorded_with(recordings: list[Recording]) -> None:
-    drawn = replace(recordings[0], provenance={"source": "CL1 (device) by animat.cultures.cl1", "pattern_seed": "7"})
+    drawn = replace(recordings[0], culture=RecordedCulture("cl1", 7))
     known = recorded_culture("cl1", [drawn], [])
     np.testing.assert_array_equal(culture_of("cl1", **known).patterns, CL1Culture(seed=7).patterns)
-    given = replace(drawn, provenance={**drawn.provenance, "pattern_seed": "none: they were given"})
+    given = replace(drawn, culture=None)
     assert recorded_culture("cl1", [given], []) == recorded_culture("virtual", [drawn], []) == {}
 
 

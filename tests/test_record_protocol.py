@@ -40,7 +40,7 @@ def test_a_culture_is_recorded_as_the_file_says(
     assert main([*replayed, "--protocol", str(tmp_path / "mine.json"), "--json"]) == 0
     (file,) = json.loads(capsys.readouterr().out.splitlines()[-1])["recordings"]
     recording = read_recording(file)
-    assert Protocol.from_json(recording.provenance["protocol"]) == MINE
+    assert recording.protocol == MINE
     assert str(recording.presentation) == "mixed, 3 pulses a presentation"
     frequency_hz, times = np.unique(recording.stimuli.frequency_hz, return_counts=True)
     assert (frequency_hz.tolist(), times.tolist()) == ([5.0, 40.0], [6, 6])
@@ -58,8 +58,8 @@ def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path
     """Patterns are as many as the culture has, which a replay of six has fewer of than usual; order and pulses too."""
     (tmp_path / "mine.json").write_text('{"presentations": 6}')
     assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 0
-    told = read_recording(tmp_path / "out" / "recording_0000_min.nwb").provenance["protocol"]
-    assert Protocol.from_json(told) == Protocol(patterns=6, presentations=6, pulse=pulse_for("replay"))
+    recording = read_recording(tmp_path / "out" / "recording_0000_min.nwb")
+    assert recording.protocol == Protocol(patterns=6, presentations=6, pulse=pulse_for("replay"))
 
 
 def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument, UnusableData
-from animat.recordings.findings import Finding
-from animat.recordings.noticed import as_provenance, noticed
-from animat.recordings.recording import Channels, Recording
-from animat.stimulation.protocol import Presentation
+from animat.recordings.findings import Finding, merged
+from animat.recordings.noticed import noticed
+from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.told import from_words, in_words
+from animat.stimulation.protocol import PAPER, Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
@@ -117,6 +118,8 @@ def test_simultaneous_spikes_have_one_order() -> None:
         {"sampling_rate_hz": 20_000.0},
         {"presentation": Presentation("mixed")},
         {"provenance": {"source": "elsewhere"}},
+        {"protocol": PAPER},
+        {"findings": (Finding("a", "note", "b"),)},
         {"stimuli": stimuli(frequency_hz=[5.0, 5.0])},
         {"stimuli": stimuli(electrodes=[[1, 2, UNKNOWN], [3, UNKNOWN, UNKNOWN]])},
         {"channels": channels(4)},
@@ -132,9 +135,17 @@ def test_the_response_is_read_after_the_last_pulse_of_a_presentation() -> None:
     assert table.is_last_of_presentation.tolist() == [False, False, True, False, True]
 
 
-def test_findings_travel_in_the_provenance_and_are_found_again() -> None:
-    noted = (Finding("a-thing", "warning", "something: odd", 3.0), Finding("another", "note", "less odd"))
-    found = noticed(recording(provenance={"source": "here: a rig", **as_provenance(noted)}))
+def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
+    noted = (Finding("a-thing", "warning", "something: odd"), Finding("another", "note", "less odd"))
+    words = {"source": "virtual culture: of a test", "seed": "7", "of a rig": "its: words"}
+    made = recording(provenance=words, protocol=PAPER, culture=RecordedCulture("virtual", 7), findings=noted)
+    again = from_words(in_words(made))
+    assert recording(**again).equals(made)
+    assert from_words({"source": "CL1 (device)", "pattern_seed": "3"})["culture"] == RecordedCulture("cl1", 3)
+    assert from_words({"source": "CL1 (device)", "pattern_seed": "none: they were given"})["culture"] is None
+    with pytest.raises(InvalidArgument, match="protocol: expected JSON"):
+        from_words({"protocol": "mixed"})
+    found = noticed(recording(findings=noted))
     assert [(f.name, f.severity, f.sentence) for f in found[:2]] == [
         ("a-thing", "warning", "something: odd"),
         ("another", "note", "less odd"),
@@ -144,7 +155,7 @@ def test_findings_travel_in_the_provenance_and_are_found_again() -> None:
 
 def test_two_findings_of_one_name_are_both_kept() -> None:
     noted = (Finding("columns-left-out", "note", "x of a.csv"), Finding("columns-left-out", "note", "y of b.csv"))
-    assert as_provenance(noted) == {"note: columns-left-out": "x of a.csv; y of b.csv"}
+    assert merged(noted) == (Finding("columns-left-out", "note", "x of a.csv; y of b.csv"),)
 
 
 def test_what_is_seen_in_the_data_is_said() -> None:

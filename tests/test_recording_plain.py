@@ -51,7 +51,12 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
     assert recording.presentation is None
     assert recording.stimuli.presentation.tolist() == [0, 1]
     assert names(recording) >= {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
-    assert "1 of 3 spikes stand behind a later one" in recording.provenance["note: unsorted-spikes"]
+    assert "1 of 3 spikes stand behind a later one" in said(recording)["unsorted-spikes"]
+
+
+def said(recording: Recording) -> dict[str, str]:
+    """What was noticed when it was read, by name."""
+    return {finding.name: finding.sentence for finding in recording.findings}
 
 
 @FEW
@@ -59,8 +64,7 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
 def test_spikes_out_of_order_are_those_with_a_later_one_anywhere_before_them(times: list[int], tmp_path: Path) -> None:
     path = npz(tmp_path, spike_time_s=np.array(times), spike_channel=np.zeros(len(times), int), **STIMULI)
     behind = sum(any(before > time for before in times[:i]) for i, time in enumerate(times))
-    said = read_recording(path).provenance.get("note: unsorted-spikes", "0 of")
-    assert said.startswith(f"{behind} of")
+    assert said(read_recording(path)).get("unsorted-spikes", "0 of").startswith(f"{behind} of")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +123,7 @@ def test_every_key_arrives_in_its_place(tmp_path: Path) -> None:
     assert recording.stimuli.is_last_of_presentation.tolist() == [False, True]
     assert (recording.start_s, recording.duration_s, recording.start_min) == (-1.0, 5.0, 140.0)
     assert (recording.sampling_rate_hz, recording.presentation) == (20_000.0, Presentation("mixed", 2))
-    assert recording.provenance["note: keys-left-out"].endswith("note_of_mine")
+    assert said(recording)["keys-left-out"].endswith("note_of_mine")
     assert "silent-channels" in names(recording)
 
 
@@ -343,7 +347,7 @@ def test_csv_with_a_header_or_a_bare_column_of_stimuli(tmp_path: Path) -> None:
     assert recording.channels.label[recording.spike_channels].tolist() == ["a", "b"]
     assert recording.stimuli.time_s.tolist() == [0.25, 1.5]
     assert recording.start_min == 10.0
-    assert "n, uV" in recording.provenance["note: columns-left-out"]
+    assert "n, uV" in said(recording)["columns-left-out"]
     stimuli = (
         "time_s;frequency_hz;pattern;electrodes;presentation\n0.1;5;left;12 13;0\n0.2;;right;14;0\n0.3;80;left;;1\n"
     )
@@ -380,10 +384,10 @@ def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tm
     assert recording.channels.label.tolist() == ["17", "21"]
     assert recording.stimuli.time_s.tolist() == [0.25, 0.5]
     assert recording.stimuli.frequency_hz.tolist() == [5.0, 12.5]
-    read_as = recording.provenance["note: headers-read-as"]
+    read_as = said(recording)["headers-read-as"]
     assert "'Time (s)' of a_spikes.csv is read as time_s" in read_as
     assert "'Frequency-Hz' of a_stimuli.csv is read as frequency_hz" in read_as
-    assert "spike_time_s of a_spikes.csv has decimal commas" in recording.provenance["note: decimal-commas"]
+    assert "spike_time_s of a_spikes.csv has decimal commas" in said(recording)["decimal-commas"]
 
 
 @settings(max_examples=50, deadline=None)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
 from animat.evaluation.statistics import compare
+from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Group, Pair, draw_comparisons
 from animat.report.controls import Controls, draw_controls
 from animat.report.learning_curves import LearningCurve, draw_learning_curves
@@ -20,21 +20,22 @@ from animat.studies.differences import came_out_otherwise, decisions, explain
 from animat.studies.learned import as_good_as_the_limit_allows, known_of, learned_of
 from animat.studies.limits import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
-from animat.studies.places import limits_file, table_file, write_table
+from animat.studies.places import limits_file
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper
+from animat.studies.results import ComparedReturns, Limit, Score, write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.specification import Body, Simulators, Source, Study, StudyCondition
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 
-ROW: dict[str, Any] = {
-    "comparison": "c", "robot": "cartpole", "at_min": 140.0, "n": 10, "first": "a", "second": "b",
-    "mean_first": 5.0, "mean_second": 16.0, "limit_first": 90.0, "limit_second": 80.0, "limit_error_first": 0.5,
-    "limit_error_second": 0.5, "random_second": -80.0, "score_first": 0.5, "score_second": 0.6, "u": 50.0,
-    "p_normal": 0.5, "outcome": NONE, "paper_u": 0.0, "paper_p": 1.83e-4, "as_in_paper": "no",
-}  # fmt: skip
+ROW = ComparedReturns(
+    comparison="c", robot="cartpole", first="a", second="b", at_min=140.0, episodes=100, n=10, mean_first=5.0,
+    mean_second=16.0, score_first=0.5, score_second=0.6, random_second=-80.0, limit_first=90.0, limit_second=80.0,
+    limit_error_first=0.5, limit_error_second=0.5, u=50.0, p_normal=0.5, p_exact=0.5, p_holm=1.0, effect=0.0,
+    effect_low_95=-1.0, effect_high_95=1.0, outcome=NONE, paper_u=0.0, paper_p=1.83e-4, as_in_paper="no",
+)  # fmt: skip
 
 
 # --- outcomes -------------------------------------------------------------------------------------------------------
@@ -52,16 +53,15 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     """Four that are all better have p = 0.03."""
     assert outcome_of(compare(np.arange(4.0), np.arange(4.0) + 100)) == TOO_FEW
     assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
-    words = _as_in_paper([ROW | {"as_in_paper": each} for each in ("yes", "cannot tell", "cannot tell")])
+    words = _as_in_paper([replace(ROW, as_in_paper=each) for each in ("yes", "cannot tell", "cannot tell")])
     assert words.startswith("1 of 3 comparisons") and "Of 2 it cannot be told" in words
     assert "otherwise" not in words
-    assert "cannot be told" in _as_in_paper([ROW | {"as_in_paper": "cannot tell"}] * 2)
+    assert "cannot be told" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
 
 
 def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
-    every = {"p_exact": 0.5, "effect": 0.0, "effect_low_95": -1.0, "effect_high_95": 1.0}
     rows = [
-        ROW | every | {"outcome": outcome, "p_holm": p_holm}
+        replace(ROW, outcome=outcome, p_holm=p_holm)
         for outcome, p_holm in ((SECOND, 0.005), (SECOND, 0.05), (FIRST, 0.05), (NONE, 1.0))
     ]
     shown = comparisons_shown(rows)
@@ -78,37 +78,31 @@ def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
 
 def test_a_comparison_knows_what_its_limit_says() -> None:
     assert "other way round" in explain(ROW)
-    assert "take more policies" in explain(ROW | {"n": 4})
-    assert "nothing to learn" in explain(ROW | {"limit_second": -79.8})
-    assert "no limit" in explain(ROW | {"limit_second": None})
-    assert "leaves room" in explain(ROW | {"limit_second": 100.0})
+    assert "take more policies" in explain(replace(ROW, n=4))
+    assert "nothing to learn" in explain(replace(ROW, limit_second=-79.8))
+    assert "no limit" in explain(replace(ROW, limit_second=None))
+    assert "leaves room" in explain(replace(ROW, limit_second=100.0))
 
 
 def test_there_is_room_as_long_as_the_second_limit_is_far_above_the_first_condition() -> None:
     """The first is near its own limit of 60; the second could have 100, and has a third of the way."""
-    row = ROW | {
-        "limit_first": 60.0,
-        "limit_second": 100.0,
-        "mean_first": 56.0,
-        "score_first": 0.97,
-        "score_second": 0.3,
-    }
+    row = replace(ROW, limit_first=60.0, limit_second=100.0, mean_first=56.0, score_first=0.97, score_second=0.3)
     assert "no room" not in explain(row)
     assert "leaves room, 44.0 above a" in explain(row)
-    assert "no room is left" in explain(row | {"mean_first": 96.0})
-    assert "at its limit" in explain(row | {"score_second": 0.98})
-    assert "at its limit" not in explain(row | {"score_second": 0.96})
+    assert "no room is left" in explain(replace(row, mean_first=96.0))
+    assert "at its limit" in explain(replace(row, score_second=0.98))
+    assert "at its limit" not in explain(replace(row, score_second=0.96))
 
 
 def test_limits_are_in_order_only_where_they_lie_apart_by_more_than_their_errors() -> None:
-    close = ROW | {"limit_first": 119.95, "limit_second": 119.94, "limit_error_first": 0.4, "limit_error_second": 2.2}
+    close = replace(ROW, limit_first=119.95, limit_second=119.94, limit_error_first=0.4, limit_error_second=2.2)
     assert "other way round" not in explain(close)
     assert "same within their errors" in explain(close)
-    assert "other way round" in explain(close | {"limit_first": 122.6})
+    assert "other way round" in explain(replace(close, limit_first=122.6))
 
 
 def test_a_control_is_given_no_limit() -> None:
-    words = explain(ROW | {"limit_first": None, "limit_error_first": None})
+    words = explain(replace(ROW, limit_first=None, limit_error_first=None))
     assert "a cannot do better than random actions" in words and "for a" not in words
 
 
@@ -117,7 +111,7 @@ def test_what_binning_takes_is_said_where_it_takes_something() -> None:
     assert "binning" not in words and "none found" in words
     ((_, words),) = came_out_otherwise([ROW], {140.0: 0.21})
     assert "binning moves P(x ≥ P50) by up to 0.21" in words
-    assert came_out_otherwise([ROW | {"as_in_paper": "yes"}, ROW | {"as_in_paper": None}]) == ()
+    assert came_out_otherwise([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)]) == ()
 
 
 # --- decisions are the study's ---------------------------------------------------------------------------------------
@@ -201,20 +195,21 @@ def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
 
 
-LEARNED: dict[str, Any] = {
-    "robot": "cartpole", "condition": "without shadowing", "mapping": "1-threshold", "at_min": 0.0, "mean_return": 96.0,
-    "random": -80.0, "limit": 110.0, "limit_run": 105.0, "normalised_score": 0.88, "score_without_clock": 0.9,
-}  # fmt: skip
+LEARNED = Score(
+    robot="cartpole", condition="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
+    mean_return=96.0, standard_deviation=3.0, interquartile_mean=96.0, low_95=95.0, high_95=97.0, random=-80.0,
+    limit=110.0, limit_grid_error=0.1, limit_run=105.0, limit_run_standard_error=0.1, limit_without_clock=100.0,
+    normalised_score=0.88, score_without_clock=0.9,
+)  # fmt: skip
 
 
 def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
-    rows = [LEARNED | {"at_min": 140.0}, LEARNED, LEARNED | {"condition": "1 threshold"}]
+    rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, condition="1 threshold")]
     assert learned_of(paper_study(), rows) == [LEARNED]
 
 
 def test_what_was_learned_stands_between_random_actions_and_the_limit() -> None:
-    known = {"standard_deviation": 3.0, "policies": 9, "limit": 120.0, "limit_without_clock": 100.0}
-    table = as_good_as_the_limit_allows(paper_study(), [LEARNED | known])
+    table = as_good_as_the_limit_allows(paper_study(), [replace(LEARNED, limit=120.0)])
     (shown,) = (dict(zip(table.head, row, strict=True)) for row in table.rows)
     assert (shown["random"], shown["limit"], shown["score"]) == (-80.0, 120.0, 0.88)
     assert table.head.index("mean ± s.e.") < table.head.index("random") < table.head.index("limit")
@@ -222,14 +217,14 @@ def test_what_was_learned_stands_between_random_actions_and_the_limit() -> None:
 
 def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
     body = Body("cartpole")
-    assert known_of(LEARNED | {"normalised_score": 0.98}, body) == "reached"
-    assert known_of(LEARNED | {"normalised_score": None}, body).startswith("nothing to learn")
-    assert known_of(LEARNED | {"limit": None, "normalised_score": None}, body).startswith(
+    assert known_of(replace(LEARNED, normalised_score=0.98), body) == "reached"
+    assert known_of(replace(LEARNED, normalised_score=None), body).startswith("nothing to learn")
+    assert known_of(replace(LEARNED, limit=None, normalised_score=None), body).startswith(
         "no limit: conditions with few"
     )
     assert known_of(LEARNED, body).endswith("short by 0.09, which neither the clock nor the grid explains")
-    assert "short by the clock" in known_of(LEARNED | {"score_without_clock": 0.99}, body)
-    assert "its controller was seen to get" in known_of(LEARNED | {"limit_run": 100.0}, body)
+    assert "short by the clock" in known_of(replace(LEARNED, score_without_clock=0.99), body)
+    assert "its controller was seen to get" in known_of(replace(LEARNED, limit_run=100.0), body)
     assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, Body("cartpole", iterations=60_000))
 
 
@@ -239,18 +234,19 @@ def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
 def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path: Path) -> None:
     study = Study(robots=(Body("cartpole"),), conditions=(StudyCondition("linear", mapping="linear"),
                                                          StudyCondition("1 threshold")))  # fmt: skip
-    shares = [(0.0, f"{i} Hz", 0.5, 0.5) for i in range(13)] + [(10.0, f"{i} Hz", 0.5, 0.5) for i in range(13)]
-    shares[13], shares[25] = (10.0, "0 Hz", 0.13, 0.28), (10.0, "12 Hz", 0.9, 0.88)
-    head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
-    write_table(table_file(tmp_path, "controllability"), head, shares)
+    labels = tuple(f"{i} Hz" for i in range(13))
+    in_data, in_simulator = np.full((2, 13), 0.5), np.full((2, 13), 0.5)
+    in_data[1, [0, 12]], in_simulator[1, [0, 12]] = (0.13, 0.9), (0.28, 0.88)
+    kept = {10.0 * i: Fidelity(labels, in_data[i], in_simulator[i], 0) for i in range(2)}
+    unknown = dict.fromkeys(field.name for field in fields(Limit))
+    told = {"robot": "cartpole", "percentiles": "moving"}
     limits = [
-        (m, "moving", at, value, None if at else "0 Hz (3)")
-        for m, value in (("9-thresholds", 99.0), ("1-threshold", 42.0))
+        Limit(**unknown | told | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"})
+        for m, x in (("9-thresholds", 99.0), ("1-threshold", 42.0))
         for at in (0.0, 10.0)
     ]
-    head = ("mapping", "percentiles", "at_min", "best_return", "left_out")
-    write_table(limits_file(tmp_path, "cartpole", "over-time"), head, limits)
-    table = controllability_shown(study, tmp_path)
+    write_typed(limits_file(tmp_path, "cartpole", "over-time"), limits)
+    table = controllability_shown(study, tmp_path, kept)
     assert table.head[-3:] == ("difference, data", "difference, simulator", "limit, cartpole")
     assert table.marked == (1,)
     assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"

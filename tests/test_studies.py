@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import os
 import random
@@ -34,7 +33,7 @@ from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
 from animat.execution.jobs import in_order
-from animat.execution.receipts import Receipt
+from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
@@ -48,10 +47,9 @@ from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.folder import describe_study, sums_of
-from animat.studies.identity import settle_identity
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
-from animat.studies.places import controls_file, episodes_file
+from animat.studies.places import controls_file, episodes_file, paths_file
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
@@ -76,11 +74,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files(folder: Path) -> dict[str, str]:
-    """Every file of a folder, hidden ones too, with a hash over its bytes."""
+    """Every file of a folder, hidden ones too, with a digest."""
     return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        path.relative_to(folder).as_posix(): digest_of(path) for path in sorted(folder.rglob("*")) if path.is_file()
     }
 
 
@@ -169,6 +165,19 @@ def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) ->
     (tmp_path / "a-file").write_text("mine")
     with pytest.raises(InvalidFile, match="got a file"):
         run_study(read_study(TINY), tmp_path / "a-file")
+
+
+def test_a_folder_of_before_results_were_typed_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    """Its fingerprint knew neither pandas nor pillow; what its jobs handed each other was CSV."""
+    study = read_study(TINY)
+    manifest = describe_study(study, {})
+    for name in ("pandas", "pillow"):
+        del manifest["versions"][name]
+    (tmp_path / "study.json").write_text(json.dumps(manifest | {"fingerprint": "of before"}))
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "episodes" / "episodes.csv").write_text("at_min,actor\n")
+    with pytest.raises(Mismatch, match=r"versions\.pandas: nothing there, .* now\); give another folder"):
+        run_study(study, tmp_path)
 
 
 def test_nothing_of_another_s_folder_is_touched(tmp_path: Path) -> None:
@@ -413,17 +422,21 @@ class Halts(Executor):
         return future
 
 
+def episodes_in(folder: Path, **columns: str) -> list[dict[str, str]]:
+    """The rows of the table of episodes with these values."""
+    return [row for row in rows(folder / "tables/episodes.csv") if columns.items() <= row.items()]
+
+
 # --- the results ----------------------------------------------------------------------------------------------------
 
 
 def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
     (told,) = rows(finished / "tables/comparisons.csv")
     means = []
-    for slug in ("before-training", "1-threshold"):
+    for condition in ("before training", "1 threshold"):
         returns = defaultdict(list)
-        for row in rows(finished / f"episodes/navigation/{slug}/episodes.csv"):
-            if float(row["at_min"]) == 0.0:
-                returns[row["actor"]].append(float(row["return"]))
+        for row in episodes_in(finished, arm=condition, agent="policy", at_min="0.0", over_time="False"):
+            returns[row["actor"]].append(float(row["return"]))
         assert {len(of_policy) for of_policy in returns.values()} == {5}
         means.append([np.mean(of_policy) for of_policy in returns.values()])
     ours = mannwhitneyu(*means, alternative="two-sided", method="asymptotic")
@@ -435,25 +448,24 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
 
 def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -> None:
     """From the episodes and the limits themselves, not from other columns of the table."""
-    folder_of = {"none": "none", "1-threshold": "1-threshold", "9-thresholds": "9-thresholds-held"}
-    limits = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "limits/navigation-limits.csv")}
+    arm_of = {
+        "none": "without neurons",
+        "1-threshold": "1-threshold",
+        "9-thresholds": "9-thresholds, percentiles held",
+    }
+    limits = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/limits.csv")}
 
-    def returns_of(path: str, at_min: float) -> np.ndarray:
-        """Of policies, or of random stimuli among controls; all have as many episodes."""
-        return np.array(
-            [
-                float(row["return"])
-                for row in rows(finished / path)
-                if row.get("control", "random") == "random" and float(row["at_min"]) == at_min
-            ]
-        )
+    def returns_of(arm: str, agent: str, at_min: str) -> np.ndarray:
+        """All have as many episodes."""
+        told = episodes_in(finished, arm=arm, agent=agent, at_min=at_min, over_time="False")
+        return np.array([float(row["return"]) for row in told])
 
     scores = rows(finished / "tables/scores.csv")
-    assert {row["mapping"] for row in scores} == set(folder_of)
+    assert {row["mapping"] for row in scores} == set(arm_of)
     for row in scores:
         mapping, at_min = row["mapping"], float(row["at_min"])
-        random_ = returns_of(f"controls/navigation/{folder_of[mapping]}/episodes.csv", at_min).mean()
-        policies = returns_of(f"episodes/navigation/{row['condition'].replace(' ', '-')}/episodes.csv", at_min)
+        random_ = returns_of(arm_of[mapping], "random", row["at_min"]).mean()
+        policies = returns_of(row["condition"], "policy", row["at_min"])
         if row["condition"] in CONTROLS:
             # Whatever it chooses is as good as random: it has no limit of its own.
             assert (row["limit"], row["normalised_score"]) == ("", "")
@@ -505,26 +517,6 @@ def test_simulators_are_kept_whole(finished: Path) -> None:
         load_timeline(finished.parent / "cut")
 
 
-def test_the_same_recording_is_the_same_file(tmp_path: Path) -> None:
-    recording = make_up_recording(1, patterns=5, channels=16)
-    for name in ("a.nwb", "b.nwb"):
-        write_nwb(recording, tmp_path / name)
-    assert (tmp_path / "a.nwb").read_bytes() != (tmp_path / "b.nwb").read_bytes()
-    for name in ("a.nwb", "b.nwb"):
-        settle_identity(tmp_path / name)
-    settled = (tmp_path / "a.nwb").read_bytes()
-    assert settled == (tmp_path / "b.nwb").read_bytes()
-    assert read_recording(tmp_path / "a.nwb").equals(recording)
-    settle_identity(tmp_path / "a.nwb")
-    assert (tmp_path / "a.nwb").read_bytes() == settled
-    other = make_up_recording(2, patterns=5, channels=16)
-    write_nwb(other, tmp_path / "c.nwb")
-    settle_identity(tmp_path / "c.nwb")
-    ids = [set(re.findall(rb"[0-9a-f]{8}-[0-9a-f]{4}-5[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}", data))
-           for data in (settled, (tmp_path / "c.nwb").read_bytes())]  # fmt: skip
-    assert ids[0] and not ids[0] & ids[1]
-
-
 def test_the_example_of_the_page_runs(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -566,7 +558,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "heuristic", "learning-curves", "limits", "controllability", "findings",
         "culture-array", "culture-psth", "culture-bursts", "culture-conditions", "culture-drift",
-        "navigation-learning", "navigation-over-time",
+        "navigation-learning", "navigation-over-time", "navigation-paths", "episodes",
     }  # fmt: skip
 
 
@@ -632,12 +624,10 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
     course = rows(finished / "tables/navigation-over-time.csv")
     assert {row["condition"] for row in course} == {"before training", "1 threshold", "control"}
     for row in course:
-        slug = row["condition"].replace(" ", "-")
-        means = [
-            float(each["mean_return"])
-            for each in rows(finished / "episodes/navigation" / slug / "over-time.csv")
-            if float(each["at_min"]) == float(row["at_min"])
-        ]
+        returns = defaultdict(list)
+        for each in episodes_in(finished, arm=row["condition"], at_min=row["at_min"], over_time="True"):
+            returns[each["actor"]].append(float(each["return"]))
+        means = [np.mean(of_policy) for of_policy in returns.values()]
         told = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
         assert told == pytest.approx(np.quantile(means, [0.25, 0.5, 0.75]))
         assert int(row["policies"]) == len(means) == 2
@@ -897,13 +887,10 @@ def test_no_two_conditions_or_controls_share_a_file(tmp_path: Path) -> None:
     body = Body("navigation")
     conditions = [StudyCondition(name, percentiles=held) for name in names for held in ("moving", "first")]
     places = {
-        of(tmp_path, body, condition, what)
-        for condition in conditions
-        for of in (episodes_file, controls_file)
-        for what in ("episodes", "paths", "over-time")
+        of(tmp_path, body, condition) for condition in conditions for of in (episodes_file, controls_file, paths_file)
     }
     # A condition's name is its own, however its percentiles are held; controls are of a way to hold them.
-    assert len(places) == 3 * len(names) + 3 * 2
+    assert len(places) == 2 * len(names) + 2
 
 
 def test_a_missing_file_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

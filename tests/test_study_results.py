@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import pytest
 from animat.animat import Animat
 from animat.cli import main
 from animat.coding.mapping import Thresholds
+from animat.errors import InvalidFile
 from animat.evaluation.optimum import best_return
-from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import holm
 from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline
@@ -23,14 +25,15 @@ from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.studies.draws import draw_seed
-from animat.studies.evaluating import HEAD, Evaluate
-from animat.studies.limits import HEAD as LIMIT_HEAD
-from animat.studies.limits import Limit
-from animat.studies.places import controls_file, episodes_file, limits_file, read_table, table_file, write_table
+from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, tabulated, write_episodes
+from animat.studies.evaluating import Evaluate
+from animat.studies.limits import FindLimits, read_limits
+from animat.studies.places import controls_file, episodes_file, limits_file, results_file, table_file
 from animat.studies.recording import Record
+from animat.studies.results import ComparedReturns, Limit, Results, read_typed, write_typed
 from animat.studies.shown import limits_shown
 from animat.studies.simulating import Fit
-from animat.studies.specification import Body, Compared, Source, Study, StudyCondition
+from animat.studies.specification import Body, Compared, Source, Study, StudyCondition, named_mapping
 from animat.studies.tabulating import References, Tabulate
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -47,8 +50,8 @@ RETURNS = {
 }
 
 
-def compared_returns(folder: Path, *comparisons: Compared) -> list[dict[str, Any]]:
-    """The table of comparisons for made-up returns of six policies: two episodes each, one below and one above."""
+def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedReturns, ...]:
+    """The comparisons of made-up returns of six policies: two episodes each, one below and one above."""
     study = Study(
         robots=(Body("cartpole"), Body("navigation")),
         conditions=(WORSE, BETTER, LIKE),
@@ -58,44 +61,78 @@ def compared_returns(folder: Path, *comparisons: Compared) -> list[dict[str, Any
     )
     for body in study.robots:
         for condition in study.conditions:
-            rows = [
-                (0.0, f"p{policy}", episode, mean + off, 10, 0)
-                for policy, mean in enumerate(RETURNS[condition.name])
-                # A third episode, that no comparison asks for, would turn every order around.
-                for episode, off in enumerate((-1.0, 1.0, -5.0 * mean))
-            ]
-            write_table(episodes_file(folder, body, condition), HEAD, rows)
-        random = [("random", 0.0, "", 0, -80.0, 10, 1)]
-        write_table(controls_file(folder, body, LIKE), ("control", *HEAD), random)
-        limit = {"mapping": "none", "percentiles": "moving", "at_min": 0.0, "best_return": 20.0, "grid_error": 0.1}
-        limit |= {"monte_carlo": 20.0, "standard_error": 0.1, "without_clock": 20.0, "left_out": None}
-        write_table(limits_file(folder, body.name), LIMIT_HEAD, [[limit.get(name, 0.0) for name in LIMIT_HEAD]])
+            # A third episode, that no comparison asks for, would turn every order around.
+            returns = np.array([[mean - 1.0, mean + 1.0, -4.0 * mean] for mean in RETURNS[condition.name]])
+            table = tabulated(episodes_of(returns), robot=body.name, arm=condition.name, at_min=0.0)
+            write_episodes(episodes_file(folder, body, condition), [table])
+        write_random(folder, body, LIKE, 0.0)
+        limit = Limit(body.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
+        write_typed(limits_file(folder, body.name), [limit])
     Tabulate(study).run(folder, Silent())
-    return read_table(table_file(folder, "comparisons"))
+    results = read_typed(results_file(folder), Results)
+    with table_file(folder, "comparisons").open(newline="") as file:
+        assert [row["u"] for row in csv.DictReader(file)] == [str(row.u) for row in results.comparisons]
+    return results.comparisons
+
+
+def write_random(folder: Path, body: Body, condition: StudyCondition, *minutes: float) -> None:
+    """Controls of which only random is there: one episode a minute, with a return of -80."""
+    ran, arm = episodes_of(np.array([[-80.0]])), named_mapping(condition.mapping, condition.percentiles)
+    tables = [tabulated(ran, robot=body.name, arm=arm, agent=RANDOM, at_min=at_min) for at_min in minutes]
+    write_episodes(controls_file(folder, body, condition), tables)
+
+
+def episodes_of(returns: np.ndarray) -> Episodes:
+    """Episodes of ten iterations each."""
+    none = np.zeros((len(returns), 0), np.int64)
+    return Episodes(returns, np.full(returns.shape, 10), np.zeros(returns.shape, bool), none, none)
+
+
+def test_the_table_of_episodes_has_a_row_for_each(tmp_path: Path) -> None:
+    returns, terminated = np.array([[1.0, 2.5], [-3.0, 0.1]]), np.array([[True, False], [False, False]])
+    ran = replace(episodes_of(returns), terminated=terminated)
+    parts = [tabulated(ran, robot="cartpole", arm="a b", at_min=at_min) for at_min in (0.0, 10.5)]
+    other = tabulated(ran, robot="cartpole", arm="1-threshold", agent="silent", at_min=0.0, over_time=True)
+    files = [write_episodes(tmp_path / "a.npz", parts), write_episodes(tmp_path / "b.npz", [other])]
+    table = read_episodes(files)
+    assert tuple(table) == COLUMNS and len(table) == 12
+    rows = table[(table["arm"] == "a b") & (table["at_min"] == 10.5)]
+    assert list(zip(rows["actor"], rows["episode"], rows["return"], rows["ended"], strict=True)) == [
+        (0, 0, 1.0, "terminated"), (0, 1, 2.5, "truncated"), (1, 0, -3.0, "truncated"), (1, 1, 0.1, "truncated"),
+    ]  # fmt: skip
+    assert table["agent"].tolist() == ["policy"] * 8 + ["silent"] * 4
+    assert table["over_time"].tolist() == [False] * 8 + [True] * 4
+    assert mean_returns(rows).tolist() == [1.75, -1.45] and mean_returns(rows, 1).tolist() == [1.0, -3.0]
+    written = files[0].read_bytes()
+    write_episodes(files[0], parts)
+    assert files[0].read_bytes() == written
+    files[1].write_bytes(written[:100])
+    with pytest.raises(InvalidFile, match=r"b\.npz: expected arrays of this study"):
+        read_episodes(files)
 
 
 def test_the_better_side_is_named_and_the_effect_has_its_sign(tmp_path: Path) -> None:
     up = Compared("up", "worse", "better", episodes=2)
     down = Compared("down", "better", "worse", episodes=2)
-    by_name = {(row["comparison"], row["robot"]): row for row in compared_returns(tmp_path, up, down)}
+    by_name = {(row.comparison, row.robot): row for row in compared_returns(tmp_path, up, down)}
     for robot in ("cartpole", "navigation"):
         rising, falling = by_name["up", robot], by_name["down", robot]
-        assert (rising["outcome"], falling["outcome"]) == ("second better", "first better")
-        assert rising["effect"] == -falling["effect"] != 0
-        assert rising["u"] == falling["u"] == 0
-        assert rising["mean_first"] == falling["mean_second"] == pytest.approx(np.mean(RETURNS["worse"]))
-        assert rising["mean_second"] == falling["mean_first"] == pytest.approx(np.mean(RETURNS["better"]))
-        assert rising["score_second"] == pytest.approx((rising["mean_second"] + 80) / 100)
+        assert (rising.outcome, falling.outcome) == ("second better", "first better")
+        assert rising.effect == -falling.effect != 0
+        assert rising.u == falling.u == 0
+        assert rising.mean_first == falling.mean_second == pytest.approx(np.mean(RETURNS["worse"]))
+        assert rising.mean_second == falling.mean_first == pytest.approx(np.mean(RETURNS["better"]))
+        assert rising.score_second == pytest.approx((rising.mean_second + 80) / 100)
 
 
 def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_path: Path) -> None:
     rows = compared_returns(
         tmp_path, Compared("alike", "better", "like", episodes=2), Compared("up", "worse", "better", episodes=2)
     )
-    assert all("better" not in row["outcome"] for row in rows if row["comparison"] == "alike")
-    corrected = holm({f"{row['comparison']}/{row['robot']}": row["p_normal"] for row in rows})
+    assert all("better" not in row.outcome for row in rows if row.comparison == "alike")
+    corrected = holm({f"{row['comparison']}/{row['robot']}": row.p_normal for row in rows})
     assert len(corrected) == 4
-    assert [row["p_holm"] for row in rows] == [corrected[f"{row['comparison']}/{row['robot']}"] for row in rows]
+    assert [row.p_holm for row in rows] == [corrected[f"{row['comparison']}/{row['robot']}"] for row in rows]
 
 
 # --- who answers ----------------------------------------------------------------------------------------------------
@@ -122,7 +159,8 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
         Evaluate(study, body, condition),
     ):
         task.run(tmp_path, Silent())
-    got = read_table(episodes_file(tmp_path, body, condition))
+    got = read_episodes([episodes_file(tmp_path, body, condition)])
+    got = got[~got["over_time"]]
 
     timeline = fit_timeline(extract_series(read_recordings(tmp_path / "recordings")))
     policies = load_policies(tmp_path / "policies" / "navigation" / "control")
@@ -136,7 +174,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
             expected[name, at_min] = ran.returns
         turned = replace(environment, delivery="chosen" if delivery == "shuffled" else "shuffled")
         expected["turned", at_min] = roll_out(turned, timeline.at(at_min), networks, 2, episodes=7, seed=seed).returns
-        returns = np.array([row["return"] for row in got if row["at_min"] == at_min]).reshape(2, 7)
+        returns = got[got["at_min"] == at_min]["return"].to_numpy().reshape(2, 7)
         np.testing.assert_allclose(returns, expected["own", at_min], rtol=1e-6)
         # So that the test can fail.
         assert not np.allclose(returns, expected["other", at_min])
@@ -163,10 +201,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def limits_of(folder: Path, name: str = "limits") -> list[dict[str, Any]]:
-    (file,) = Limit(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
+def limits_of(folder: Path, name: str = "limits") -> tuple[Limit, ...]:
+    (file,) = FindLimits(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
     assert file == limits_file(folder, "navigation", name)
-    return read_table(file)
+    return read_limits(folder, "navigation", name)
 
 
 def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
@@ -180,29 +218,29 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
     monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", enough)
     few = [i for i in range(5) if n[0][i] < enough]
     at_first, at_last, without = limits_of(recorded)
-    assert at_first["left_out"] == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
-    assert at_last["left_out"] is None is without["left_out"]
+    assert at_first.left_out == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
+    assert at_last.left_out is None is without.left_out
     for row in (at_first, at_last):
-        assert row["low_95"] <= row["best_return"] <= row["high_95"]
-    assert without["low_95"] is without["high_95"] is None
+        assert row.low_95 <= row.best_return <= row.high_95
+    assert without.low_95 is without.high_95 is None
     # Of the others, at the thresholds of all.
     kept = series[0].only([i for i in range(5) if i not in few])
     simulator = replace(fit_histogram(kept), percentiles=fit_histogram(series[0]).percentiles)
     environment = Animat(Navigation(episode_limit=60), Thresholds(1), 5 - len(few))
-    assert at_first["best_return"] == best_return(environment, simulator, resolution=0.25, episodes=0).value
+    assert at_first.best_return == best_return(environment, simulator, resolution=0.25, episodes=0).value
 
     for condition in FEW.conditions:
-        random = [("random", at_min, "", 0, -80.0, 10, 1) for at_min in (0.0, 140.0)]
-        write_table(controls_file(recorded, FEW.robots[0], condition), ("control", *HEAD), random)
-    known, condition = References(FEW, recorded, FEW.robots[0]), FEW.conditions[0]
+        write_random(recorded, FEW.robots[0], condition, 0.0, 140.0)
+    random = read_episodes(controls_file(recorded, FEW.robots[0], condition) for condition in FEW.conditions)
+    known, condition = References(FEW, recorded, FEW.robots[0], random), FEW.conditions[0]
     assert known.limit(condition, 0.0) is None is known.score(condition, 0.0, 5.0)
     assert known.limit(condition, 140.0) is not None is not known.score(condition, 140.0, 5.0)
     rough = limits_of(recorded, "over-time")
-    assert [row["left_out"] for row in rough] == [at_first["left_out"], None]
-    assert {row["low_95"] for row in rough} == {None}
-    note = limits_shown([{"robot": "navigation", **row} for row in (at_first, at_last, without)])
+    assert [row.left_out for row in rough] == [at_first.left_out, None]
+    assert {row.low_95 for row in rough} == {None}
+    note = limits_shown((at_first, at_last, without))
     assert "1 of 3 limits leave out conditions with fewer than 30 responses" in note.note
-    assert note.rows[0][-1] == at_first["left_out"]
+    assert note.rows[0][-1] == at_first.left_out
 
 
 def test_where_no_condition_has_enough_responses_a_study_has_no_limit(
@@ -211,10 +249,10 @@ def test_where_no_condition_has_enough_responses_a_study_has_no_limit(
     monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", 41)
     at_first, at_last, without = limits_of(recorded)
     for row in (at_first, at_last):
-        assert row["left_out"].count(" Hz (") == 5
-        assert {row[name] for name in LIMIT_HEAD[3:-1]} == {None}
-    assert without["best_return"] > 0
-    shown = limits_shown([{"robot": "navigation", **row} for row in (at_first, without)])
+        assert row.left_out.count(" Hz (") == 5
+        assert set(astuple(row)[4:-1]) == {None}
+    assert without.best_return > 0
+    shown = limits_shown((at_first, without))
     assert shown.rows[0][shown.head.index("limit ± grid")] is None and 0 not in shown.marked
 
 
@@ -267,13 +305,13 @@ def test_a_study_of_a_real_recording_with_two_conditions(
 
     policy = Policy.load(folder / "policies" / "navigation" / "9-thresholds" / "p0.safetensors")
     assert [condition.label for condition in policy.conditions] == ["5 Hz", "10 Hz"]
-    limits = {limit["mapping"]: limit for limit in read_table(table_file(folder, "limits"))}
-    scores = read_table(table_file(folder, "scores"))
-    assert {score["mapping"] for score in scores} == set(limits) == {"1-threshold", "9-thresholds"}
+    results = read_typed(results_file(folder), Results)
+    limits, scores = {limit.mapping: limit for limit in results.limits}, results.scores
+    assert {score.mapping for score in scores} == set(limits) == {"1-threshold", "9-thresholds"}
     for score in scores:
-        limit = limits[score["mapping"]]
+        limit = limits[score.mapping]
         # That culture could do better than chance, and never well: without neurons the limit is above 20.
-        assert score["random"] + 20 < limit["best_return"] < 10
-        assert abs(limit["monte_carlo"] - limit["best_return"]) < 4 * limit["standard_error"] + limit["grid_error"] + 1
-        assert score["mean_return"] < limit["best_return"] + 4 * limit["standard_error"] + limit["grid_error"]
+        assert score.random + 20 < limit.best_return < 10
+        assert abs(limit.monte_carlo - limit.best_return) < 4 * limit.standard_error + limit.grid_error + 1
+        assert score.mean_return < limit.best_return + 4 * limit.standard_error + limit.grid_error
     assert (folder / "report.html").stat().st_size > 100_000

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
+
+from animat.errors import InvalidFile, Mismatch
 
 _LONGEST = 60
 
@@ -42,6 +47,42 @@ def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Colle
         return "" if found == wanted else f"{name}: {_short(found)} there, {_short(wanted)} now"
     told = (first_difference(one, other, place, ignoring=ignoring) for one, other, place in pairs)
     return next((difference for difference in told if difference), "")
+
+
+def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
+    """SHA-256 over plain data, and bytes beside."""
+    digest = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
+    for part in more:
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def description_in(path: Path, what: str) -> dict[str, Any] | None:
+    """What a file says of the folder that it lies in, with its fingerprint; None if there is none.
+
+    Args:
+        path: the file, JSON.
+        what: the folder's contents, such as `study`, for a message.
+
+    Raises:
+        InvalidFile: if it cannot be read.
+    """
+    if not path.exists():
+        return None
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+        _ = found["fingerprint"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InvalidFile(f"{path}: expected a {what}'s description, got a file that cannot be read") from error
+    return found
+
+
+def of_another(folder: Path, what: str, difference: str) -> Mismatch:
+    """The error of a folder that holds another study or training than was asked for."""
+    return Mismatch(
+        f"{folder}: expected a folder of this {what}, got one of another ({difference}); give another folder, or "
+        "remove this one"
+    )
 
 
 def _short(value: Any) -> str:

@@ -61,8 +61,6 @@ class Convert:
     """Of two troughs within it, the deeper one is the spike"""
     blank_ms: tuple[float, float] = (0.5, 1.5)
     """From before to after each stimulus in which nothing is looked for"""
-    engine: Literal["auto", "scipy", "spikeinterface"] = "auto"
-    """What filters and finds spikes; auto: SpikeInterface where it is installed"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -80,7 +78,6 @@ class Convert:
             dead_time_ms=self.dead_time_ms,
             blank_ms=self.blank_ms,
             recovery_ms=max(20.0, self.blank_ms[1]),
-            engine=self.engine,
         )
         origin = Origin(**{each.name: getattr(self, each.name) for each in fields(Origin)})
         with Bar("finding spikes") as progress:

@@ -170,7 +170,6 @@ class Run(Stimulating):
         """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
         from animat.cultures.kinds import pulse_for
         from animat.cultures.same_culture import other_culture, other_patterns
-        from animat.stimulation.protocol import Protocol
 
         if calibration is None:
             return pulse_for(self.culture), None, ()
@@ -178,10 +177,9 @@ class Run(Stimulating):
         if loop.encoder.takes_patterns:
             found.append(other_patterns(recordings[0], culture))
         noticed = tuple(finding for finding in found if finding is not None)
-        told = recordings[0].provenance.get("protocol")
-        if told is None:
+        protocol = recordings[0].protocol
+        if protocol is None:
             return pulse_for(self.culture), None, noticed
-        protocol = Protocol.from_json(told)
         return protocol.pulse, min(protocol.patterns, len(culture.patterns)), noticed
 
     def _record(self, culture: Culture, first: Policy, account: Account, progress: Progress) -> Recording:

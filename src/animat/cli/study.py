@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,9 +37,11 @@ class StudyFile:
 
 def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
     """Run a study, whose files are named as seen from `base`, and print its comparisons."""
+    from animat.lined_up import lined_up
     from animat.progress import Bar
     from animat.studies.heuristic import not_outperforming
-    from animat.studies.places import read_table, table_file
+    from animat.studies.places import results_file
+    from animat.studies.results import Results, read_typed
     from animat.studies.run import run_study
 
     for body in study.robots:
@@ -51,18 +53,17 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
     began = time.monotonic()
     with Bar("study") as progress:
         ran = run_study(study, out, base=base, workers=workers, progress=progress)
-    comparisons = read_table(table_file(ran.folder, "comparisons"))
-    for row in comparisons:
-        paper = (
-            ""
-            if row["paper_p"] is None
-            else f"; the paper's p {row['paper_p']:.3g}, which implies U {row['paper_u']:g}"
+    results = read_typed(results_file(ran.folder), Results)
+    cells = []
+    for row in results.comparisons:
+        paper = "" if row.paper_p is None else f"; the paper's p {row.paper_p:.3g}, which implies U {row.paper_u:g}"
+        means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}"
+        cells.append(
+            [f"{row.robot}, {row.comparison}", *means, f"{row.u:g}", f"{row.p_normal:.3g}", row.outcome + paper]
         )
-        print(
-            f"{row['robot']:11} {row['comparison']:28} {row['mean_first']:8.1f} {row['mean_second']:8.1f}  "
-            f"U {row['u']:<4g} p {row['p_normal']:<9.3g} {row['outcome']}{paper}"
-        )
-    beside = not_outperforming(ran.folder)
+    if cells:
+        print("\n".join(lined_up(["", "first", "second", "U", "p", ""], cells)))
+    beside = not_outperforming(results)
     for sentence in beside:
         print(sentence)
     if ran.done_now:
@@ -74,6 +75,6 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
         "report": str(ran.report),
         "jobs": ran.jobs,
         "done_now_cpu_s": ran.done_now,
-        "comparisons": comparisons,
+        "comparisons": [asdict(row) for row in results.comparisons],
         "not_outperforming_the_heuristic": beside,
     }

@@ -17,6 +17,7 @@ from animat.errors import AnimatError, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
+from animat.recordings.told import from_words
 from animat.writing import written_whole
 
 LOG_FILE = "session.log"
@@ -62,7 +63,18 @@ class Gathered:
             UnusableData: for records that do not fit together.
         """
         header, outline, stimuli = self._header, self.outline, self._pulses.stimuli()
+        words = {
+            **header.provenance,
+            "session_description": _described(header),
+            "recorded_at": header.recorded_at,
+            "closed_loop": header.loop,
+            "closed_loop_ended": f"{ending.by}: {ending.sentence}",
+            "closed_loop_unanswered_pulses": str(unanswered_pulses(outline)),
+        }
+        if outline.left_out:
+            words["left_out"] = in_words(outline.left_out)
         duration_s = max(0.0, self._end_s, self.spike_counts.span_s[1], self._pulses.last_s)
+        words["closed_loop_unwatched_s"] = f"{max(0.0, duration_s - self._watched_s):.6f}"
         return Recording(
             spike_times_s=[],  # type: ignore[arg-type]
             spike_channels=[],  # type: ignore[arg-type]
@@ -73,16 +85,7 @@ class Gathered:
             duration_s=duration_s,
             start_min=header.start_min,
             presentation=header.presentation,
-            provenance={
-                **header.provenance,
-                "session_description": _described(header),
-                "recorded_at": header.recorded_at,
-                "closed_loop": header.loop,
-                "closed_loop_ended": f"{ending.by}: {ending.sentence}",
-                "closed_loop_unwatched_s": f"{max(0.0, duration_s - self._watched_s):.6f}",
-                **({"left_out": in_words(outline.left_out)} if outline.left_out else {}),
-                "closed_loop_unanswered_pulses": str(unanswered_pulses(outline)),
-            },
+            **from_words(words),
         )
 
 

@@ -17,7 +17,7 @@ from animat.cultures.safety import Admitted
 from animat.cultures.sealing import refuse_overrides
 from animat.errors import AnimatError, InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.recording import Channels, Recording
+from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.places import electrodes_of
 from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Presentation, Protocol
@@ -45,7 +45,7 @@ class Culture(Openable):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        refuse_overrides(cls, Culture, leaving=("__init__", "left_out", "device"))
+        refuse_overrides(cls, Culture, leaving=("__init__", "left_out", "device", "recorded_as"))
 
     # What a backend is: data. Valid once it is open.
 
@@ -68,6 +68,11 @@ class Culture(Openable):
     @abc.abstractmethod
     def provenance(self) -> dict[str, str]:
         """What a recording says about where it came from."""
+
+    @property
+    def recorded_as(self) -> RecordedCulture | None:
+        """What has this culture again, as its recordings keep it; None for what no seed makes."""
+        return None
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -207,7 +212,7 @@ class Culture(Openable):
         recording's clock, block following block.
 
         Args:
-            protocol: what to do; it is kept in the recording's provenance, as JSON.
+            protocol: what to do; it is kept with the recording.
             seed: decides the order of conditions and patterns.
             progress: told after each block.
 
@@ -216,7 +221,7 @@ class Culture(Openable):
         """
         schedule = self.schedule(protocol, seed)
         progress = progress or Silent()
-        provenance = {**self.provenance, "protocol": protocol.to_json(), "protocol_seed": str(seed)}
+        provenance = {**self.provenance, "protocol_seed": str(seed)}
         self._rehearse(schedule)
         before = self.left_out
         start_min = self.now_s / 60
@@ -234,6 +239,7 @@ class Culture(Openable):
             sampling_rate_hz=self.sampling_rate_hz,
             start_min=start_min,
             provenance=provenance,
+            culture=self.recorded_as,
         )
 
     def _rehearse(self, schedule: Schedule) -> None:

@@ -297,7 +297,7 @@ class CultureContract(abc.ABC):
                 np.testing.assert_array_equal(getattr(recording.stimuli, name), asked)
             assert recording.duration_s >= schedule.recorded_s - 1e-6
             assert recording.presentation == protocol.presentation
-            assert Protocol.from_json(recording.provenance["protocol"]) == protocol
+            assert recording.protocol == protocol
             assert culture.delivered == len(schedule)
             _expect(AnimatError, lambda: culture.record(replace(protocol, patterns=len(culture.patterns) + 1)))
 

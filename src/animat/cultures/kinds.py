@@ -89,19 +89,11 @@ def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: 
     it is stimulated through the electrodes that it was recorded with.
     """
     found: dict[str, Any] = {}
-    provenance = recordings[0].provenance if recordings else {}
-    if (
-        kind == "cl1"
-        and provenance.get("source", "").startswith("CL1")
-        and provenance.get("pattern_seed", "").isdigit()
-    ):
-        found["seed"] = int(provenance["pattern_seed"])
-    if (
-        kind == "virtual"
-        and provenance.get("source", "").startswith("virtual culture")
-        and provenance.get("seed", "").isdigit()
-    ):
-        found["seed"] = int(provenance["seed"])
+    culture = recordings[0].culture if recordings else None
+    if culture is None or culture.kind != kind:
+        return found
+    found["seed"] = culture.seed
+    if kind == "virtual":
         from animat.cultures.series import STATE_FILE
 
         folders = {file if file.is_dir() else file.parent for file in files}

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from animat.cultures.base import Culture
 from animat.cultures.same_culture import other_patterns
-from animat.cultures.series import check_interval, difference_from
+from animat.cultures.series import check_interval, difference_from, record_when_due, series_files
 from animat.errors import InvalidArgument, Mismatch
-from animat.progress import Part, Progress, Silent
-from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.progress import Progress, Silent
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
@@ -68,7 +68,7 @@ def record_living_series(
     _check(protocol, sessions, interval_min, seed)
     folder, progress = Path(folder), progress or Silent()
     # Seen before it is touched: somebody else's folder stays as it is.
-    _beginning_s(culture, protocol, _files(folder, sessions, interval_min), 60 * interval_min)
+    _beginning_s(culture, protocol, series_files(folder, sessions, interval_min), 60 * interval_min)
     with alone_in(folder):
         return record_in_held_folder(culture, protocol, folder, sessions, interval_min, seed, progress)
 
@@ -88,31 +88,23 @@ def record_in_held_folder(
     are those of `record_living_series`.
     """
     _check(protocol, sessions, interval_min, seed)
-    files = _files(folder, sessions, interval_min)
-    missed_min = []
+    files = series_files(folder, sessions, interval_min)
     # Now that nobody writes: another run may have ended just before the folder was held.
     zero_s = _beginning_s(culture, protocol, files, 60 * interval_min)
-    for session, file in enumerate(files):
-        due_s = zero_s + 60 * session * interval_min
-        if not file.exists():
-            if culture.now_s >= due_s + 60 * interval_min:
-                missed_min.append(session * interval_min)
-                continue
-            culture.rest(max(0.0, due_s - culture.now_s))
-            part = Part(progress, session, 1, sessions, file.name)
-            write_nwb(culture.record(protocol, seed * 10_000 + session, part), file)
-        progress.update(session + 1, sessions, file.name)
-    return LivingSeries([file for file in files if file.exists()], missed_min)
+    left = [session for session, file in enumerate(files) if not file.exists()]
+    for session, recording in record_when_due(
+        culture, protocol, files, left, zero_s, 60 * interval_min, seed, progress
+    ):
+        write_nwb(recording, files[session])
+    made = [file for file in files if file.exists()]
+    progress.update(sessions, sessions, made[-1].name if made else "")
+    return LivingSeries(made, [session * interval_min for session, file in enumerate(files) if not file.exists()])
 
 
 def _check(protocol: Protocol, sessions: int, interval_min: float, seed: int) -> None:
     check_interval(protocol, sessions, interval_min)
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
-
-
-def _files(folder: Path, sessions: int, interval_min: float) -> list[Path]:
-    return [folder / recording_name(session * interval_min) for session in range(sessions)]
 
 
 def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interval_s: float) -> float:
@@ -136,7 +128,7 @@ def _beginning_s(culture: Culture, protocol: Protocol, files: list[Path], interv
 
 def _expect_of(file: Path, there: Recording, culture: Culture, protocol: Protocol) -> None:
     told = {name: words for name, words in culture.provenance.items() if name not in _MAY_DIFFER}
-    if difference := difference_from({**told, "protocol": protocol.to_json()}, there):
+    if difference := difference_from(told, protocol, there):
         raise Mismatch(
             f"{file}: expected a recording of this culture by this protocol, got another ({difference}): choose "
             "another folder"

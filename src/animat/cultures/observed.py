@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.recordings.recording import Channels, Recording
+from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.schedule import Schedule
 from animat.stimulation.stimulus import Stimuli, Stimulus
@@ -90,6 +90,7 @@ def assembled(
     sampling_rate_hz: float,
     start_min: float,
     provenance: Mapping[str, str],
+    culture: RecordedCulture | None,
 ) -> Recording:
     """The blocks of a schedule, one after the other on one clock, as a recording.
 
@@ -99,7 +100,7 @@ def assembled(
         channels: of the culture.
         sampling_rate_hz: whose samples the spikes lie on.
         start_min: of the recording on the culture's clock.
-        provenance: of the recording.
+        provenance, culture: of the recording.
 
     Returns:
         The recording, its times on samples; it ends with the sample that the last block ends in.
@@ -130,6 +131,8 @@ def assembled(
         start_min=start_min,
         presentation=schedule.protocol.presentation,
         provenance=provenance,
+        protocol=schedule.protocol,
+        culture=culture,
     )
 
 

@@ -36,7 +36,7 @@ def other_culture(recording: Recording, start_min: float, culture: Culture) -> F
         return None
     differ = [name for name, words in culture.settings.items() if told.get(name) != words]
     if differ:
-        of = f"virtual culture {told.get('seed')}"
+        of = f"virtual culture {'?' if recording.culture is None else recording.culture.seed}"
         if "source" in differ:
             of = "no virtual culture"
         elif "seed" not in differ:

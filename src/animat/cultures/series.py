@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from animat.cultures.base import Culture
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
@@ -66,7 +67,7 @@ def record_virtual_series(
     fresh = make_culture()
     check_interval(protocol, sessions, interval_min, fresh.n_patterns)
     folder, progress = Path(folder), progress or Silent()
-    files = [folder / recording_name(session * interval_min) for session in range(sessions)]
+    files = series_files(folder, sessions, interval_min)
     # Seen before it is touched: somebody else's folder stays as it is.
     _expect_series(files, fresh, protocol, interval_min)
     with alone_in(folder):
@@ -100,22 +101,52 @@ def _record(
             culture.selection.save(folder / SELECTION_FILE)
         if not recorded:
             culture.save_state(folder / STATE_FILE, sessions=0)
-        for session in range(recorded, sessions):
-            culture.rest(max(0.0, 60 * session * interval_min - culture.now_s))
-            part = Part(progress, session, 1, sessions, files[session].name)
-            recording = culture.record(protocol, _seed(culture, session), part)
+        left = range(recorded, sessions)
+        for session, recording in record_when_due(
+            culture, protocol, files, left, 0.0, 60 * interval_min, culture.seed, progress
+        ):
             if files[session].exists():
                 _expect_equal(files[session], recording)
             else:
                 write_nwb(recording, files[session])
             # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
             culture.save_state(folder / STATE_FILE, sessions=session + 1)
-            progress.update(session + 1, sessions, files[session].name)
 
 
-def _seed(culture: VirtualCulture, session: int) -> int:
-    """Of a session's schedule: other cultures and other sessions have other orders."""
-    return culture.seed * 10_000 + session
+def record_when_due(
+    culture: Culture,
+    protocol: Protocol,
+    files: Sequence[Path],
+    left: Iterable[int],
+    zero_s: float,
+    interval_s: float,
+    seed: int,
+    progress: Progress,
+) -> Iterator[tuple[int, Recording]]:
+    """Each recording of a series that is left, with its number, when it is due; one whose successor is due is missed.
+
+    Args:
+        culture: open.
+        protocol: of every recording.
+        files: of the whole series.
+        left: numbers of the recordings to be made, rising.
+        zero_s: when the first one is due, on the culture's clock.
+        interval_s: from one to the next.
+        seed: of the orders of stimuli.
+        progress: told after each block, and when a recording is dealt with.
+    """
+    for session in left:
+        due_s = zero_s + session * interval_s
+        if culture.now_s < due_s + interval_s:
+            culture.rest(max(0.0, due_s - culture.now_s))
+            part = Part(progress, session, 1, len(files), files[session].name)
+            yield session, culture.record(protocol, _order(seed, session), part)
+            progress.update(session + 1, len(files), files[session].name)
+
+
+def _order(seed: int, session: int) -> int:
+    """The seed of a session's schedule: other cultures and other sessions have other orders."""
+    return seed * 10_000 + session
 
 
 def _remove_leftovers(folder: Path) -> None:
@@ -164,6 +195,11 @@ def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int)
     return culture, 0
 
 
+def series_files(folder: Path, sessions: int, interval_min: float) -> list[Path]:
+    """Where the recordings of a series lie."""
+    return [folder / recording_name(session * interval_min) for session in range(sessions)]
+
+
 def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_patterns: int | None = None) -> None:
     """Raise unless there are sessions, each is over when the next one is due, and there are patterns enough.
 
@@ -197,10 +233,9 @@ def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, s
     there = read_recording(file)
     expected = {
         **culture.settings,
-        "protocol": protocol.to_json(),
-        "protocol_seed": str(_seed(culture, session)),
+        "protocol_seed": str(_order(culture.seed, session)),
     }
-    if difference := difference_from(expected, there):
+    if difference := difference_from(expected, protocol, there):
         raise Mismatch(
             f"{file}: expected a recording of the same culture and protocol, got another ({difference}): remove it, or "
             "choose another folder"
@@ -217,14 +252,14 @@ def _expect_equal(file: Path, again: Recording) -> None:
         )
 
 
-def difference_from(expected: dict[str, str], recording: Recording) -> str:
-    """The first setting that a recording was not made with, as its provenance tells; nothing where there is none."""
+def difference_from(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:
+    """The first setting that a recording was not made with; nothing where there is none."""
     for name, words in expected.items():
-        got = recording.provenance.get(name)
-        if got != words:
-            found = {} if got is None else {name: _parsed(got)}
-            return first_difference(found, {name: _parsed(words)}) or f"{name}, written otherwise"
-    return ""
+        there = {name: _parsed(recording.provenance[name])} if name in recording.provenance else {}
+        if difference := first_difference(there, {name: _parsed(words)}):
+            return difference
+    by = None if recording.protocol is None else json.loads(recording.protocol.to_json())
+    return first_difference({"protocol": by}, {"protocol": json.loads(protocol.to_json())})
 
 
 def _parsed(words: str) -> Any:

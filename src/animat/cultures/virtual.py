@@ -17,7 +17,7 @@ from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
-from animat.recordings.recording import Channels
+from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import MAXONE
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 from animat.stimulation.scan import ScannedActivity
@@ -173,6 +173,11 @@ class VirtualCulture(Culture):
             "selection": f"{len(self.selection.recording)} of {self.selection.passed} electrodes that passed, of "
             f"{self.selection.scanned} scanned",
         }
+
+    @property
+    def recorded_as(self) -> RecordedCulture:
+        """Its seed."""
+        return RecordedCulture("virtual", self.seed)
 
     @property
     def settings(self) -> dict[str, str]:

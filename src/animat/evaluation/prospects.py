@@ -37,13 +37,7 @@ class Prospect:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return {
-            "robot": self.robot,
-            "mapping": self.mapping,
-            "random": self.random,
-            "random_standard_error": self.random_standard_error,
-            "best": self.best.to_dict(),
-        }
+        return vars(self) | {"best": self.best.to_dict()}
 
     def to_text(self) -> str:
         """In a line."""

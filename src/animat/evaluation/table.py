@@ -19,6 +19,7 @@ from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import normalised_score
 from animat.evaluation.verdict import Verdict
+from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
@@ -145,22 +146,19 @@ class Evaluation:
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
         if self.held_from_min is not None:
             on += f", percentiles held from {self.held_from_min:g} min"
-        width = max(16, *(len(row.name) for row in self.rows))
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
-        lines = [
-            f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each",
-            f"  {'':{width}} {'mean return':>11}  {'s.e.':>5}  {'iterations':>10}  {'ended early':>11}"
-            + ("" if self.limit is None else f"  {'score':>6}"),
-        ]
+        head = ["", "mean return", "s.e.", "iterations", "ended early", "score", ""]
+        cells = []
         for row in self.rows:
-            told = row.to_dict()
+            told, score = row.to_dict(), self.score(row)
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
-            score = self.score(row)
-            scored = "" if self.limit is None else f"  {'' if score is None else f'{score:.2f}':>6}"
-            lines.append(
-                f"  {row.name:{width}} {told['mean_return']:11.1f}  {error:>5}  {told['mean_length']:10.1f}"
-                f"  {100 * told['terminated_share']:9.0f} %{scored}  {row.meaning}"
-            )
+            numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
+            ended = f"{100 * told['terminated_share']:.0f} %"
+            cells.append([row.name, *numbers, ended, "" if score is None else f"{score:.2f}", row.meaning])
+        if self.limit is None:
+            for line in (head, *cells):
+                del line[-2]
+        lines = [f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each", *lined_up(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if self.verdict is not None:
@@ -325,8 +323,7 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
             )
         )
     found += transfer.other_simulator(policy.fitted, timeline.fitted)
-    trained = policy.provenance.get("simulators") or {}
-    first_min = next(iter(trained.get("recorded_at_min", ())), None)
+    first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         found.append(
             Finding(

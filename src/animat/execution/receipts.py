@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from animat.errors import InvalidFile
+from animat.errors import AnimatError, InvalidFile
 from animat.writing import written_whole
 
 
@@ -21,7 +21,7 @@ class Receipt:
         job: its name.
         study: fingerprint of the study or training that it is part of.
         inputs: digest of the receipt of each job it needed.
-        outputs: SHA-256 of each file, by its place in the folder.
+        outputs: of each file by its place in the folder, `digest_of` it.
     """
 
     job: str
@@ -76,8 +76,22 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def digest_of(path: Path) -> str:
+    """SHA-256 of what a file tells: of the recording in one of NWB, which has identifiers and a date of its own each
+    time that it is written; else of its bytes.
+
+    Raises:
+        OSError, InvalidFile: if it cannot be read.
+    """
+    if path.suffix != ".nwb":
+        return sha256(path)
+    from animat.recordings.apart import packed, read_hdf5_apart
+
+    return hashlib.sha256(packed(read_hdf5_apart(path))).hexdigest()
+
+
 def _is_file_of(path: Path, sum_: str) -> bool:
     try:
-        return sha256(path) == sum_
-    except OSError:
+        return digest_of(path) == sum_
+    except (OSError, AnimatError):
         return False

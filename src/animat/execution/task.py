@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import AnimatError, out_of_memory
-from animat.execution.receipts import sha256
+from animat.execution.receipts import digest_of
 from animat.progress import Progress
 
 UNFINISHED = ".unfinished"
@@ -30,7 +30,8 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        """Do it and return the files that it left, each written whole; done again, they are the same bytes.
+        """Do it and return the files that it left, each written whole; done again, they are the same
+        (`animat.execution.receipts.digest_of`).
 
         Args:
             folder: in which all its files are.
@@ -40,7 +41,7 @@ class Task(abc.ABC):
 
 @dataclass(frozen=True)
 class Done:
-    """What came of a task: SHA-256 of each file that it left, by its place in the folder; processor seconds."""
+    """What came of a task: the digest of each file that it left, by its place in the folder; processor seconds."""
 
     files: dict[str, str]
     cpu_s: float
@@ -63,7 +64,7 @@ def carry_out(task: Task, folder: Path, notice: Path) -> Done:
     except Exception as error:
         memory = out_of_memory(error)
         raise AnimatError(_unforeseen(error) if memory is None else f"{memory}: {memory_of(task)}") from error
-    sums = {file.relative_to(folder).as_posix(): sha256(file) for file in files}
+    sums = {file.relative_to(folder).as_posix(): digest_of(file) for file in files}
     return Done(sums, time.process_time() - began_s)
 
 

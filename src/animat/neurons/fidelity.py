@@ -34,6 +34,11 @@ class Fidelity:
     in_simulator: Float[np.ndarray, " conditions"]
     n_above_range: int
 
+    @property
+    def largest_loss(self) -> float:
+        """How far the simulator moves P(x >= P50) of any condition."""
+        return float(np.abs(self.in_data - self.in_simulator).max())
+
     def findings(self, *, of_memory: bool = False) -> tuple[Finding, ...]:
         """A warning where binning, or the nearest of too few, moves P(x >= P50) by more than `LARGEST_LOSS`, or where
         responses lie above the range.

@@ -14,6 +14,7 @@ from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.evaluation.verdict import Beside, Verdict
+from animat.lined_up import lined_up
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
 from animat.recordings.findings import Finding
@@ -191,31 +192,28 @@ class RealityGap:
 
     def to_text(self) -> str:
         """A table for a terminal."""
-        lines = [
-            f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
-            f"{self.calibrated_at_min:g} min",
-            f"  {'':16} {'predicted':>9}  {'95 % interval':>16} {'lived':>8} {'gap':>7}  {'95 % interval':>16} "
-            f"{'episodes':>8} {'pulses/action':>13} {'p':>8}",
-        ]
+        cells = []
         for row in self.rows:
             told, prediction = row.to_dict(), row.prediction
             anew = f"{prediction.low:.1f} to {prediction.high:.1f}"
-            lived = f"{'-':>8} {'-':>7}  {'':>16}"
-            if told["gap"] is not None:
-                gap = told["gap"]
+            lived = ["-", "-", ""]
+            if (gap := told["gap"]) is not None:
                 between = "unknown" if gap["low"] is None else f"{gap['low']:+.1f} to {gap['high']:+.1f}"
-                lived = f"{told['lived']:8.1f} {gap['value']:+7.1f}  {between:>16}"
+                lived = [f"{told['lived']:.1f}", f"{gap['value']:+.1f}", between]
             p = "" if row.beside is None else f"{row.beside.p:.2g}"
-            lines.append(
-                f"  {row.name:16} {told['predicted']:9.1f}  {anew:>16} {lived} {len(row.lived):8} "
-                f"{row.pulses_per_action:13.1f} {p:>8}  {row.meaning}"
-            )
-        share = (
-            ""
-            if self.gap_share is None
-            else (f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it")
-        )
+            counts = [str(len(row.lived)), f"{row.pulses_per_action:.1f}"]
+            cells.append([row.name, f"{told['predicted']:.1f}", anew, *lived, *counts, p, row.meaning])
+        interval = "95 % interval"
+        head = ["", "predicted", interval, "lived", "gap", interval, "episodes", "pulses/action", "p", ""]
+        lines = [
+            f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
+            f"{self.calibrated_at_min:g} min",
+            *lined_up(head, cells),
+        ]
         if self.limit is not None:
+            share = ""
+            if self.gap_share is not None:
+                share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
             lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
         lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
         outline = self.session.to_dict()

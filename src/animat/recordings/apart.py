@@ -29,6 +29,7 @@ import numpy as np
 from animat import errors
 from animat.errors import AnimatError, InvalidFile
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.told import from_words, in_words
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 
@@ -149,14 +150,15 @@ def _received(pipe: Any, size: int, until: float) -> bytes | None:
     return b"".join(parts)
 
 
-def _packed(recording: Recording) -> bytes:
+def packed(recording: Recording) -> bytes:
+    """All of a recording as bytes, the same for recordings that are equal."""
     arrays: dict[str, Any] = {name: getattr(recording, name) for name in _ARRAYS}
     arrays |= {f"channels_{name}": getattr(recording.channels, name) for name in _CHANNELS}
     arrays |= {f"stimuli_{name}": getattr(recording.stimuli, name) for name in _STIMULI}
     words = {
         "numbers": {name: float(getattr(recording, name)) for name in _NUMBERS},
         "presentation": None if recording.presentation is None else asdict(recording.presentation),
-        "provenance": list(recording.provenance.items()),
+        "told": list(in_words(recording).items()),
     }
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)
@@ -173,7 +175,7 @@ def _unpacked(payload: bytes) -> Recording:
             stimuli=Stimuli(**{name: arrays[f"stimuli_{name}"] for name in _STIMULI}),
             **words["numbers"],
             presentation=None if presentation is None else Presentation(**presentation),
-            provenance=dict(words["provenance"]),
+            **from_words(dict(words["told"])),
         )
 
 
@@ -207,7 +209,7 @@ def _serve(requests: BinaryIO, answers: BinaryIO) -> None:
         try:
             os.chdir(request["folder"])
             _limit(path)
-            kind, payload = b"R", _packed(read_hdf5(path, part=request["part"], stimuli=request["stimuli"]))
+            kind, payload = b"R", packed(read_hdf5(path, part=request["part"], stimuli=request["stimuli"]))
         except AnimatError as error:
             kind, payload = b"E", json.dumps({"kind": type(error).__name__, "message": str(error)}).encode()
         except (*DAMAGE, RecursionError, AssertionError) as error:

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
-from animat.recordings.findings import Finding
-from animat.recordings.noticed import as_provenance
+from animat.recordings.findings import Finding, merged
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Order, Presentation
 from animat.stimulation.stimulus import Stimuli
@@ -71,7 +70,7 @@ class PlainColumns:
 
         Args:
             provenance: where the columns came from.
-            findings: what was noticed so far; these and what is noticed here go into the recording's provenance.
+            findings: what was noticed so far; these and what is noticed here go with the recording.
 
         Raises:
             UnusableData: naming the column, what was expected and what came.
@@ -103,7 +102,8 @@ class PlainColumns:
             duration_s=duration_s,
             start_min=float(self.start_min),
             presentation=self._presentation(),
-            provenance={**provenance, **names, **as_provenance(noted)},
+            provenance={**provenance, **names},
+            findings=merged(noted),
         )
 
     def _channels(self, n_spikes: int, noted: list[Finding]) -> tuple[Channels, Int64[np.ndarray, " spikes"]]:

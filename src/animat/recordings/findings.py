@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -37,6 +37,15 @@ def left_out_of(what: str, names: Sequence[str], file: str = "") -> Finding:
     """The finding on keys or columns of a file that nobody knows."""
     sentence = f"{what}{f' of {file}' if file else ''} that are not known were left out: {', '.join(names)}"
     return Finding(f"{what}-left-out", "note", sentence, float(len(names)))
+
+
+def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Those of one name and severity as one, with the sentences of all: as they are kept with a recording."""
+    sentences: dict[tuple[str, Severity], str] = {}
+    for finding in findings:
+        key = finding.name, finding.severity
+        sentences[key] = f"{sentences[key]}; {finding.sentence}" if key in sentences else finding.sentence
+    return tuple(Finding(*key, sentence) for key, sentence in sentences.items())
 
 
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import get_args
 
 import numpy as np
 
 from animat.recordings.channel_quality import channel_findings
-from animat.recordings.findings import Finding, Severity
+from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import time_findings
@@ -17,19 +16,6 @@ from animat.tables import UNKNOWN
 MANY_STIMULI = 100
 STIMULI_A_SPIKE = 10.0
 """From here on, spikes and stimuli must be swapped: a culture that answers so seldom teaches nothing."""
-
-
-def as_provenance(findings: Iterable[Finding]) -> dict[str, str]:
-    """Findings as entries of `Recording.provenance`, so that they travel with the recording and its file.
-
-    An entry reads `"warning: silent-channels-unknown"` -> its sentence; `noticed` turns it back into a finding. Those
-    of one name become one entry, with the sentences of all.
-    """
-    entries: dict[str, str] = {}
-    for finding in findings:
-        key = f"{finding.severity}: {finding.name}"
-        entries[key] = f"{entries[key]}; {finding.sentence}" if key in entries else finding.sentence
-    return entries
 
 
 def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
@@ -42,15 +28,10 @@ def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     stimuli than spikes (`more-stimuli-than-spikes`), stimuli of one time (`simultaneous-stimuli`), stimuli without
     electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
     """
-    from_file = []
-    for key, sentence in recording.provenance.items():
-        severity, colon, name = key.partition(": ")
-        if colon and severity in get_args(Severity):
-            from_file.append(Finding(name, severity, sentence))  # type: ignore[arg-type]
     if isinstance(recording, ResponseTable):
-        return tuple(from_file)
-    known = {finding.name for finding in from_file}
-    return (*from_file, *(finding for finding in _in_data(recording) if finding.name not in known))
+        return recording.findings
+    known = {finding.name for finding in recording.findings}
+    return (*recording.findings, *(finding for finding in _in_data(recording) if finding.name not in known))
 
 
 def _in_data(recording: Recording) -> Iterable[Finding]:

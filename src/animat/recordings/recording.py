@@ -12,8 +12,9 @@ from jaxtyping import Float64, Int64
 
 from animat.brief import briefly
 from animat.errors import UnusableData
+from animat.recordings.findings import Finding
 from animat.stimulation.array import ElectrodeArray
-from animat.stimulation.protocol import Presentation
+from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import CENTURY_S, FASTEST_HZ, expect_rising_times, freeze
 
@@ -64,6 +65,19 @@ class Channels:
         return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
 
 
+@dataclass(frozen=True)
+class RecordedCulture:
+    """Which culture a recording is of, where that can be had again.
+
+    Attributes:
+        kind: as `animat.cultures.kinds` names it.
+        seed: of a virtual culture, or of a CL1's patterns.
+    """
+
+    kind: str
+    seed: int
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One recording of a culture: its spikes, channels and stimuli. Arrays are read-only.
@@ -82,7 +96,10 @@ class Recording:
         duration_s: from `start_s`; all spikes and stimuli lie within.
         start_min: start on the culture's clock, in minutes.
         presentation: how stimuli were presented, None where it is not known.
-        provenance: where the recording came from, words by words.
+        provenance: where the recording came from, words by words, for people.
+        protocol: that it was recorded by, None where it is not known.
+        culture: which one it is of, None where that is not known or cannot be had again.
+        findings: what was noticed when it was read, or its spikes were found.
 
     Raises:
         UnusableData: for times that are not finite or do not rise, or rows that no table names.
@@ -100,6 +117,9 @@ class Recording:
     start_min: float = 0.0
     presentation: Presentation | None = None
     provenance: Mapping[str, str] = field(default_factory=dict)
+    protocol: Protocol | None = None
+    culture: RecordedCulture | None = None
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "spikes", spike_times_s=np.float64, spike_channels=np.int64)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import UnusableData
+from animat.recordings.findings import Finding
 from animat.recordings.recording import Channels
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
@@ -32,7 +33,8 @@ class ResponseTable:
         window_ms: the window after the stimulus that the spikes were counted in, None where it is not known.
         start_min: start on the culture's clock, in minutes.
         presentation: how stimuli were presented, None where it is not known.
-        provenance: where the table came from, words by words.
+        provenance: where the table came from, words by words, for people.
+        findings: what was noticed when it was read.
 
     Raises:
         UnusableData: for values that are negative or not finite, counts that are not whole, or tables of other lengths.
@@ -47,6 +49,7 @@ class ResponseTable:
     start_min: float = 0.0
     presentation: Presentation | None = None
     provenance: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))

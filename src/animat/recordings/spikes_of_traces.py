@@ -11,7 +11,7 @@ import numpy as np
 from animat.progress import Progress
 from animat.recordings.detection.finding_spikes import find_spikes
 from animat.recordings.detection.settings import Detection
-from animat.recordings.noticed import as_provenance
+from animat.recordings.findings import merged
 from animat.recordings.raw import RawTraces
 from animat.recordings.recording import Recording
 
@@ -60,7 +60,7 @@ def with_spikes_of(
     band = "as recorded" if settings.band_hz is None else f"{settings.band_hz[0]:g}-{settings.band_hz[1]:g} Hz"
     how = (
         f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, blanked "
-        f"{settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli, by {found.engine}"
+        f"{settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli"
     )
     # A spike is at its sample, which rounding may put an ulp outside of the span.
     time_s = np.clip(found.time_s, base.start_s, base.stop_s)
@@ -69,5 +69,6 @@ def with_spikes_of(
         spike_times_s=time_s,
         spike_channels=found.channel,
         sampling_rate_hz=traces.sampling_rate_hz,
-        provenance={**base.provenance, "spikes": how, **as_provenance(found.findings)},
+        provenance={**base.provenance, "spikes": how},
+        findings=merged((*base.findings, *found.findings)),
     )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import LARGEST_LOSS
+from animat.studies.results import ComparedReturns
 from animat.studies.specification import Study
 from animat.studies.tabulating import AIM, LEVEL
 
@@ -116,7 +116,7 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
 
 
 def came_out_otherwise(
-    rows: list[dict[str, Any]], lost: Mapping[float, float] | None = None
+    rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
 ) -> tuple[tuple[str, str], ...]:
     """For each comparison that differs from the paper or cannot tell: what came out, and what its limit says to it.
 
@@ -126,61 +126,61 @@ def came_out_otherwise(
     """
     told = []
     for row in rows:
-        if row["as_in_paper"] not in ("no", "cannot tell"):
+        if row.as_in_paper not in ("no", "cannot tell"):
             continue
         words = (
-            f"The paper found {row['second']} better than {row['first']} (p = {row['paper_p']:.3g}, which implies U = "
-            f"{row['paper_u']:g}). Here: {row['outcome']} (U = {row['u']:g}, p = {row['p_normal']:.3g}; mean returns "
-            f"{row['mean_first']:.1f} and {row['mean_second']:.1f}). {explain(row)}"
+            f"The paper found {row.second} better than {row.first} (p = {row.paper_p:.3g}, which implies U = "
+            f"{row.paper_u:g}). Here: {row.outcome} (U = {row.u:g}, p = {row.p_normal:.3g}; mean returns "
+            f"{row.mean_first:.1f} and {row.mean_second:.1f}). {explain(row)}"
         )
-        loss = (lost or {}).get(row["at_min"], 0.0)
+        loss = (lost or {}).get(row.at_min, 0.0)
         if loss > LARGEST_LOSS:
             words += (
                 f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and limit are those of the "
                 "simulator, and not all that the culture would allow."
             )
-        told.append((f"{row['comparison']}, {row['robot']}", words))
+        told.append((f"{row.comparison}, {row.robot}", words))
     return tuple(told)
 
 
-def explain(row: dict[str, Any]) -> str:
+def explain(row: ComparedReturns) -> str:
     """What the limits say to a comparison's outcome."""
-    n = int(row["n"])
+    n = row.n
     smallest = p_of_u(0.0, n, n)
     if smallest >= LEVEL:
         return f"With {n} policies a side p cannot fall below {smallest:.2g}, however they differ: take more policies."
-    first, second, random = row["limit_first"], row["limit_second"], row["random_second"]
+    first, second, random = row.limit_first, row.limit_second, row.random_second
     if second is None or random is None:
         return "There is no limit to compare with."
-    error_second = row["limit_error_second"] or 0.0
+    error_second = row.limit_error_second or 0.0
     if second - random <= error_second:
         return (
-            f"The best possible return for {row['second']}, {second:.1f}, is not above that of random actions: "
+            f"The best possible return for {row.second}, {second:.1f}, is not above that of random actions: "
             "there is nothing to learn."
         )
-    limits = f"The best possible return is {second:.1f} for {row['second']}"
+    limits = f"The best possible return is {second:.1f} for {row.second}"
     if first is None:
         # A control has no limit of its own: whatever it chooses, another condition is delivered.
-        limits += f"; {row['first']} cannot do better than random actions, {random:.1f}"
+        limits += f"; {row.first} cannot do better than random actions, {random:.1f}"
     else:
-        limits = f"The best possible return is {first:.1f} for {row['first']} and {second:.1f} for {row['second']}"
-        error = (row["limit_error_first"] or 0.0) + error_second
+        limits = f"The best possible return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
+        error = (row.limit_error_first or 0.0) + error_second
         if first - second > error:
             return f"{limits}: with these responses the order of the limits is itself the other way round."
         if abs(first - second) <= error:
             limits += ", which is the same within their errors"
     # How much more than the first condition the second could have, as a part of all there is to learn.
-    room = (second - row["mean_first"]) / (second - random)
+    room = (second - row.mean_first) / (second - random)
     if room <= 1 - AIM:
         return (
-            f"{limits}, and {row['first']} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
+            f"{limits}, and {row.first} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
             "actions and that: no room is left."
         )
-    score = row["score_second"]
+    score = row.score_second
     if score is not None and score >= AIM:
-        return f"{limits}; {row['second']} is at its limit (score {score:.2f}), so more cannot be had from it."
-    scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row["score_first"], score))
+        return f"{limits}; {row.second} is at its limit (score {score:.2f}), so more cannot be had from it."
+    scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row.score_first, score))
     return (
-        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, {second - row['mean_first']:.1f} "
-        f"above {row['first']}, so it does not explain this."
+        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, {second - row.mean_first:.1f} "
+        f"above {row.first}, so it does not explain this."
     )

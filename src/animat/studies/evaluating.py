@@ -13,15 +13,14 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.studies.draws import draw_seed
+from animat.studies.episodes import RANDOM, tabulated, write_episodes
 from animat.studies.paths import record_paths
-from animat.studies.places import TIMELINE, controls_file, episodes_file, policies_folder, write_table
+from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Body, Study, StudyCondition, named_mapping
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
 from animat.training.policy import Policy
-
-HEAD = ("at_min", "actor", "episode", "return", "iterations", "ended")
 
 
 @final
@@ -39,33 +38,23 @@ class Evaluate(StudyTask):
         setting = setting_of(study, self.body, self.condition, timeline)
         networks = _networks(study, folder, self.body, self.condition)
         robot, slug, n = self.body.name, self.condition.slug, study.policies
-        rows: list[tuple[Any, ...]] = []
-        minutes = study.minutes_of(self.condition, first_minute(timeline), last_minute(timeline))
-        for at_min, episodes in minutes.items():
-            seed = draw_seed(study.seed, robot, slug, at_min)
-            rows += _rows(at_min, setting.run(networks, n, at_min, episodes, seed), [f"p{i}" for i in range(n)])
-        files = [write_table(episodes_file(folder, self.body, self.condition), HEAD, rows)]
+        first, last = first_minute(timeline), last_minute(timeline)
+        parts = []
+        for at_min, episodes in study.minutes_of(self.condition, first, last).items():
+            ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
+            parts.append(tabulated(ran, robot=robot, arm=self.condition.name, at_min=at_min))
         if self.condition.through_neurons and timeline is not None:
-            over_time = []
             for i, at_min in enumerate(timeline.start_min.tolist()):
                 progress.update(i, len(timeline), "over time")
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
-                means = setting.run(networks, n, at_min, study.episodes_over_time, seed).returns.mean(axis=1)
-                over_time += [(at_min, f"p{i}", mean) for i, mean in enumerate(means.tolist())]
-            path = episodes_file(folder, self.body, self.condition, "over-time")
-            files.append(write_table(path, ("at_min", "actor", "mean_return"), over_time))
-        return [*files, self._paths(study, folder, setting, networks, last_minute(timeline))]
-
-    def _paths(self, study: Study, folder: Path, setting: Setting, networks: Networks, at_min: float) -> Path:
-        seed = draw_seed(study.seed, self.body.name, self.condition.slug, at_min, "paths")
-        paths = record_paths(setting.environment, setting.simulator(at_min), networks, study.policies, seed)
-        rows = [
-            (f"p{actor}", i, *paths.observations[actor, i].tolist(), paths.commands[actor, i - 1].item() if i else None)
-            for actor, length in enumerate(paths.lengths.tolist())
-            for i in range(length + 1)
+                ran = setting.run(networks, n, at_min, study.episodes_over_time, seed)
+                parts.append(tabulated(ran, robot=robot, arm=self.condition.name, at_min=at_min, over_time=True))
+        seed = draw_seed(study.seed, robot, slug, last, "paths")
+        paths = record_paths(setting.environment, setting.simulator(last), networks, n, seed)
+        return [
+            write_episodes(episodes_file(folder, self.body, self.condition), parts),
+            paths.save(paths_file(folder, self.body, self.condition)),
         ]
-        head = ("actor", "iteration", *(q.name for q in setting.environment.robot.quantities), "command")
-        return write_table(episodes_file(folder, self.body, self.condition, "paths"), head, rows)
 
 
 @final
@@ -87,8 +76,9 @@ class Control(StudyTask):
         condition, robot = replace(self.plain, delivery="chosen"), self.body.name
         setting = setting_of(study, self.body, condition, timeline)
         name = f"controls-{condition.mapping}" + ("-held" if condition.percentiles == "first" else "")
+        arm = named_mapping(condition.mapping, condition.percentiles)
         networks = _networks(study, folder, self.body, self.plain) if is_usual(self.plain) else None
-        rows: list[tuple[Any, ...]] = []
+        parts = []
         first, last = first_minute(timeline), last_minute(timeline)
         minutes = study.limit_minutes(first, last) if condition.through_neurons else [last]
         for i, at_min in enumerate(minutes):
@@ -97,17 +87,13 @@ class Control(StudyTask):
             for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
                 seed, n = draw_seed(study.seed, robot, name, at_min, each.name), each.n_actors
                 ran = roll_out(each.environment, each.simulator, each.actor, n, episodes=study.episodes, seed=seed)
-                rows += [(each.name, *row) for row in _rows(at_min, ran, [f"p{i}" if n > 1 else "" for i in range(n)])]
-        files = [write_table(controls_file(folder, self.body, condition), ("control", *HEAD), rows)]
+                parts.append(tabulated(ran, robot=robot, arm=arm, at_min=at_min, agent=each.name))
         if timeline is not None and condition.through_neurons:
-            over_time = []
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
-                random = setting.run(Uniform(), 1, at_min, study.episodes, seed)
-                over_time.append((at_min, random.returns.mean().item()))
-            path = controls_file(folder, self.body, condition, "over-time")
-            files.append(write_table(path, ("at_min", "random"), over_time))
-        return files
+                ran = setting.run(Uniform(), 1, at_min, study.episodes, seed)
+                parts.append(tabulated(ran, robot=robot, arm=arm, at_min=at_min, agent=RANDOM, over_time=True))
+        return [write_episodes(controls_file(folder, self.body, condition), parts)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,13 +155,3 @@ def _networks(study: Study, folder: Path, body: Body, condition: StudyCondition)
     out = policies_folder(folder, body, condition)
     policies = [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
     return networks_of(policies, greedy=study.actions == "most probable")
-
-
-def _rows(at_min: float, ran: Episodes, actors: list[str]) -> list[tuple[Any, ...]]:
-    return [
-        (at_min, actor, episode, return_, length, int(ended))
-        for actor, returns, lengths, terminated in zip(
-            actors, ran.returns.tolist(), ran.lengths.tolist(), ran.terminated.tolist(), strict=True
-        )
-        for episode, (return_, length, ended) in enumerate(zip(returns, lengths, terminated, strict=True))
-    ]

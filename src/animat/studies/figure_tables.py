@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ from animat.report.learning_curves import LearningCurve, mean_with_interval
 from animat.report.over_time import Courses
 from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
-from animat.studies.places import table_file, write_table
+from animat.studies.paths import Paths
+from animat.studies.places import table_file
+from animat.studies.results import write_table
 from animat.tables import UNKNOWN
 
 
@@ -112,6 +114,17 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
                     (panel.title, course.name, at_min, len(course.returns), *quartiles, *beside, fine.get(at_min))
                 )
     return _write(folder, f"{robot}-over-time", (*head, "limit_rough_grid", "limit_fine_grid"), rows)
+
+
+def write_paths(folder: Path, robot: str, quantities: Sequence[str], paths: Mapping[str, Paths]) -> Path:
+    """One episode of each policy of every condition: what is observed, and the command that led there."""
+    rows = (
+        (condition, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
+        for condition, of in paths.items()
+        for actor, (observations, commands) in enumerate(of.whole())
+        for i, observed in enumerate(observations)
+    )
+    return _write(folder, f"{robot}-paths", ("condition", "policy", "iteration", *quantities, "command"), rows)
 
 
 def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:

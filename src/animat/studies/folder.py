@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import json
 import platform
@@ -11,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from animat.differences import first_difference
+from animat.differences import description_in, fingerprint_of, first_difference, of_another
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
 from animat.recordings.formats.csv import stimuli_beside
@@ -22,7 +21,10 @@ from animat.writing import LOCK, alone_in, clear_away, is_unfinished, written_wh
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
-_PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "matplotlib", "jinja2")
+_PACKAGES = (
+    "animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "pandas", "pillow", "matplotlib",
+    "jinja2",
+)  # fmt: skip
 _ABOUT_FILES = "# files: as seen from where the specification lay. To run it from here: files = ['recordings']\n"
 
 
@@ -48,7 +50,7 @@ def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
     }
     # By way of JSON, in which a tuple and a list are the same.
     told = json.loads(json.dumps(told))
-    return told | {"fingerprint": hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()}
+    return told | {"fingerprint": fingerprint_of(told)}
 
 
 def source_files(study: Study, base: Path) -> list[Path]:
@@ -126,27 +128,18 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
         Mismatch: if it is another study's, or holds other files.
         InvalidFile: if its description cannot be read.
     """
-    path = folder / MANIFEST
-    if not path.exists():
+    found = description_in(folder / MANIFEST, "study")
+    if found is None:
         others = [e for e in folder.iterdir() if not _is_passing(e)] if folder.is_dir() else []
         if others:
             raise Mismatch(f"{folder}: expected an empty folder or one of this study, got one with other files in it")
         return False
-    try:
-        found = json.loads(path.read_text())
-        fingerprint = found["fingerprint"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InvalidFile(f"{path}: expected a study's description, got a file that cannot be read") from error
-    if fingerprint == manifest["fingerprint"]:
+    if found["fingerprint"] == manifest["fingerprint"]:
         return (folder / SPECIFICATION).exists()
     # A study that stopped at its first step left a specification and no more.
     begun = (path for path in folder.rglob("*") if not path.is_dir() and not _is_passing(path))
     if any(path.name not in (MANIFEST, SPECIFICATION) for path in begun):
-        difference = first_difference(found, manifest, ignoring=("fingerprint",))
-        raise Mismatch(
-            f"{folder}: expected a folder of this study, got one of another ({difference}); give another folder, or "
-            "remove this one"
-        )
+        raise of_another(folder, "study", first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
 
 

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
 from animat.report.html import Table, with_error
+from animat.studies.results import Score
 from animat.studies.specification import Body, Study
 from animat.studies.tabulating import AIM
 
 
-def learned_of(study: Study, scores: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def learned_of(study: Study, scores: Sequence[Score]) -> list[Score]:
     """Of the table of scores, the rows of conditions on the one recording that they were trained on, the first."""
     learned = {condition.name for condition in study.conditions if condition.learns_one_recording}
-    first: dict[tuple[str, str], dict[str, Any]] = {}
+    first: dict[tuple[str, str], Score] = {}
     for row in scores:
-        if row["condition"] in learned:
-            known = first.setdefault((row["robot"], row["condition"]), row)
-            if row["at_min"] < known["at_min"]:
-                first[row["robot"], row["condition"]] = row
+        if row.condition in learned:
+            known = first.setdefault((row.robot, row.condition), row)
+            if row.at_min < known.at_min:
+                first[row.robot, row.condition] = row
     return list(first.values())
 
 
-def as_good_as_the_limit_allows(study: Study, rows: list[dict[str, Any]]) -> Table:
+def as_good_as_the_limit_allows(study: Study, rows: Sequence[Score]) -> Table:
     """Scores beside `AIM`, with what is known of the difference."""
     bodies = {body.name: body for body in study.robots}
     head = (
@@ -42,22 +43,22 @@ def as_good_as_the_limit_allows(study: Study, rows: list[dict[str, Any]]) -> Tab
     cells = []
     for row in rows:
         error = None
-        if row["standard_deviation"] is not None:
-            error = row["standard_deviation"] / math.sqrt(row["policies"])
+        if row.standard_deviation is not None:
+            error = row.standard_deviation / math.sqrt(row.policies)
         cells.append(
             (
-                row["robot"],
-                row["condition"],
-                row["mapping"],
-                row["at_min"],
-                with_error(row["mean_return"], error),
-                row["random"],
-                row["limit"],
-                row["limit_run"],
-                row["limit_without_clock"],
-                row["normalised_score"],
-                row["score_without_clock"],
-                known_of(row, bodies[row["robot"]]),
+                row.robot,
+                row.condition,
+                row.mapping,
+                row.at_min,
+                with_error(row.mean_return, error),
+                row.random,
+                row.limit,
+                row.limit_run,
+                row.limit_without_clock,
+                row.normalised_score,
+                row.score_without_clock,
+                known_of(row, bodies[row.robot]),
             )
         )
     return Table(
@@ -68,21 +69,21 @@ def as_good_as_the_limit_allows(study: Study, rows: list[dict[str, Any]]) -> Tab
         "gets if it does not know the time left, as policies do not; a better one may exist, not above the limit. Of "
         "without clock: the score with this in place of the limit.",
         beside="tables/scores.csv",
-        marked=tuple(i for i, row in enumerate(rows) if (row["normalised_score"] or 0.0) < AIM),
+        marked=tuple(i for i, row in enumerate(rows) if (row.normalised_score or 0.0) < AIM),
     )
 
 
-def known_of(row: dict[str, Any], body: Body) -> str:
+def known_of(row: Score, body: Body) -> str:
     """What is known of a score: that it is reached, or what stands between it and the limit."""
-    score, without_clock = row["normalised_score"], row["score_without_clock"]
-    if row["limit"] is None:
+    score, without_clock = row.normalised_score, row.score_without_clock
+    if row.limit is None:
         return "no limit: conditions with few responses are left out of it"
     if score is None:
         return "nothing to learn: the limit is not above random actions"
     if score >= AIM:
         return "reached"
-    run, random = row["limit_run"], row["random"]
-    if run is not None and (row["mean_return"] - random) >= AIM * (run - random):
+    run, random = row.limit_run, row.random
+    if run is not None and random is not None and (row.mean_return - random) >= AIM * (run - random):
         return f"short of the limit, not of what its controller was seen to get ({run:.1f})"
     if without_clock is not None and without_clock >= AIM:
         return "short by the clock: reached against the same controller without knowing the time left"

@@ -13,26 +13,12 @@ from animat.progress import Part, Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
-from animat.studies.places import limits_file, read_table, write_table
+from animat.studies.places import limits_file
+from animat.studies.results import Limit, read_typed, write_typed
 from animat.studies.simulating import read_series
 from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.task import StudyTask
 
-HEAD = (
-    "mapping",
-    "percentiles",
-    "at_min",
-    "best_return",
-    "low_95",
-    "high_95",
-    "grid_error",
-    "monte_carlo",
-    "standard_error",
-    "without_clock",
-    "without_clock_standard_error",
-    "nodes",
-    "left_out",
-)
 ROUGH = 0.5
 """Steps of the grid along each axis where every recording has its limit, as a part of those elsewhere."""
 COARSER = 0.8
@@ -53,9 +39,14 @@ def rough_kinds(study: Study) -> list[StudyCondition]:
     return [kind for kind in kinds_of(study) if kind.through_neurons and kind.mapping != "linear"]
 
 
-def limits_of_all(folder: Path, robot: str, what: str = "limits") -> list[dict[str, Any]]:
+def limits_of_all(folder: Path, robot: str, what: str = "limits") -> list[Limit]:
     """The limits of all conditions; what policies could do with fewer is none of theirs."""
-    return [row for row in read_table(limits_file(folder, robot, what)) if row["left_out"] is None]
+    return [limit for limit in read_limits(folder, robot, what) if limit.left_out is None]
+
+
+def read_limits(folder: Path, robot: str, what: str = "limits") -> tuple[Limit, ...]:
+    """The limits as the job left them."""
+    return read_typed(limits_file(folder, robot, what), tuple[Limit, ...])
 
 
 def left_out(study: Study) -> list[str]:
@@ -71,7 +62,7 @@ def left_out(study: Study) -> list[str]:
 
 @final
 @dataclass(frozen=True)
-class Limit(StudyTask):
+class FindLimits(StudyTask):
     """The best possible return on a robot for every mapping of the study, of conditions with enough responses.
 
     Of a robot without a grid the table is empty.
@@ -89,7 +80,7 @@ class Limit(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         file = limits_file(folder, self.body.name, "over-time" if self.over_time else "limits")
         if no_grid(self.body.robot()) is not None:
-            return [write_table(file, HEAD, [])]
+            return [write_typed(file, [])]
         study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         kinds, minutes = kinds_of(study), study.limit_minutes(first, last)
@@ -131,11 +122,13 @@ class Limit(StudyTask):
         for done, (i, of) in enumerate(known.items(), len(cases) + 1):
             found[i] = of.known(found[i], resolution=COARSER * resolution, seed=study.seed)
             progress.update(done, steps, "how well it is known")
-        rows = [
-            (kind.mapping, kind.percentiles, at, *_cells(found.get(i)), "; ".join(left_out.get(i, ())) or None)
-            for i, (kind, at) in enumerate(asked)
-        ]
-        return [write_table(file, HEAD, rows)]
+        limits = []
+        for i, (kind, at) in enumerate(asked):
+            few = "; ".join(left_out.get(i, ())) or None
+            limits.append(
+                Limit(self.body.name, kind.mapping, kind.percentiles, at, **_known(found.get(i)), left_out=few)
+            )
+        return [write_typed(file, limits)]
 
 
 def _compared(study: Study, first: float, last: float) -> list[tuple[StudyCondition, float]]:
@@ -149,11 +142,14 @@ def _compared(study: Study, first: float, last: float) -> list[tuple[StudyCondit
     ]
 
 
-def _cells(optimum: Optimum | None) -> tuple[float | int | None, ...]:
-    """Of the head, from the best return to the nodes; nothing where no condition has enough responses."""
-    if optimum is None:
-        return (None,) * len(HEAD[3:-1])
-    told, interval = optimum.to_dict(), optimum.interval
-    told["best_return"] = told["value"]
-    told["low_95"], told["high_95"] = (None, None) if interval is None else (interval.low, interval.high)
-    return tuple(told[name] for name in HEAD[3:-1])
+def _known(optimum: Optimum | None) -> dict[str, Any]:
+    """The fields of a limit from the best return to the nodes; None where no condition has enough responses."""
+    told = {} if optimum is None else optimum.to_dict()
+    interval = None if optimum is None else optimum.interval
+    names = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
+    return {
+        "best_return": told.get("value"),
+        "low_95": None if interval is None else interval.low,
+        "high_95": None if interval is None else interval.high,
+        **{name: told.get(name) for name in names},
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from jaxtyping import Float, Int64
 from animat.animat import Environment
 from animat.evaluation.rollouts import Actor
 from animat.neurons.simulator import NeuronSimulator
+from animat.studies.results import read_arrays, write_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,22 @@ class Paths:
     observations: Float[np.ndarray, "actors iterations+1 observations"]
     commands: Float[np.ndarray, "actors iterations"]
     lengths: Int64[np.ndarray, " actors"]
+
+    def save(self, path: Path) -> Path:
+        """Write it, complete or absent."""
+        return write_arrays(path, vars(self))
+
+    @staticmethod
+    def load(path: Path) -> Paths:
+        """Read what `save` wrote; raises InvalidFile if it cannot be read."""
+        return Paths(**read_arrays(path))
+
+    def whole(self) -> list[tuple[np.ndarray, list[float]]]:
+        """Observations and commands of each actor, up to the end of its episode."""
+        return [
+            (observations[: length + 1], commands[:length].tolist())
+            for observations, commands, length in zip(self.observations, self.commands, self.lengths, strict=True)
+        ]
 
 
 def record_paths(

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, TypeAlias, final
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, save_figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.capabilities import lacking
+from animat.studies.episodes import POLICY, RANDOM, mean_returns
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.figure_tables import (
     write_array,
@@ -37,23 +38,21 @@ from animat.studies.figure_tables import (
     write_courses,
     write_drift,
     write_learning,
+    write_paths,
     write_psth,
 )
 from animat.studies.limits import kinds_of, limits_of_all
-from animat.studies.places import (
-    RECORDINGS,
-    controls_file,
-    episodes_file,
-    read_table,
-    table_file,
-)
+from animat.studies.paths import Paths
+from animat.studies.places import RECORDINGS, paths_file, results_file
+from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
 from animat.studies.simulating import read_series
-from animat.studies.specification import Body, Study, StudyCondition
-from animat.studies.tabulating import TRAINED, References, named_mapping, performances
+from animat.studies.specification import Body, Study, StudyCondition, named_mapping
+from animat.studies.tabulating import TRAINED, References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 
 @final
@@ -105,27 +104,32 @@ class RobotPictures(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         robot, name = self.body.robot(), self.body.name
         study, timeline = as_recorded(self.study, folder)
-        last = last_minute(timeline)
-        known = References(study, folder, self.body)
+        table = all_episodes(study, folder, [self.body])
+        known = References(study, folder, self.body, table)
+        results = read_typed(results_file(folder), Results)
+        rough = _over_time(study, folder, self.body, table)
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
-        curves = _curves(study, folder, self.body, known, timeline)
+        curves = _curves(study, folder, self.body, known, rough, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(write_learning(folder, name, curves))
         if study.comparisons:
-            figures["comparisons"] = draw_comparisons(
-                _pairs(study, folder, self.body, known, last), f"{name}: comparisons"
-            )
+            rows = [row for row in results.comparisons if row.robot == name]
+            figures["comparisons"] = draw_comparisons(_pairs(study, rows, table, known), f"{name}: comparisons")
         if timeline is not None and len(timeline) > 1:
-            courses = _courses(study, folder, self.body, known, timeline)
+            courses = _courses(study, table, known, rough, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
             drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
             figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
             tables.append(write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
-        figures["controls"] = draw_controls(_controls(folder, self.body), f"{name}: controls")
-        paths = {condition.name: _paths(folder, self.body, condition) for condition in study.conditions}
+        figures["controls"] = draw_controls(
+            _controls(study, [row for row in results.controls if row.robot == name]), f"{name}: controls"
+        )
+        recorded = {each.name: Paths.load(paths_file(folder, self.body, each)) for each in study.conditions}
+        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.quantities], recorded))
+        paths = {condition: of.whole() for condition, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
             only_paths = {c: [path for path, _ in each] for c, each in paths.items()}
@@ -144,39 +148,27 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     return files
 
 
+Rough: TypeAlias = dict[tuple[str, str, float], tuple[float, float | None]]
+"""By mapping, percentiles and minute: the mean return of random actions, and the limit on a rough grid if known."""
+
+
 def _curves(
-    study: Study, folder: Path, body: Body, known: References, timeline: SimulatorTimeline | None
+    study: Study, folder: Path, body: Body, known: References, rough: Rough, timeline: SimulatorTimeline | None
 ) -> list[LearningCurve]:
-    returns: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
-    iterations: dict[str, list[float]] = {}
-    for row in read_table(table_file(folder, "learning-curves")):
-        if row["robot"] == body.name:
-            mean = row["mean_return"]
-            returns[row["condition"]][row["policy"]].append(np.nan if mean is None else mean)
-            if row["policy"] == "p0":
-                iterations.setdefault(row["condition"], []).append(row["iterations"])
-    rough = _over_time(study, folder, body)
     curves = []
     for condition in study.conditions:
-        if condition.name in returns:
-            parts = len(iterations[condition.name])
-            minutes = _minutes_in_training(study, condition, timeline, parts)
-            random, limit = [], []
-            for at_min in minutes:
-                row = known.limit(condition, at_min) or {}
-                near = rough.get((condition.mapping, condition.percentiles, at_min), (None, None))
-                random.append(near[0] if condition.through_neurons else known.random(condition, at_min))
-                exact = row.get("best_return")
-                limit.append(near[1] if exact is None and condition.delivery == "chosen" else exact)
-            curves.append(
-                LearningCurve(
-                    condition.name,
-                    np.array(iterations[condition.name]),
-                    np.array(list(returns[condition.name].values()), np.float64),
-                    np.array(random, np.float64),
-                    np.array(limit, np.float64),
-                )
-            )
+        if not condition.trained:
+            continue
+        told = learning_of(study, folder, body, condition)
+        random, limit = [], []
+        for at_min in _minutes_in_training(study, condition, timeline, told.shape[1]):
+            best = known.limit(condition, at_min)
+            near = rough.get((condition.mapping, condition.percentiles, at_min), (None, None))
+            random.append(near[0] if condition.through_neurons else known.random(condition, at_min))
+            fallback = near[1] if condition.delivery == "chosen" else None
+            limit.append(fallback if best is None else best.best_return)
+        beside = np.array(random, np.float64), np.array(limit, np.float64)
+        curves.append(LearningCurve(condition.name, told[0, :, 0], told[:, :, 2], *beside))
     return curves
 
 
@@ -192,99 +184,89 @@ def _minutes_in_training(
     return [float(timeline.start_min[row]) for row in rows]
 
 
-def _over_time(study: Study, folder: Path, body: Body) -> dict[tuple[str, str, float], tuple[float, float | None]]:
+def _over_time(study: Study, folder: Path, body: Body, table: DataFrame) -> Rough:
     """Random actions and the limit on a rough grid (None where it was not computed) at every recording."""
     if not study.needs_neurons:
         return {}
     limits = {
-        (row["mapping"], row["percentiles"], row["at_min"]): row["best_return"]
-        for row in limits_of_all(folder, body.name, "over-time")
+        (limit.mapping, limit.percentiles, limit.at_min): limit.best_return
+        for limit in limits_of_all(folder, body.name, "over-time")
     }
-    found: dict[tuple[str, str, float], tuple[float, float | None]] = {}
+    found: Rough = {}
+    random = table[(table["agent"] == RANDOM) & table["over_time"]]
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
-        for row in read_table(controls_file(folder, body, kind, "over-time")):
-            key = (kind.mapping, kind.percentiles, row["at_min"])
-            found[key] = (row["random"], limits.get(key))
+        of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
+        for at_min, returns in of_kind.groupby("at_min")["return"]:
+            key = (kind.mapping, kind.percentiles, at_min)
+            found[key] = (float(returns.to_numpy().mean()), limits.get(key))
     return found
 
 
-def _pairs(study: Study, folder: Path, body: Body, known: References, last: float) -> list[Pair]:
-    rows = {
-        row["comparison"]: row for row in read_table(table_file(folder, "comparisons")) if row["robot"] == body.name
-    }
+def _pairs(study: Study, rows: list[ComparedReturns], table: DataFrame, known: References) -> list[Pair]:
     pairs = []
-    for compared in study.comparisons:
-        at_min = last if compared.at_min is None else compared.at_min
-        groups: list[Group] = []
-        for condition in (study.condition(compared.first), study.condition(compared.second)):
-            limit = known.limit(condition, at_min)
+    for row in rows:
+        groups = []
+        for name, score in ((row.first, row.score_first), (row.second, row.score_second)):
+            condition = study.condition(name)
+            limit = known.limit(condition, row.at_min)
             groups.append(
                 Group(
-                    condition.name,
-                    performances(folder, body, condition, at_min, compared.episodes),
-                    known.random(condition, at_min),
-                    None if limit is None else limit["best_return"],
-                    rows[compared.name]["score_first" if not groups else "score_second"],
+                    name,
+                    performances(table, row.robot, condition, row.at_min, row.episodes),
+                    known.random(condition, row.at_min),
+                    None if limit is None else limit.best_return,
+                    score,
                 )
             )
-        row = rows[compared.name]
-        pairs.append(Pair(f"at {at_min:g} min", groups[0], groups[1], row["p_holm"], row["u"]))
+        first, second = groups
+        pairs.append(Pair(f"at {row.at_min:g} min", first, second, row.p_holm, row.u))
     return pairs
 
 
-def _courses(study: Study, folder: Path, body: Body, known: References, timeline: SimulatorTimeline) -> list[Courses]:
-    rough = _over_time(study, folder, body)
-    every_min = [float(at_min) for at_min in timeline.start_min]
+def _courses(
+    study: Study, table: DataFrame, known: References, rough: Rough, timeline: SimulatorTimeline
+) -> list[Courses]:
+    every_min: list[float] = timeline.start_min.tolist()
+    over_time = table[(table["agent"] == POLICY) & table["over_time"]]
     panels = []
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
-        same = [c for c in study.conditions if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
         courses = []
-        for condition in same:
-            of_policy: dict[str, list[float]] = defaultdict(list)
-            for row in read_table(episodes_file(folder, body, condition, "over-time")):
-                of_policy[row["actor"]].append(row["mean_return"])
-            courses.append(Course(condition.name, np.array(every_min), np.array(list(of_policy.values()))))
+        for condition in study.conditions:
+            if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles):
+                of_minute = over_time[over_time["arm"] == condition.name].groupby("at_min")
+                returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
+                courses.append(Course(condition.name, np.array(every_min), returns))
         at = [rough[kind.mapping, kind.percentiles, at_min] for at_min in every_min]
-        fine = [(at_min, row["best_return"]) for at_min in every_min for row in (known.limit(kind, at_min),) if row]
+        limits = ((at_min, known.limit(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
                 named_mapping(kind.mapping, kind.percentiles),
                 tuple(courses),
                 np.array([random for random, _ in at]),
                 None if at[0][1] is None else np.array([limit for _, limit in at], np.float64),
-                tuple(fine),
+                tuple(
+                    (at_min, limit.best_return) for at_min, limit in limits if limit and limit.best_return is not None
+                ),
             )
         )
     return panels
 
 
-def _controls(folder: Path, body: Body) -> list[Controls]:
-    of_panel: dict[tuple[str, str, float], list[dict[str, Any]]] = defaultdict(list)
-    for row in read_table(table_file(folder, "controls")):
-        if row["robot"] == body.name:
-            of_panel[row["mapping"], row["percentiles"], row["at_min"]].append(row)
+def _controls(study: Study, rows: list[ControlReturns]) -> list[Controls]:
+    trained = {f"{TRAINED}{condition.name}" for condition in study.conditions}
+    of_panel: dict[tuple[str, str, float], list[ControlReturns]] = defaultdict(list)
+    for row in rows:
+        of_panel[row.mapping, row.percentiles, row.at_min].append(row)
     panels = []
-    for (mapping, percentiles, at_min), rows in of_panel.items():
+    for (mapping, percentiles, at_min), same in of_panel.items():
         at = "" if mapping == "none" else f", recording at {at_min:g} min"
         panels.append(
             Controls(
                 f"{named_mapping(mapping, percentiles)}{at}",
-                tuple((row["control"], row["mean_return"], row["standard_error"]) for row in rows),
-                sum(row["control"].startswith(TRAINED) for row in rows),
-                rows[0]["random"],
-                rows[0]["limit"],
+                tuple((row.control, row.mean_return, row.standard_error) for row in same),
+                sum(row.control in trained for row in same),
+                same[0].random,
+                same[0].limit,
             )
         )
     return panels
-
-
-def _paths(folder: Path, body: Body, condition: StudyCondition) -> list[tuple[np.ndarray, list[float]]]:
-    """Observations and commands of each policy's episode."""
-    of_actor: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for row in read_table(episodes_file(folder, body, condition, "paths")):
-        of_actor[row["actor"]].append(row)
-    names = [quantity.name for quantity in body.robot().quantities]
-    return [
-        (np.array([[row[name] for name in names] for row in rows]), [row["command"] for row in rows[1:]])
-        for rows in of_actor.values()
-    ]

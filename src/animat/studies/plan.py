@@ -62,7 +62,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
 def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
     """Controls and limits on a robot."""
     from animat.studies.evaluating import Control
-    from animat.studies.limits import Limit, kinds_of
+    from animat.studies.limits import FindLimits, kinds_of
     from animat.training.group import split_groups
 
     jobs = []
@@ -73,9 +73,9 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
         jobs.append(Job(name, Control(study, body, plain), (*groups, *neurons), 6))
     resolution = body.limit_resolution or study.limit_resolution
     cost_s = 40 * resolution ** len(body.robot().quantities) + 10
-    jobs.append(Job(f"limit/{body.name}", Limit(study, body), neurons, cost_s))
+    jobs.append(Job(f"limit/{body.name}", FindLimits(study, body), neurons, cost_s))
     if neurons:
-        jobs.append(Job(f"limit/{body.name}/over-time", Limit(study, body, over_time=True), neurons, 12))
+        jobs.append(Job(f"limit/{body.name}/over-time", FindLimits(study, body, over_time=True), neurons, 12))
     return jobs
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
 from animat.evaluation.statistics import p_of_u
+from animat.neurons.fidelity import Fidelity
 from animat.progress import Progress
 from animat.report.html import Picture, Section, Table, write_page
 from animat.report.style import FORMATS
@@ -18,7 +20,8 @@ from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
 from animat.studies.heuristic import not_outperforming
 from animat.studies.learned import as_good_as_the_limit_allows, learned_of
-from animat.studies.places import REPORT, RESPONSES, read_table, table_file
+from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
+from animat.studies.results import ComparedReturns, Results, read_typed
 from animat.studies.shown import (
     comparisons_shown,
     controllability_shown,
@@ -28,6 +31,7 @@ from animat.studies.shown import (
     returns_shown,
     scores_shown,
 )
+from animat.studies.simulating import load_timeline
 from animat.studies.specification import Study
 from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL
 from animat.studies.task import StudyTask
@@ -40,19 +44,28 @@ class Publish(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, manifest = self.study, json.loads((folder / MANIFEST).read_text())
-        sections = [_short(study, folder), _scores(study, folder)]
+        results = read_typed(results_file(folder), Results)
+        kept: dict[float, Fidelity] = {}
         if study.needs_neurons:
-            sections.append(_culture(study, folder))
-        sections += [_robot(folder, body.name) for body in study.robots]
-        sections += [_controls(study, folder), _done(study, folder)]
+            timeline = load_timeline(folder / TIMELINE)
+            kept = dict(zip(timeline.start_min.tolist(), timeline.fidelities, strict=True))
+        sections = [_short(study, results), _scores(study, results)]
+        if kept:
+            table = controllability_shown(study, folder, kept)
+            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE)
+            sections.append(Section("The culture", tables=(table,), pictures=pictures))
+        for body in study.robots:
+            pictures = _pictures(folder, body.name, ROBOT, _NUMBERS_OF_ROBOT)
+            sections.append(Section(body.name.capitalize(), pictures=pictures))
+        sections += [_controls(study, results), _done(study, results)]
         if study.paper:
-            sections.append(_differences(study, folder))
-        sections.append(_noticed(folder))
+            sections.append(_differences(study, results, kept))
+        sections.append(_noticed(results))
         versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
         colophon = [
             f"Made with {versions}.",
             f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study on the same "
-            "versions and machine is the same files, bit for bit.",
+            "versions and machine has the same results, bit for bit.",
             f"Study {manifest['fingerprint']}",
         ]
         return [write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
@@ -69,10 +82,10 @@ def _lead(study: Study) -> str:
     )
 
 
-def _short(study: Study, folder: Path) -> Section:
-    rows = read_table(table_file(folder, "comparisons"))
+def _short(study: Study, results: Results) -> Section:
+    rows = results.comparisons
     paragraphs = []
-    printed = [row for row in rows if row["paper_p"] is not None]
+    printed = [row for row in rows if row.paper_p is not None]
     if printed:
         paragraphs.append(_as_in_paper(printed))
     smallest = p_of_u(0.0, study.policies, study.policies)
@@ -97,9 +110,9 @@ def _short(study: Study, folder: Path) -> Section:
     )
 
 
-def _as_in_paper(rows: list[dict[str, Any]]) -> str:
+def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
     """How many of the paper's comparisons came out as there; what cannot be told is neither yes nor no."""
-    told = Counter(row["as_in_paper"] for row in rows)
+    told = Counter(row.as_in_paper for row in rows)
     if told["cannot tell"] == len(rows):
         return f"Whether the {len(rows)} comparisons come out as in the paper cannot be told, with as few policies."
     words = f"{told['yes']} of {len(rows)} comparisons came out as in the paper: the same one better, at p < {LEVEL:g}."
@@ -110,13 +123,9 @@ def _as_in_paper(rows: list[dict[str, Any]]) -> str:
     return words
 
 
-def _scores(study: Study, folder: Path) -> Section:
-    rows = read_table(table_file(folder, "scores"))
-    learned = learned_of(study, rows)
-    tables = [
-        scores_shown(rows),
-        limits_shown(read_table(table_file(folder, "limits"))),
-    ]
+def _scores(study: Study, results: Results) -> Section:
+    learned = learned_of(study, results.scores)
+    tables = [scores_shown(results.scores), limits_shown(results.limits)]
     paragraphs = [
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     ]
@@ -128,15 +137,6 @@ def _scores(study: Study, folder: Path) -> Section:
         )
         tables.insert(0, as_good_as_the_limit_allows(study, learned))
     return Section("Scores", tuple(paragraphs), tables=tuple(tables))
-
-
-def _culture(study: Study, folder: Path) -> Section:
-    table = controllability_shown(study, folder)
-    return Section("The culture", tables=(table,), pictures=_pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE))
-
-
-def _robot(folder: Path, robot: str) -> Section:
-    return Section(robot.capitalize(), pictures=_pictures(folder, robot, ROBOT, _NUMBERS_OF_ROBOT))
 
 
 _NUMBERS_OF_CULTURE = {
@@ -152,6 +152,7 @@ _NUMBERS_OF_ROBOT = {
     "learning": ("tables/{of}-learning.csv", "tables/learning-curves.csv"),
     "comparisons": ("tables/comparisons.csv",),
     "over-time": ("tables/{of}-over-time.csv",),
+    "paths": ("tables/{of}-paths.csv",),
     "controls": ("tables/controls.csv",),
 }
 """Files that hold what figures show."""
@@ -169,7 +170,7 @@ def _pictures(
     return tuple(pictures)
 
 
-def _controls(study: Study, folder: Path) -> Section:
+def _controls(study: Study, results: Results) -> Section:
     points = (
         ("random", "Any action, equally likely, whatever is observed."),
         ("constant", "One stimulus always (without neurons: one command)."),
@@ -181,16 +182,16 @@ def _controls(study: Study, folder: Path) -> Section:
         ("silent", "The trained policies on a culture that always answers 0."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
     )
-    beside = heuristic_shown(folder)
+    beside = heuristic_shown(results.heuristic)
     return Section(
         "Is it the culture?",
-        ("Each control takes something away.", *not_outperforming(folder)),
+        ("Each control takes something away.", *not_outperforming(results)),
         points,
-        ((beside,) if beside.rows else ()) + (controls_shown(study, folder),),
+        ((beside,) if beside.rows else ()) + (controls_shown(study, results.controls),),
     )
 
 
-def _done(study: Study, folder: Path) -> Section:
+def _done(study: Study, results: Results) -> Section:
     culture, simulators = study.culture, study.simulators
     if culture.kind == "files":
         recorded = f"Recordings from files: {', '.join(culture.files)}."
@@ -220,8 +221,7 @@ def _done(study: Study, folder: Path) -> Section:
         ),
     ]
     points.append(("Evaluation", _ACTIONS[study.actions]))
-    findings = read_table(table_file(folder, "findings"))
-    points += [("Left out", f"{row['sentence']}.") for row in findings if row["name"] == LEFT_OUT]
+    points += [("Left out", f"{finding.sentence}.") for finding in results.findings if finding.name == LEFT_OUT]
     for condition in study.conditions:
         said = [f"mapping {condition.mapping}" if condition.through_neurons else "the robot is moved directly"]
         if condition.through_neurons:
@@ -244,12 +244,9 @@ _ACTIONS = {
 }
 
 
-def _differences(study: Study, folder: Path) -> Section:
-    rows = [row for row in read_table(table_file(folder, "comparisons")) if row["paper_p"] is not None]
-    lost: dict[float, float] = {}
-    for row in read_table(table_file(folder, "controllability")) if study.needs_neurons else ():
-        loss = abs(row["above_median_in_data"] - row["above_median_in_simulator"])
-        lost[row["at_min"]] = max(lost.get(row["at_min"], 0.0), loss)
+def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity]) -> Section:
+    rows = [row for row in results.comparisons if row.paper_p is not None]
+    lost = {at_min: of.largest_loss for at_min, of in kept.items()}
     otherwise = came_out_otherwise(rows, lost)
     paragraphs = [
         "Sawada, Wake, Sasabuchi, Takamatsu, Takahashi, Ikeuchi: Design strategies for controlling neuron-connected "
@@ -261,11 +258,10 @@ def _differences(study: Study, folder: Path) -> Section:
     return Section("Differences from the paper", tuple(paragraphs), (*otherwise, *decisions(study)))
 
 
-def _noticed(folder: Path) -> Section:
-    rows = read_table(table_file(folder, "findings"))
-    grave = [row for row in rows if row["severity"] != "note"]
-    notes = len(rows) - len(grave)
-    shown = tuple((row["name"], row["sentence"]) for row in grave)
+def _noticed(results: Results) -> Section:
+    grave = [finding for finding in results.findings if finding.severity != "note"]
+    notes = len(results.findings) - len(grave)
+    shown = tuple((finding.name, finding.sentence) for finding in grave)
     said = (
         f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the limits; all "
         "are in tables/findings.csv."

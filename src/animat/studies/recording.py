@@ -12,7 +12,6 @@ from animat.execution.receipts import Receipt
 from animat.progress import Progress
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.folder import source_files
-from animat.studies.identity import settle_identity
 from animat.studies.places import RECEIPTS, RECORDINGS
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
@@ -39,8 +38,6 @@ class Record(StudyTask):
         kind = self.study.culture.kind
         make = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[kind]
         files = make(self.study, out, progress)
-        for file in files:
-            settle_identity(file)
         kept = (SELECTION_FILE, STATE_FILE) if kind == "virtual" else ()
         return [*files, *(out / name for name in kept)]
 

@@ -48,7 +48,8 @@ def run_study(
     """Run a study into a folder, or go on with one.
 
     Killed at any moment and called again, it goes on from the jobs that are done and, within a training, from its last
-    checkpoint; the folder ends as the same files, bit for bit, as if undisturbed, with any number of workers.
+    checkpoint; the folder ends as if undisturbed, with any number of workers: the same files, bit for bit,
+    and the same recordings, in files to which NWB gives identifiers and dates of their own.
 
     Args:
         study: the specification.

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from animat.evaluation.optimum import bracket_findings
-from animat.neurons.fidelity import LARGEST_LOSS
+from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Table, cell, with_error
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.limits import limits_of_all, rough_kinds
-from animat.studies.places import read_table, table_file
-from animat.studies.specification import Study
-from animat.studies.tabulating import FIRST, LEVEL, SECOND, named_mapping
+from animat.studies.results import BesideHeuristic, ComparedReturns, ControlReturns, Limit, Score
+from animat.studies.specification import Study, named_mapping
+from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
-Columns: TypeAlias = list[tuple[str, "str | Callable[[dict[str, Any]], Any]"]]
-"""Of a table that is shown: their names, and the key or a function of a row that gives the cell."""
+Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
+"""Of a table that is shown: their names, and the field or a function of a row that gives the cell."""
 
 _MOST_LABELS = 12
 _MOST_ROWS = 40
@@ -31,9 +29,9 @@ _SCORE_NOTE = (
 )
 
 
-def comparisons_shown(rows: list[dict[str, Any]]) -> Table:
+def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
     """Tests and outcomes, beside the paper's p where it printed one."""
-    printed = any(row["paper_p"] is not None for row in rows)
+    printed = any(row.paper_p is not None for row in rows)
     columns: Columns = [
         ("comparison", "comparison"),
         ("robot", "robot"),
@@ -55,11 +53,11 @@ def comparisons_shown(rows: list[dict[str, Any]]) -> Table:
         if printed
         else "",
         beside="tables/comparisons.csv",
-        marked=tuple(i for i, row in enumerate(rows) if row["as_in_paper"] == "no"),
+        marked=tuple(i for i, row in enumerate(rows) if row.as_in_paper == "no"),
     )
 
 
-def returns_shown(rows: list[dict[str, Any]]) -> Table:
+def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
     """The same comparisons as mean returns, limits and scores."""
     return Table(
         "The same comparisons as returns",
@@ -83,7 +81,7 @@ def returns_shown(rows: list[dict[str, Any]]) -> Table:
     )
 
 
-def scores_shown(rows: list[dict[str, Any]]) -> Table:
+def scores_shown(rows: Sequence[Score]) -> Table:
     """Every condition at every minute it was evaluated at."""
     return Table(
         "Every condition",
@@ -108,19 +106,19 @@ def scores_shown(rows: list[dict[str, Any]]) -> Table:
     )
 
 
-def limits_shown(limits: list[dict[str, Any]]) -> Table:
+def limits_shown(limits: Sequence[Limit]) -> Table:
     """The best possible returns as brackets, with their intervals; what was left out of them is said."""
     columns: Columns = [
         ("robot", "robot"),
-        ("mapping", lambda row: named_mapping(row["mapping"], row["percentiles"])),
+        ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
         ("at (min)", "at_min"),
         ("limit ± grid", _pair("best_return", "grid_error")),
-        ("95 % interval", lambda row: None if row["low_95"] is None else _ends(row["low_95"], row["high_95"])),
+        ("95 % interval", lambda row: None if row.low_95 is None else _ends(row.low_95, row.high_95)),
         ("its controller, run", _pair("monte_carlo", "standard_error")),
         ("without clock", _pair("without_clock", "without_clock_standard_error")),
         ("nodes", "nodes"),
     ]
-    without = [row for row in limits if row["left_out"] is not None]
+    without = [row for row in limits if row.left_out is not None]
     left_out = ""
     if without:
         columns.append(("left out (responses)", "left_out"))
@@ -138,38 +136,38 @@ def limits_shown(limits: list[dict[str, Any]]) -> Table:
         "they part by more than 3 standard errors and the grid's error. Without clock: the same controller if it "
         "does not know the time left, as policies do not. On a rough grid at every recording: limits/." + left_out,
         beside="tables/limits.csv",
-        marked=tuple(i for i, row in enumerate(limits) if _parted(row)),
+        marked=tuple(i for i, row in enumerate(limits) if row.findings()),
     )
 
 
-def controllability_shown(study: Study, folder: Path) -> Table:
-    """How often each condition passes the median in every recording, in the data and in the simulator."""
-    in_data: dict[float, dict[str, float]] = defaultdict(dict)
-    in_simulator: dict[float, dict[str, float]] = defaultdict(dict)
-    for row in read_table(table_file(folder, "controllability")):
-        in_data[row["at_min"]][row["condition"]] = row["above_median_in_data"]
-        in_simulator[row["at_min"]][row["condition"]] = row["above_median_in_simulator"]
+def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
+    """How often each condition passes the median in every recording, in the data and in the simulator.
+
+    Args:
+        kept: what the simulator keeps of each recording, by its minute.
+    """
     kinds = rough_kinds(study)[:1]
     limits = {
         body.name: {
-            row["at_min"]: row["best_return"]
-            for row in limits_of_all(folder, body.name, "over-time")
-            if (row["mapping"], row["percentiles"]) == (kinds[0].mapping, kinds[0].percentiles)
+            limit.at_min: limit.best_return
+            for limit in limits_of_all(folder, body.name, "over-time")
+            if (limit.mapping, limit.percentiles) == (kinds[0].mapping, kinds[0].percentiles)
         }
         for body in study.robots
         if kinds
     }
-    every = list(next(iter(in_data.values())))
-    labels = every[:_MOST_LABELS]
-    lost = {at_min: max(abs(of[x] - in_simulator[at_min][x]) for x in every) for at_min, of in in_data.items()}
-    rows = []
-    for at_min, of in in_data.items():
-        drawn = in_simulator[at_min]
-        shares = (
-            f"{of[x]:.2f}\u00a0→\u00a0{drawn[x]:.2f}" if abs(of[x] - drawn[x]) > LARGEST_LOSS else of[x] for x in labels
-        )
-        apart = (max(each.values()) - min(each.values()) for each in (of, drawn))
-        rows.append((at_min, *shares, *apart, *(by_minute.get(at_min) for by_minute in limits.values())))
+    labels = next(iter(kept.values())).labels
+    rows, marked = [], []
+    for i, (at_min, of) in enumerate(kept.items()):
+        in_data, in_simulator = of.in_data.tolist(), of.in_simulator.tolist()
+        shares = [
+            f"{a:.2f}\u00a0→\u00a0{b:.2f}" if abs(a - b) > LARGEST_LOSS else a
+            for a, b in zip(in_data, in_simulator, strict=True)
+        ]
+        apart = (max(each) - min(each) for each in (in_data, in_simulator))
+        rows.append((at_min, *shares[:_MOST_LABELS], *apart, *(by_minute.get(at_min) for by_minute in limits.values())))
+        if of.largest_loss > LARGEST_LOSS:
+            marked.append(i)
     note = (
         "P(x ≥ P50) of each condition: how often it answers above the median of all. A controller can only work with "
         "the difference between them, and of that with what the simulator keeps of the responses. Highlighted, with "
@@ -179,29 +177,34 @@ def controllability_shown(study: Study, folder: Path) -> Table:
     if kinds:
         mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)
         note += f" Limit: the best possible return with {mapping} on a rough grid."
-    if len(every) > len(labels):
-        note += f" {len(every) - len(labels)} more conditions are in the file; the differences are over all."
+    if len(labels) > _MOST_LABELS:
+        note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."
     return Table(
         "Controllability of every recording",
-        ("at (min)", *labels, "difference, data", "difference, simulator", *(f"limit, {robot}" for robot in limits)),
+        (
+            "at (min)",
+            *labels[:_MOST_LABELS],
+            "difference, data",
+            "difference, simulator",
+            *(f"limit, {robot}" for robot in limits),
+        ),
         tuple(rows),
         note=note,
         beside="tables/controllability.csv",
-        marked=tuple(i for i, loss in enumerate(lost.values()) if loss > LARGEST_LOSS),
+        marked=tuple(marked),
     )
 
 
-def controls_shown(study: Study, folder: Path) -> Table:
+def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
     """Trained policies and the controls of their mapping, at every recording that anything is evaluated at."""
-    rows = read_table(table_file(folder, "controls"))
     return Table(
         "Controls",
         *_columns(
             rows,
             [
                 ("robot", "robot"),
-                ("mapping", lambda row: named_mapping(row["mapping"], row["percentiles"])),
-                ("at (min)", lambda row: None if row["mapping"] == "none" else row["at_min"]),
+                ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
+                ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
                 ("control", "control"),
                 ("actors", "actors"),
                 ("mean return", _pair("mean_return", "standard_error")),
@@ -214,7 +217,7 @@ def controls_shown(study: Study, folder: Path) -> Table:
         "one actor over its episodes. Limits are those of the culture as it answers, also beside silent and shuffled."
         + (
             " Without neurons, where any command can be chosen, none is held constant."
-            if any(row["mapping"] == "none" for row in rows)
+            if any(row.mapping == "none" for row in rows)
             and any(body.robot().baseline_commands is None for body in study.robots)
             else ""
         ),
@@ -223,9 +226,8 @@ def controls_shown(study: Study, folder: Path) -> Table:
     )
 
 
-def heuristic_shown(folder: Path) -> Table:
+def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
     """Trained policies beside the rule made by hand, episode by episode."""
-    rows = read_table(table_file(folder, "heuristic"))
     return Table(
         "Policies beside the rule made by hand",
         *_columns(
@@ -244,39 +246,33 @@ def heuristic_shown(folder: Path) -> Table:
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
         "return is larger, ties half. Highlighted: learning brought no more than the rule did.",
         beside="tables/heuristic.csv",
-        marked=tuple(i for i, row in enumerate(rows) if row["outcome"] == NOT),
+        marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
     )
 
 
-def _columns(rows: Sequence[dict[str, Any]], columns: Columns) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
-    """Head and cells of a table: a column is a name and the key, or a function of the row."""
-    cells = tuple(tuple(key(row) if callable(key) else row[key] for _, key in columns) for row in rows)
+def _columns(rows: Sequence[Any], columns: Columns) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
+    """Head and cells of a table: a column is a name and the field, or a function of the row."""
+    cells = tuple(tuple(of(row) if callable(of) else getattr(row, of) for _, of in columns) for row in rows)
     return tuple(name for name, _ in columns), cells
 
 
-def _pair(value: str, error: str) -> Callable[[dict[str, Any]], str | None]:
-    return lambda row: None if row[value] is None else with_error(row[value], row[error])
+def _pair(value: str, error: str) -> Callable[[Any], str | None]:
+    return lambda row: None if getattr(row, value) is None else with_error(getattr(row, value), getattr(row, error))
 
 
-def _interval(value: str, low: str, high: str) -> Callable[[dict[str, Any]], str]:
-    return lambda row: f"{cell(row[value])}\u00a0{_ends(row[low], row[high])}"
+def _interval(value: str, low: str, high: str) -> Callable[[Any], str]:
+    return lambda row: f"{cell(getattr(row, value))}\u00a0{_ends(getattr(row, low), getattr(row, high))}"
 
 
 def _ends(low: float, high: float) -> str:
     return f"[{cell(low)}, {cell(high)}]".replace(" ", "\u00a0")
 
 
-def _printed(row: dict[str, Any]) -> str | None:
-    return None if row["paper_p"] is None else f"{cell(row['paper_p'])}\u00a0({cell(row['paper_u'])})"
+def _printed(row: ComparedReturns) -> str | None:
+    return None if row.paper_p is None else f"{cell(row.paper_p)}\u00a0({cell(row.paper_u)})"
 
 
-def _outcome(row: dict[str, Any]) -> str:
+def _outcome(row: ComparedReturns) -> str:
     """The outcome by the paper's p; where correction takes it back, it says so."""
-    taken_back = row["outcome"] in (FIRST, SECOND) and row["p_holm"] >= LEVEL
-    return f"{row['outcome']}, not after correction" if taken_back else row["outcome"]
-
-
-def _parted(row: dict[str, Any]) -> bool:
-    if row["best_return"] is None:
-        return False
-    return bool(bracket_findings(row["best_return"], row["grid_error"], row["monte_carlo"], row["standard_error"]))
+    taken_back = row.outcome in (FIRST, SECOND) and row.p_holm >= LEVEL
+    return f"{row.outcome}, not after correction" if taken_back else row.outcome

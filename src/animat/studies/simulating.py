@@ -24,7 +24,8 @@ from animat.responses.conditions import conditions_named
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Presentation
-from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE, write_table
+from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
+from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.writing import written_whole

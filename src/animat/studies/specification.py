@@ -218,6 +218,12 @@ class StudyCondition:
         return self.trained and self.through_neurons and not self.shadowing and self.delivery == "chosen"
 
 
+def named_mapping(mapping: str, percentiles: str) -> str:
+    """A mapping in words, with whether its percentiles are held."""
+    held = ", percentiles held" if percentiles == "first" else ""
+    return "without neurons" if mapping == "none" else f"{mapping}{held}"
+
+
 @record
 class Compared:
     """Two conditions that are compared on every robot, by the policies' mean returns.

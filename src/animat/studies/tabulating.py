@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, TypeVar, final
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
-from animat.evaluation.optimum import bracket_findings
 from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
+from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
+from animat.studies.episodes import POLICY, RANDOM, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
-from animat.studies.heuristic import HEAD, rows_beside_heuristic
-from animat.studies.limits import HEAD as LIMITS
-from animat.studies.limits import kinds_of, left_out, limits_of_all
+from animat.studies.heuristic import beside_heuristic
+from animat.studies.limits import kinds_of, left_out, limits_of_all, read_limits
 from animat.studies.paper import PRINTED
-from animat.studies.places import (
-    controls_file,
-    episodes_file,
-    limits_file,
-    policies_folder,
-    read_table,
-    table_file,
+from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
+from animat.studies.results import (
+    BesideHeuristic,
+    ComparedReturns,
+    ControlReturns,
+    Limit,
+    Results,
+    Score,
+    write_records,
+    write_table,
+    write_typed,
 )
-from animat.studies.places import write_table as write
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Body, Study, StudyCondition, named_mapping
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
+from animat.writing import written_whole
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+T = TypeVar("T")
 
 LEVEL = 0.01
 """The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
@@ -40,218 +48,171 @@ LEVEL = 0.01
 AIM = 0.97
 """Normalised score from which a condition counts as being as good as its limit allows."""
 
-SCORES = (
-    "robot",
-    "condition",
-    "mapping",
-    "at_min",
-    "policies",
-    "episodes",
-    "mean_return",
-    "standard_deviation",
-    "interquartile_mean",
-    "low_95",
-    "high_95",
-    "random",
-    "limit",
-    "limit_grid_error",
-    "limit_run",
-    "limit_run_standard_error",
-    "limit_without_clock",
-    "normalised_score",
-    "score_without_clock",
-)
-COMPARISONS = (
-    "comparison",
-    "robot",
-    "first",
-    "second",
-    "at_min",
-    "episodes",
-    "n",
-    "mean_first",
-    "mean_second",
-    "score_first",
-    "score_second",
-    "random_second",
-    "limit_first",
-    "limit_second",
-    "limit_error_first",
-    "limit_error_second",
-    "u",
-    "p_normal",
-    "p_exact",
-    "p_holm",
-    "effect",
-    "effect_low_95",
-    "effect_high_95",
-    "outcome",
-    "paper_u",
-    "paper_p",
-    "as_in_paper",
-)
 LEFT_OUT = "left-out"
 """The finding that a robot cannot do something, which the study is without."""
 
 TRAINED = "trained: "
 """In front of a condition's name among the controls."""
 
-CONTROLS = (
-    "robot",
-    "mapping",
-    "percentiles",
-    "at_min",
-    "control",
-    "actors",
-    "mean_return",
-    "standard_error",
-    "random",
-    "limit",
-    "normalised_score",
-)
 CURVES = ("robot", "condition", "policy", "iterations", "episodes", "mean_return")
 
 
 @final
 @dataclass(frozen=True)
 class Tabulate(StudyTask):
-    """Write `tables/`: scores, comparisons, controls, heuristic, learning-curves, limits, controllability, findings."""
+    """Summarise the table of episodes and write `tables/`: results for the tasks that show them, all else as CSV."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
-        files: list[Path] = []
-
-        def table(name: str, head: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-            files.append(write(table_file(folder, name), list(head), [list(row) for row in rows]))
-
-        references = {body.name: References(study, folder, body) for body in study.robots}
-        table("scores", SCORES, _scores(study, folder, first, last, references))
-        table("comparisons", COMPARISONS, _comparisons(study, folder, last, references))
-        controls = [row for body in study.robots for row in _controls(study, folder, body, references[body.name])]
-        table("controls", CONTROLS, controls)
-        table("heuristic", HEAD, [row for body in study.robots for row in rows_beside_heuristic(study, folder, body)])
-        table("learning-curves", CURVES, _curves(study, folder))
-        limits = [(body.name, row) for body in study.robots for row in read_table(limits_file(folder, body.name))]
-        table("limits", ("robot", *LIMITS), ((robot, *row.values()) for robot, row in limits))
+        table = all_episodes(study, folder)
+        known = {body.name: References(study, folder, body, table) for body in study.robots}
+        limits = tuple(limit for body in study.robots for limit in read_limits(folder, body.name))
+        results = Results(
+            scores=tuple(_scores(study, table, first, last, known)),
+            comparisons=tuple(_comparisons(study, table, last, known)),
+            controls=tuple(row for body in study.robots for row in _controls(study, table, body, known[body.name])),
+            heuristic=tuple(row for body in study.robots for row in beside_heuristic(study, table, body)),
+            limits=limits,
+            findings=tuple(_findings(study, timeline, limits)),
+        )
+        files = [write_typed(results_file(folder), results)]
+        for name, kind in (
+            ("scores", Score),
+            ("comparisons", ComparedReturns),
+            ("controls", ControlReturns),
+            ("heuristic", BesideHeuristic),
+            ("limits", Limit),
+        ):
+            files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
+        told = ((finding.severity, finding.name, finding.sentence) for finding in results.findings)
+        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "sentence"), told))
+        files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
         if timeline is not None:
-            rows = (
-                (at_min, label, in_data, in_simulator)
-                for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True)
-                for label, in_data, in_simulator in zip(
-                    kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True
-                )
-            )
-            table("controllability", ("at_min", "condition", "above_median_in_data", "above_median_in_simulator"), rows)
-        noticed = [] if timeline is None else list(timeline.findings)
-        for robot, row in limits:
-            if row["best_return"] is None:
-                continue
-            of = (row[name] for name in ("best_return", "grid_error", "monte_carlo", "standard_error"))
-            where = f"{robot}, {named_mapping(row['mapping'], row['percentiles'])}, at {row['at_min']:g} min"
-            noticed += [replace(told, sentence=f"{where}: {told.sentence}") for told in bracket_findings(*of)]
-        noticed += [Finding(LEFT_OUT, "note", sentence) for sentence in left_out(study)]
-        table("findings", ("severity", "name", "sentence"), ((n.severity, n.name, n.sentence) for n in noticed))
-        return files
+            head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
+            files.append(write_table(table_file(folder, "controllability"), head, _controllability(timeline)))
+        with written_whole(table_file(folder, "episodes")) as beside:
+            table.to_csv(beside, index=False, lineterminator="\n")
+        return [*files, table_file(folder, "episodes")]
+
+
+def all_episodes(study: Study, folder: Path, robots: Iterable[Body] | None = None) -> DataFrame:
+    """The table of episodes of all robots, or of some."""
+    files = []
+    for body in study.robots if robots is None else robots:
+        files += [episodes_file(folder, body, condition) for condition in study.conditions]
+        files += [controls_file(folder, body, kind) for kind in kinds_of(study)]
+    return read_episodes(files)
+
+
+def _findings(study: Study, timeline: SimulatorTimeline | None, limits: Iterable[Limit]) -> Iterator[Finding]:
+    if timeline is not None:
+        yield from timeline.findings
+    for limit in limits:
+        where = f"{limit.robot}, {named_mapping(limit.mapping, limit.percentiles)}, at {limit.at_min:g} min"
+        for told in limit.findings():
+            yield replace(told, sentence=f"{where}: {told.sentence}")
+    for sentence in left_out(study):
+        yield Finding(LEFT_OUT, "note", sentence)
+
+
+def _controllability(timeline: SimulatorTimeline) -> Iterator[tuple[Any, ...]]:
+    for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True):
+        for told in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True):
+            yield at_min, *told
 
 
 class References:
-    """Random policies and best possible returns on a robot, for every mapping and minute."""
+    """Random policies and best possible returns on a robot, for every mapping and minute.
 
-    def __init__(self, study: Study, folder: Path, body: Body) -> None:
-        self._limits: dict[tuple[str, str, float], dict[str, Any]] = {
-            (row["mapping"], row["percentiles"], row["at_min"]): row for row in limits_of_all(folder, body.name)
+    Args:
+        table: of the robot's episodes.
+    """
+
+    def __init__(self, study: Study, folder: Path, body: Body, table: DataFrame) -> None:
+        self._limits = {
+            (limit.mapping, limit.percentiles, limit.at_min): limit for limit in limits_of_all(folder, body.name)
         }
+        random = table[(table["robot"] == body.name) & (table["agent"] == RANDOM) & ~table["over_time"]]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_minute: dict[float, list[float]] = defaultdict(list)
-            for row in read_table(controls_file(folder, body, kind)):
-                if row["control"] == "random":
-                    of_minute[row["at_min"]].append(row["return"])
-            for at_min, returns in of_minute.items():
-                self._random[kind.mapping, kind.percentiles, at_min] = float(np.mean(returns))
+            of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
+            for at_min, returns in of_kind.groupby("at_min")["return"]:
+                self._random[kind.mapping, kind.percentiles, at_min] = float(returns.to_numpy().mean())
 
     def random(self, condition: StudyCondition, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._of(self._random, condition, at_min)  # type: ignore[no-any-return]
+        return self._of(self._random, condition, at_min)
 
-    def limit(self, condition: StudyCondition, at_min: float) -> dict[str, Any] | None:
+    def limit(self, condition: StudyCondition, at_min: float) -> Limit | None:
         """The best possible return and how well it is known.
 
         None for a control, which can do nothing, and where conditions with few responses were left out of it.
         """
         if condition.delivery == "shuffled":
             return None
-        return self._of(self._limits, condition, at_min)  # type: ignore[no-any-return]
+        return self._of(self._limits, condition, at_min)
 
     def score(
         self, condition: StudyCondition, at_min: float, mean: float, against: str = "best_return"
     ) -> float | None:
-        """The normalised score, against the limit or another column of its table; None where nothing can be learned."""
+        """The normalised score, against the limit or another of its fields; None where nothing can be learned."""
         random, limit = self.random(condition, at_min), self.limit(condition, at_min)
-        if random is None or limit is None or limit[against] is None:
+        best = None if limit is None else getattr(limit, against)
+        if random is None or best is None:
             return None
         try:
-            return normalised_score(mean, random, limit[against])
+            return normalised_score(mean, random, best)
         except InvalidArgument:
             return None
 
     @staticmethod
-    def _of(known: dict[tuple[str, str, float], Any], condition: StudyCondition, at_min: float) -> Any:
+    def _of(known: Mapping[tuple[str, str, float], T], condition: StudyCondition, at_min: float) -> T | None:
         if condition.through_neurons:
             return known.get((condition.mapping, condition.percentiles, at_min))
         # Without neurons every minute is the same.
-        same = [v for (mapping, _, _), v in known.items() if mapping == condition.mapping]
-        return same[0] if same else None
+        return next((value for (mapping, _, _), value in known.items() if mapping == condition.mapping), None)
 
 
 def performances(
-    folder: Path, body: Body, condition: StudyCondition, at_min: float, episodes: int | None = None
+    table: DataFrame, robot: str, condition: StudyCondition, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
     """Each policy's mean return over its first `episodes` at a minute, or all: the paper's measure of a policy."""
-    returns: dict[str, list[float]] = defaultdict(list)
-    for row in read_table(episodes_file(folder, body, condition)):
-        if row["at_min"] == at_min:
-            returns[row["actor"]].append(row["return"])
-    return np.array([np.mean(of_policy[:episodes]) for of_policy in returns.values()])
-
-
-def named_mapping(mapping: str, percentiles: str) -> str:
-    """A mapping in words, with whether its percentiles are held."""
-    held = ", percentiles held" if percentiles == "first" else ""
-    return "without neurons" if mapping == "none" else f"{mapping}{held}"
+    of_robot = table[(table["robot"] == robot) & (table["arm"] == condition.name) & (table["agent"] == POLICY)]
+    return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
 
 
 def _scores(
-    study: Study, folder: Path, first: float, last: float, references: dict[str, References]
-) -> Iterable[tuple[Any, ...]]:
+    study: Study, table: DataFrame, first: float, last: float, references: Mapping[str, References]
+) -> Iterator[Score]:
     for body in study.robots:
         known = references[body.name]
         for condition in study.conditions:
             for at_min, episodes in sorted(study.minutes_of(condition, first, last).items()):
-                means = performances(folder, body, condition, at_min)
+                means = performances(table, body.name, condition, at_min)
+                mean = float(means.mean())
                 middle = interquartile_mean(means, within=body.robot().return_range)
-                limit = known.limit(condition, at_min) or {}
-                yield (
-                    body.name,
-                    condition.name,
-                    condition.mapping,
-                    at_min,
-                    len(means),
-                    episodes,
-                    float(means.mean()),
-                    float(means.std(ddof=1)) if len(means) > 1 else None,
-                    middle.value,
-                    middle.low,
-                    middle.high,
-                    known.random(condition, at_min),
-                    limit.get("best_return"),
-                    limit.get("grid_error"),
-                    limit.get("monte_carlo"),
-                    limit.get("standard_error"),
-                    limit.get("without_clock"),
-                    known.score(condition, at_min, float(means.mean())),
-                    known.score(condition, at_min, float(means.mean()), "without_clock"),
+                limit = known.limit(condition, at_min)
+                yield Score(
+                    robot=body.name,
+                    condition=condition.name,
+                    mapping=condition.mapping,
+                    at_min=at_min,
+                    policies=len(means),
+                    episodes=episodes,
+                    mean_return=mean,
+                    standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
+                    interquartile_mean=middle.value,
+                    low_95=middle.low,
+                    high_95=middle.high,
+                    random=known.random(condition, at_min),
+                    limit=None if limit is None else limit.best_return,
+                    limit_grid_error=None if limit is None else limit.grid_error,
+                    limit_run=None if limit is None else limit.monte_carlo,
+                    limit_run_standard_error=None if limit is None else limit.standard_error,
+                    limit_without_clock=None if limit is None else limit.without_clock,
+                    normalised_score=known.score(condition, at_min, mean),
+                    score_without_clock=known.score(condition, at_min, mean, "without_clock"),
                 )
 
 
@@ -274,98 +235,106 @@ def outcome_of(told: Comparison) -> str:
     return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
 
 
-def _limit_error(limit: dict[str, Any]) -> float | None:
+def _limit_error(limit: Limit | None) -> float | None:
     """How far the best possible return may lie from its value: by the grid, or down to the controller's return."""
-    if not limit:
+    if limit is None or limit.grid_error is None:
         return None
-    names = ("best_return", "grid_error", "monte_carlo", "standard_error")
-    parted = bracket_findings(*(limit[name] for name in names))
-    error: float = max([limit["grid_error"], *(abs(each.value or 0.0) for each in parted)])
-    return error
+    return max(limit.grid_error, *(abs(each.value or 0.0) for each in limit.findings()), 0.0)
 
 
-def _comparisons(study: Study, folder: Path, last: float, references: dict[str, References]) -> list[tuple[Any, ...]]:
+def _comparisons(
+    study: Study, table: DataFrame, last: float, references: Mapping[str, References]
+) -> Iterator[ComparedReturns]:
     made = []
     for compared in study.comparisons:
         at_min = last if compared.at_min is None else compared.at_min
-        first, second = study.condition(compared.first), study.condition(compared.second)
+        sides = study.condition(compared.first), study.condition(compared.second)
         for body in study.robots:
-            a, b = (performances(folder, body, side, at_min, compared.episodes) for side in (first, second))
-            made.append((compared, body, first, second, at_min, a, b, compare(a, b)))
-    corrected = holm({f"{compared.name}/{body.name}": told.p_normal for compared, body, *_, told in made})
-    rows = []
-    for compared, body, first, second, at_min, a, b, told in made:
-        known = references[body.name]
-        printed = PRINTED.get((compared.name, body.name)) if study.paper else None
+            a, b = (performances(table, body.name, side, at_min, compared.episodes) for side in sides)
+            made.append((compared, body.name, sides, at_min, a, b, compare(a, b)))
+    corrected = holm({f"{compared.name}/{robot}": told.p_normal for compared, robot, *_, told in made})
+    for compared, robot, (first, second), at_min, a, b, told in made:
+        known = references[robot]
+        printed = PRINTED.get((compared.name, robot)) if study.paper else None
         outcome = outcome_of(told)
-        limits = [known.limit(condition, at_min) or {} for condition in (first, second)]
-        rows.append(
-            (
-                compared.name,
-                body.name,
-                first.name,
-                second.name,
-                at_min,
-                compared.episodes,
-                len(a),
-                float(a.mean()),
-                float(b.mean()),
-                known.score(first, at_min, float(a.mean())),
-                known.score(second, at_min, float(b.mean())),
-                known.random(second, at_min),
-                limits[0].get("best_return"),
-                limits[1].get("best_return"),
-                _limit_error(limits[0]),
-                _limit_error(limits[1]),
-                told.u,
-                told.p_normal,
-                told.p_exact,
-                corrected[f"{compared.name}/{body.name}"],
-                told.effect.value,
-                told.effect.low,
-                told.effect.high,
-                outcome,
-                None if printed is None else printed.u,
-                None if printed is None else printed.p,
-                None if printed is None else AS_IN_PAPER[outcome],
-            )
+        limits = [known.limit(condition, at_min) for condition in (first, second)]
+        yield ComparedReturns(
+            comparison=compared.name,
+            robot=robot,
+            first=first.name,
+            second=second.name,
+            at_min=at_min,
+            episodes=compared.episodes,
+            n=len(a),
+            mean_first=float(a.mean()),
+            mean_second=float(b.mean()),
+            score_first=known.score(first, at_min, float(a.mean())),
+            score_second=known.score(second, at_min, float(b.mean())),
+            random_second=known.random(second, at_min),
+            limit_first=None if limits[0] is None else limits[0].best_return,
+            limit_second=None if limits[1] is None else limits[1].best_return,
+            limit_error_first=_limit_error(limits[0]),
+            limit_error_second=_limit_error(limits[1]),
+            u=told.u,
+            p_normal=told.p_normal,
+            p_exact=told.p_exact,
+            p_holm=corrected[f"{compared.name}/{robot}"],
+            effect=told.effect.value,
+            effect_low_95=told.effect.low,
+            effect_high_95=told.effect.high,
+            outcome=outcome,
+            paper_u=None if printed is None else printed.u,
+            paper_p=None if printed is None else printed.p,
+            as_in_paper=None if printed is None else AS_IN_PAPER[outcome],
         )
-    return rows
 
 
-def _controls(study: Study, folder: Path, body: Body, known: References) -> Iterable[tuple[Any, ...]]:
+def _controls(study: Study, table: DataFrame, body: Body, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        returns: dict[tuple[float, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-        for row in read_table(controls_file(folder, body, kind)):
-            returns[row["at_min"], row["control"]][row["actor"] or ""].append(row["return"])
-        for at_min in sorted({minute for minute, _ in returns}):
+        arm = named_mapping(kind.mapping, kind.percentiles)
+        of_kind = table[(table["robot"] == body.name) & (table["arm"] == arm) & (table["agent"] != POLICY)]
+        for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
             for condition in study.conditions:
                 if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles):
-                    means = performances(folder, body, condition, at_min)
+                    means = performances(table, body.name, condition, at_min)
                     if condition.trained and len(means):
                         rows.append((f"{TRAINED}{condition.name}", len(means), means))
-            for (minute, control), actors in returns.items():
-                if minute == at_min:
-                    means = np.array([np.mean(of_actor) for of_actor in actors.values()])
-                    # Over actors, as each is one sample; a control of one actor has its episodes for samples.
-                    rows.append(
-                        (control, len(means), means if len(means) > 1 else np.array(next(iter(actors.values()))))
-                    )
-            limit = known.limit(kind, at_min) or {}
-            for name, actors_, samples in rows:
+            for agent, of_agent in of_minute.groupby("agent", sort=False):
+                means = mean_returns(of_agent)
+                # Over actors, as each is one sample; a control of one actor has its episodes for samples.
+                rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
+            limit = known.limit(kind, at_min)
+            for name, actors, samples in rows:
                 mean = float(samples.mean())
-                error = float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
-                references = (known.random(kind, at_min), limit.get("best_return"), known.score(kind, at_min, mean))
-                yield body.name, kind.mapping, kind.percentiles, at_min, name, actors_, mean, error, *references
+                yield ControlReturns(
+                    robot=body.name,
+                    mapping=kind.mapping,
+                    percentiles=kind.percentiles,
+                    at_min=at_min,
+                    control=name,
+                    actors=actors,
+                    mean_return=mean,
+                    standard_error=float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None,
+                    random=known.random(kind, at_min),
+                    limit=None if limit is None else limit.best_return,
+                    normalised_score=known.score(kind, at_min, mean),
+                )
 
 
-def _curves(study: Study, folder: Path) -> Iterable[tuple[Any, ...]]:
+def learning_of(
+    study: Study, folder: Path, body: Body, condition: StudyCondition
+) -> Float64[np.ndarray, "policies parts 3"]:
+    """The learning curves of a condition's policies, as in `Policy.learning_curve`."""
+    out = policies_folder(folder, body, condition)
+    curves = [Policy.load(out / f"p{i}.safetensors").learning_curve for i in range(study.policies)]
+    return np.stack(curves).astype(np.float64)
+
+
+def _curves(study: Study, folder: Path) -> Iterator[tuple[Any, ...]]:
     for body in study.robots:
-        for condition in study.conditions:
-            out = policies_folder(folder, body, condition)
-            for i in range(study.policies if condition.trained else 0):
-                curve = Policy.load(out / f"p{i}.safetensors").learning_curve
-                for iterations, episodes, mean_return in curve.tolist():
-                    mean = None if np.isnan(mean_return) else mean_return
-                    yield body.name, condition.name, f"p{i}", int(iterations), int(episodes), mean
+        for condition in (condition for condition in study.conditions if condition.trained):
+            for i, curve in enumerate(learning_of(study, folder, body, condition).tolist()):
+                for iterations, episodes, mean in curve:
+                    told = int(iterations), int(episodes), None if np.isnan(mean) else mean
+                    yield body.name, condition.name, f"p{i}", *told

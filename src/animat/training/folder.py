@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import json
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 
 from animat.coding.mapping import check_mapping, expect_loadable_mapping
-from animat.differences import first_difference
+from animat.differences import description_in, fingerprint_of, first_difference, of_another
 from animat.errors import InvalidFile, Mismatch
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
@@ -56,11 +55,10 @@ def describe(training: Training, timeline: SimulatorTimeline | None, sources: Se
     }
     # By way of JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))
-    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode())
-    for leaf in jax.tree.leaves(timeline.simulators if timeline else ()):
-        digest.update(np.ascontiguousarray(leaf).tobytes())
+    leaves = jax.tree.leaves(timeline.simulators if timeline else ())
+    fingerprint = fingerprint_of(manifest, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # Names of files are told but do not decide: the same recordings in another place are the same.
-    return manifest | {"sources": list(sources), "fingerprint": digest.hexdigest()}
+    return manifest | {"sources": list(sources), "fingerprint": fingerprint}
 
 
 def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
@@ -84,7 +82,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
         unknown = ("simulators", "sources", "fingerprint", *(("duration_min",) if as_long_as_recordings else ()))
         if difference := _first_difference(found, describe(training, None), unknown):
-            raise _of_another(folder, difference)
+            raise of_another(folder, "training", difference)
 
 
 def is_finished(training: Training, folder: Path) -> bool:
@@ -110,19 +108,14 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     """
     found = _description_in(folder)
     if found is not None and found["fingerprint"] != manifest["fingerprint"]:
-        raise _of_another(folder, _first_difference(found, manifest, _NOT_TOLD) or "other responses")
+        difference = _first_difference(found, manifest, _NOT_TOLD) or "other responses"
+        raise of_another(folder, "training", difference)
     return found is not None
 
 
 def _description_in(folder: Path) -> dict[str, Any] | None:
     """What a folder says it holds; None if it is free."""
-    path = folder / MANIFEST
-    if path.exists():
-        try:
-            found: dict[str, Any] = json.loads(path.read_text())
-            _ = found["fingerprint"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InvalidFile(f"{path}: expected a training's description, got a file that cannot be read") from error
+    if (found := description_in(folder / MANIFEST, "training")) is not None:
         return found
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
@@ -135,13 +128,6 @@ def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring:
     # What follows from the robot, such as the usual iterations, is not what differs.
     there, now = (each.get("training", {}).get("robot", {}).get("name") for each in (found, manifest))
     return first_difference(there, now, "training.robot.name") or first_difference(found, manifest, ignoring=ignoring)
-
-
-def _of_another(folder: Path, difference: str) -> Mismatch:
-    return Mismatch(
-        f"{folder}: expected a folder of this training, got one of another ({difference}); "
-        "give another folder, or remove this one"
-    )
 
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:

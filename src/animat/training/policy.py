@@ -144,6 +144,11 @@ class Policy:
         return {name: told[name] for name in FITTED if name in told}
 
     @property
+    def recorded_at_min(self) -> tuple[float, ...]:
+        """The recordings that those simulators were made of; none where that is not known."""
+        return tuple((self.provenance.get("simulators") or {}).get("recorded_at_min", ()))
+
+    @property
     def _trained(self) -> Dict[str, Any]:
         told = self.provenance.get("training")
         return told if isinstance(told, Dict) else {}

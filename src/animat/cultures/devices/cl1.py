@@ -24,7 +24,7 @@ from animat.cultures.pace import Pace
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
-from animat.recordings.recording import Channels
+from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import Phase, Pulse
@@ -107,7 +107,7 @@ class CL1Culture(Culture):
         if jitter_tolerance_ms is not None and not jitter_tolerance_ms >= 0:
             raise InvalidArgument(f"jitter_tolerance_ms: expected 0 ms or more, or None, got {jitter_tolerance_ms}")
         self._patterns = _drawn(seed) if patterns is None else _checked(patterns)
-        self._pattern_seed = str(seed) if patterns is None else "none: they were given"
+        self._seed = seed if patterns is None else None
         self._ticks_per_s = ticks_per_s
         self._margin_frames = round(margin_ms * 1e-3 * FRAMES_PER_S)
         self._jitter: dict[str, Any] = {"ignore_jitter": True}
@@ -164,6 +164,11 @@ class CL1Culture(Culture):
         return float(FRAMES_PER_S)
 
     @property
+    def recorded_as(self) -> RecordedCulture | None:
+        """The seed of its patterns, where they were drawn."""
+        return None if self._seed is None else RecordedCulture("cl1", self._seed)
+
+    @property
     def provenance(self) -> dict[str, str]:
         """The device by its own names, the SDK's version, and whether it is a simulator."""
         self._opened_neurons()
@@ -178,7 +183,7 @@ class CL1Culture(Culture):
             # The words that recordings have: a series goes on only where they stay, whatever the module's name.
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
-            "pattern_seed": self._pattern_seed,
+            "pattern_seed": "none: they were given" if self._seed is None else str(self._seed),
             **named,
         }
 

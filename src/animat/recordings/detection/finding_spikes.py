@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from animat.progress import Progress, Silent
-from animat.recordings.detection.band import MARGIN_S, check_band
-from animat.recordings.detection.engines import SCIPY, Steps, steps_of
+from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
 from animat.recordings.detection.noise import median_noise_uv
 from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
 from animat.recordings.detection.settings import Detection
+from animat.recordings.detection.troughs import find_troughs
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
 
@@ -35,14 +35,12 @@ class FoundSpikes:
         time_s: at their troughs, on the recording's clock, shape (spikes,).
         channel: row of the channel table, shape (spikes,).
         noise_uv: standard deviation of each channel's noise, shape (channels,).
-        engine: what filtered and found them.
         findings: what was noticed.
     """
 
     time_s: Float64[np.ndarray, " spikes"]
     channel: Int64[np.ndarray, " spikes"]
     noise_uv: Float32[np.ndarray, " channels"]
-    engine: str
     findings: tuple[Finding, ...]
 
 
@@ -67,23 +65,21 @@ def find_spikes(
         progress: told after each piece.
 
     Raises:
-        InvalidArgument: for a band that the sampling rate does not hold, or SpikeInterface where it is not installed.
+        InvalidArgument: for a band that the sampling rate does not hold.
         InvalidFile: if samples cannot be read.
     """
     settings, progress = settings or Detection(), progress or Silent()
     if settings.band_hz is not None:
         check_band(settings.band_hz, traces.sampling_rate_hz)
-    steps = steps_of(settings.engine)
     stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
     workers = workers or len(os.sched_getaffinity(0))
     noise_uv = _noise_uv(traces, stimulus, settings, workers)
-    sample, channel, saturation = _detect(traces, stimulus, noise_uv, settings, steps, workers, progress)
+    sample, channel, saturation = _detect(traces, stimulus, noise_uv, settings, workers, progress)
     order = np.lexsort((channel, sample))
     return FoundSpikes(
         time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
-        engine=steps.name,
         findings=tuple(_findings(noise_uv, len(stimulus), saturation, settings)),
     )
 
@@ -135,11 +131,11 @@ def _noise_uv(
 
 
 def _filtered(
-    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float, steps: Steps = SCIPY
+    rows: Float32[np.ndarray, "channels samples"], settings: Detection, rate_hz: float
 ) -> Float32[np.ndarray, "channels samples"]:
     if settings.band_hz is None:
         return np.asarray(rows - np.median(rows, axis=1, keepdims=True), dtype=np.float32)
-    return steps.band_pass(rows, settings.band_hz, rate_hz)
+    return band_pass(rows, settings.band_hz, rate_hz)
 
 
 def _detect(
@@ -147,7 +143,6 @@ def _detect(
     stimulus: Int64[np.ndarray, " stimuli"],
     noise_uv: Float32[np.ndarray, " channels"],
     settings: Detection,
-    steps: Steps,
     workers: int,
     progress: Progress,
 ) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray]:
@@ -160,8 +155,7 @@ def _detect(
     def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         found = [
-            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings, steps)
-            for columns in blocks(len(noise_uv))
+            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings) for columns in blocks(len(noise_uv))
         ]
         saturation = np.zeros((np.count_nonzero(piece.owned), 2))
         for _, _, of_block in found:
@@ -200,13 +194,12 @@ def _of_block(
     apart: int,
     rate_hz: float,
     settings: Detection,
-    steps: Steps,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cleaned = piece.cleaned(columns, noise_uv, rate_hz, settings)
-    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz, steps)
+    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
     if cleaned.is_blank is not None:
         filtered[cleaned.is_blank] = 0.0
-    row, sample = steps.find_troughs(
+    row, sample = find_troughs(
         filtered, depth_uv[columns], apart, piece.margin, piece.margin + piece.stop - piece.start
     )
     saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
 from animat.errors import InvalidArgument
 from animat.records import Number, Positive, record
-
-Engine = Literal["auto", "scipy", "spikeinterface"]
-
 
 Milliseconds = Annotated[Number, Field(ge=0, le=1000)]
 
@@ -28,8 +25,6 @@ class Detection:
         saturation_uv: at which an amplifier saturates; None: where the trace is flat, far from where it was.
         recovery_ms: how long after a stimulus its artefact is followed.
         chunk_s: traces read at a time; with 1,024 channels at 20 kHz 0.5 s take some 200 MB a core.
-        engine: what filters and finds: `"spikeinterface"`, `"scipy"`, or `"auto"`, SpikeInterface where it is
-            installed. Everything else is the same for both; scipy takes a third to a half of the time.
 
     Raises:
         InvalidArgument: naming the setting, what was expected and what came.
@@ -42,7 +37,6 @@ class Detection:
     saturation_uv: Positive | None = None
     recovery_ms: Milliseconds = 20.0
     chunk_s: Annotated[Number, Field(ge=0.1, le=60)] = 0.5
-    engine: Engine = "auto"
 
     def __post_init__(self) -> None:
         if self.band_hz is not None and not self.band_hz[0] < self.band_hz[1]:

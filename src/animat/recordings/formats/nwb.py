@@ -33,6 +33,7 @@ from animat.recordings.formats.nwb_layout import (
 from animat.recordings.formats.nwb_of_others import read_other_nwb
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.told import from_words
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
@@ -177,7 +178,7 @@ def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Rec
         duration_s=_cell(file, "duration_s", float),
         start_min=_cell(file, "start_min", float),
         presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
-        provenance=_provenance(file),
+        **from_words(_words(file)),
     )
 
 
@@ -216,7 +217,7 @@ def _channels(file: Hdf5File) -> Channels:
     )
 
 
-def _provenance(file: Hdf5File) -> dict[str, str]:
+def _words(file: Hdf5File) -> dict[str, str]:
     if not file.has(PROVENANCE_TABLE):
         return {}
     keys, words = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))

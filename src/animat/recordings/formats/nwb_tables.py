@@ -19,6 +19,7 @@ from pynwb.misc import Units
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.told import in_words
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
@@ -49,7 +50,7 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
         recording: all but its spikes are taken.
         spike_counts: of each channel: their times are for the caller to write.
     """
-    words = {_text("provenance", k): _text("provenance", v) for k, v in recording.provenance.items()}
+    words = {_text("provenance", k): _text("provenance", v) for k, v in in_words(recording).items()}
     nwb = NWBFile(
         session_description=words.get(
             "session_description", "Spikes of a neuronal culture on a multi-electrode array, under stimulation."

@@ -26,7 +26,6 @@ from animat.recordings.findings import Finding, left_out_of
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, plain_column
 from animat.recordings.formats.npz import load_columns
 from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
-from animat.recordings.noticed import as_provenance
 from animat.recordings.response_table import Kind, ResponseTable
 
 KINDS: tuple[Kind, ...] = ("count", "rate_hz")
@@ -237,12 +236,12 @@ def _table(
     has_times = "stimulus_time_s" in columns
     times = np.asarray(columns.pop("stimulus_time_s", np.arange(len(values), dtype=np.float64)))
     plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, channel_label=labels, **columns)
-    recording = plain.to_recording({}, tuple(findings))
     if len(values) != len(times):
         raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
     if not has_times:
         order = "the table has no times of stimuli: its rows are taken for the order of presentation"
-        provenance = provenance | as_provenance([Finding("stimulus-times-unknown", "note", order)])
+        findings = [Finding("stimulus-times-unknown", "note", order), *findings]
+    recording = plain.to_recording({}, tuple(findings))
     return ResponseTable(
         values=np.asarray(values, dtype=np.float64)[np.argsort(times, kind="stable")],
         kind=kind,
@@ -253,4 +252,5 @@ def _table(
         start_min=recording.start_min,
         presentation=recording.presentation,
         provenance={**provenance, **recording.provenance},
+        findings=recording.findings,
     )

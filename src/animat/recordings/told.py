@@ -1,0 +1,40 @@
+"""What is told of a recording beside its arrays: as fields in a program, as words by their keys in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, get_args
+
+from animat.recordings.findings import Finding, Severity
+from animat.recordings.recording import RecordedCulture, Recording
+from animat.stimulation.protocol import Protocol
+
+
+def in_words(recording: Recording) -> dict[str, str]:
+    """What a file keeps: the provenance, and the fields that `from_words` takes back out."""
+    words = dict(recording.provenance)
+    if recording.protocol is not None:
+        words["protocol"] = recording.protocol.to_json()
+    return words | {f"{finding.severity}: {finding.name}": finding.sentence for finding in recording.findings}
+
+
+def from_words(words: Mapping[str, str]) -> dict[str, Any]:
+    """A recording's `provenance`, `protocol`, `culture` and `findings`, from the words of a file.
+
+    Raises:
+        InvalidArgument: for a protocol that is none.
+    """
+    provenance, findings, protocol = dict[str, str](), list[Finding](), None
+    for key, sentence in words.items():
+        severity, colon, name = key.partition(": ")
+        if key == "protocol":
+            protocol = Protocol.from_json(sentence)
+        elif colon and severity in get_args(Severity):
+            findings.append(Finding(name, severity, sentence))  # type: ignore[arg-type]
+        else:
+            provenance[key] = sentence
+    culture = None
+    for kind, begins, seed in (("virtual", "virtual culture", "seed"), ("cl1", "CL1", "pattern_seed")):
+        if words.get("source", "").startswith(begins) and words.get(seed, "").isdecimal():
+            culture = RecordedCulture(kind, int(words[seed]))
+    return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}

@@ -1,0 +1,82 @@
+"""The one table of episodes: a row an episode, whoever acted; returns of every kind are summarised from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.evaluation.rollouts import Episodes
+from animat.studies.results import read_arrays, write_arrays
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
+
+COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "return", "iterations", "ended")
+"""Of the table:
+
+- robot: its name in the study.
+- arm: what it was run in: a condition's name, or of controls what they act through (`named_mapping`).
+- agent: `POLICY`, or the control's name.
+- actor: which of several, from 0: of policies p0, p1, ...
+- at_min: the recording that answers.
+- over_time: whether it is one of the few episodes at every recording.
+- episode: from 0.
+- return, iterations: of the episode.
+- ended: `terminated` by itself, or `truncated` at the episode limit.
+"""
+POLICY = "policy"
+RANDOM = "random"
+
+
+def tabulated(
+    ran: Episodes, *, robot: str, arm: str, at_min: float, agent: str = POLICY, over_time: bool = False
+) -> DataFrame:
+    """Episodes that were run together, as rows of the table."""
+    from pandas import DataFrame
+
+    actor, episode = (index.ravel() for index in np.indices(ran.returns.shape))
+    told = {
+        "robot": robot,
+        "arm": arm,
+        "agent": agent,
+        "actor": actor,
+        "at_min": at_min,
+        "over_time": over_time,
+        "episode": episode,
+        "return": ran.returns.ravel(),
+        "iterations": ran.lengths.ravel(),
+        "ended": np.where(ran.terminated, "terminated", "truncated").ravel(),
+    }
+    return DataFrame(told, columns=list(COLUMNS))
+
+
+def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
+    """Write parts of the table as one file, complete or absent: each column an array, and the same bytes always."""
+    import pandas as pd
+
+    table = pd.concat(parts)
+    columns = {
+        name: column.to_numpy(str if pd.api.types.is_string_dtype(column) else None) for name, column in table.items()
+    }
+    return write_arrays(path, columns)
+
+
+def read_episodes(paths: Iterable[Path]) -> DataFrame:
+    """The table, put together from its files; raises InvalidFile if one cannot be read."""
+    import pandas as pd
+
+    return pd.concat([pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths], ignore_index=True)
+
+
+def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.ndarray, " actors"]:
+    """Each actor's mean return over its first episodes, or all: what the paper calls a policy's performance."""
+
+    def mean(of_actor: Series) -> float:
+        return float(of_actor.to_numpy()[:episodes].mean())
+
+    means: Float64[np.ndarray, " actors"] = rows.groupby("actor")["return"].apply(mean).to_numpy(np.float64)
+    return means

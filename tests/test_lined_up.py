@@ -1,0 +1,19 @@
+"""Tables for a terminal."""
+
+from __future__ import annotations
+
+from animat.lined_up import lined_up
+
+
+def test_words_stand_to_the_left_and_numbers_under_the_end_of_their_columns_name() -> None:
+    assert lined_up(
+        ["", "mean", "p", ""], [["policies", "96.0", "", ""], ["random", "-80.25", "0.001", "any action"]]
+    ) == [
+        "              mean      p",
+        "  policies    96.0",
+        "  random    -80.25  0.001  any action",
+    ]
+
+
+def test_a_table_without_rows_is_its_head() -> None:
+    assert lined_up(["name", "mean", "meaning"], []) == ["  name  mean  meaning"]
