@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,17 +26,28 @@ install_import_hook(
     "beartype.beartype",
 )
 
-from animat.compilation import keep_compilations, user_cache  # noqa: E402
 from animat.cultures import holding  # noqa: E402
+
+SOON_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""A sixth of the time to compile a training, which then takes three times as long, and here lasts for moments."""
 
 # The same random examples each time; others with --hypothesis-profile=default.
 settings.register_profile("the same", derandomize=True)
 settings.load_profile("the same")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile soon, in this process and all that it starts; the oracles train for minutes, compiled as users are."""
+    if config.getoption("markexpr") == "not oracle":
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SOON_COMPILED}"
+
+
 @pytest.fixture(scope="session", autouse=True)
 def caches() -> Iterator[None]:
     """Compile each program once a machine, not once a run of the tests; libraries that want a cache have one."""
+    # Not before XLA's flags are set.
+    from animat.compilation import keep_compilations, user_cache
+
     keep_compilations()
     with user_cache():
         yield
@@ -68,3 +80,24 @@ def in_the_foreground() -> Iterator[None]:
     yield
     for number, handler in zip((signal.SIGINT, signal.SIGHUP), before, strict=True):
         signal.signal(number, handler)
+
+
+class InThisProcess(ThreadPoolExecutor):
+    """In place of processes, each on a core: one thread, in which what was imported and traced before is at hand."""
+
+    def __init__(self, cores: Sequence[int]) -> None:
+        super().__init__(1)
+
+
+@pytest.fixture(scope="module")
+def in_this_process() -> Iterator[None]:
+    """Jobs are done here, for tests of what comes out of them; processes have tests of their own (`test_pinned`)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("animat.execution.jobs.PinnedProcesses", InThisProcess)
+        yield
+
+
+@pytest.fixture
+def few_redrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Predictions with intervals from few simulators, for tests of what else a closed loop says and does."""
+    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 4)

@@ -86,15 +86,15 @@ def medians(responses: Responses) -> list[float]:
     return [float(np.median(responses.rates_of(i))) for i in range(len(responses.conditions))]
 
 
-def measure(seed: int) -> Recorded:
-    """All figures of one seed; about 1,800 s of culture."""
+def measure(seed: int, recordings: int = 15) -> Recorded:
+    """All figures of one seed; about 1,800 s of culture, and the ten minutes from one recording to the next."""
     with VirtualCulture(seed) as culture:
         selection = culture.selection
         spontaneous = culture.advance(SPONTANEOUS_S)
         rate_hz = len(spontaneous.time_s) / SPONTANEOUS_S / len(culture.channels)
         bursts_ms = network_bursts_ms(spontaneous, len(culture.channels))
         began_s, series = culture.now_s, []
-        for session in range(15):
+        for session in range(recordings):
             culture.rest(max(0.0, began_s + 600 * session - culture.now_s))
             series.append(extract_responses(culture.record(PAPER, session)))
     first = series[0]

@@ -33,6 +33,8 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 QUICK = ["--policies", "2", "--iterations", "2000"]
 
 
@@ -111,7 +113,7 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert main([*train, "--json"]) == 0
     assert set(last_json(capsys.readouterr().out)["returns"]) == {"p0", "p1"}  # type: ignore[call-overload]
 
-    evaluate = ["evaluate", str(trained), "--recordings", str(series), "--at-min", "0", "--episodes", "10"]
+    evaluate = ["evaluate", str(trained), "--recordings", str(series), "--at-min", "0"]
     assert main([*evaluate, "--json"]) == 0
     told = last_json(capsys.readouterr().out)
     assert told["recorded_at_min"] == 0.0
@@ -132,7 +134,7 @@ def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
 
     monkeypatch.setattr("animat.evaluation.table.best_return", rough)
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
-    command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0", "--episodes", "10"]
+    command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0"]
     assert main([*command, "--limit", "--json"]) == 0
     said = capsys.readouterr().out
     told: dict[str, Any] = last_json(said)
@@ -509,7 +511,7 @@ def test_a_real_culture_trains_a_controller_of_two_conditions(
     choice = ["--recordings", organoid, "--conditions", "interval:5,10+-25%"]
     assert main(["train", "cartpole", *choice, *QUICK, "--out", str(tmp_path)]) == 0
     assert "the conditions differ by 0.16 at most" in capsys.readouterr().err
-    assert main(["evaluate", str(tmp_path), *choice, "--episodes", "10", "--json"]) == 0
+    assert main(["evaluate", str(tmp_path), *choice, "--json"]) == 0
     rows = last_json(capsys.readouterr().out)["rows"]
     assert [row["name"] for row in rows][2:4] == ["constant 5 Hz", "constant 10 Hz"]  # type: ignore[attr-defined, index]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import numba
 import pytest
 
 import animat
+from animat import compilation
 from animat.compilation import cache_folder, kept_njit
 
 
@@ -35,6 +37,20 @@ def test_nobody_s_home_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "home", unknown)
     with pytest.raises(OSError, match="Not a directory"):
         cache_folder().mkdir(parents=True)
+
+
+@pytest.mark.parametrize(
+    ("flags", "level"), [(None, 1), ("--xla_dump_to=x", 1), ("--xla_backend_optimization_level=2", None)]
+)
+def test_what_xla_flags_say_is_left_as_it_is(
+    flags: str | None, level: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    if flags is not None:
+        monkeypatch.setenv("XLA_FLAGS", flags)
+    options = runpy.run_path(compilation.__file__)["FAST_TO_COMPILE"]
+    assert options.get("xla_backend_optimization_level") == level
+    assert options["xla_cpu_parallel_codegen_split_count"] == 1
 
 
 COMPILING = """

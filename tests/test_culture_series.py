@@ -34,8 +34,8 @@ record(sys.argv[2], sessions=int(sys.argv[3]))
 """
 
 
-def record(folder: str | Path, *, sessions: int = 4, seed: int = 1, protocol: Protocol = SHORT) -> list[Path]:
-    return record_virtual_series(lambda: small_culture(seed), protocol, folder, sessions=sessions, interval_min=2.0)
+def record(folder: str | Path, *, sessions: int = 3, seed: int = 1, protocol: Protocol = SHORT) -> list[Path]:
+    return record_virtual_series(lambda: small_culture(seed), protocol, folder, sessions=sessions, interval_min=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +56,10 @@ def copied(files: list[Path], to: Path) -> Path:
 
 def test_a_series_has_its_recordings_at_their_minutes(undisturbed: list[Path]) -> None:
     folder = undisturbed[0].parent
-    assert [file.name for file in undisturbed] == [f"recording_{m:04}_min.nwb" for m in (0, 2, 4, 6)]
+    assert [file.name for file in undisturbed] == [f"recording_{m:04}_min.nwb" for m in (0, 1, 2)]
     recordings = read_recordings(folder)
-    assert [recording.start_min for recording in recordings] == [0.0, 2.0, 4.0, 6.0]
-    assert len({tuple(recording.stimuli.pattern.tolist()) for recording in recordings}) == 4
+    assert [recording.start_min for recording in recordings] == [0.0, 1.0, 2.0]
+    assert len({tuple(recording.stimuli.pattern.tolist()) for recording in recordings}) == 3
     selection = Selection.load(folder / "selection.json")
     assert selection.recording.tolist() == recordings[0].channels.electrode.tolist()
     assert sorted(p.name for p in folder.iterdir() if p.suffix != ".nwb") == [STATE_FILE, "selection.json"]
@@ -67,7 +67,7 @@ def test_a_series_has_its_recordings_at_their_minutes(undisturbed: list[Path]) -
 
 def test_it_is_longer_when_asked_again_for_more(undisturbed: list[Path], tmp_path: Path) -> None:
     record(tmp_path / "a", sessions=1)
-    record(tmp_path / "a", sessions=3)
+    record(tmp_path / "a", sessions=2)
     assert same(record(tmp_path / "a"), undisturbed)
 
 
@@ -85,10 +85,10 @@ def test_what_is_there_is_kept_and_nothing_is_done_again(
     "lost",
     [
         [STATE_FILE],
-        ["recording_0006_min.nwb"],
         ["recording_0002_min.nwb"],
+        ["recording_0001_min.nwb"],
         ["recording_0000_min.nwb", STATE_FILE],
-        ["recording_0004_min.nwb", "recording_0006_min.nwb", "selection.json"],
+        ["recording_0001_min.nwb", "recording_0002_min.nwb", "selection.json"],
     ],
 )
 def test_whatever_is_lost_comes_back_the_same(undisturbed: list[Path], tmp_path: Path, lost: list[str]) -> None:
@@ -101,7 +101,7 @@ def test_whatever_is_lost_comes_back_the_same(undisturbed: list[Path], tmp_path:
 def test_a_state_that_is_behind_its_recordings_catches_up(undisturbed: list[Path], tmp_path: Path) -> None:
     # As if killed between a recording and the state after it.
     record(tmp_path / "behind", sessions=1)
-    for file in undisturbed[1:3]:
+    for file in undisturbed[1:2]:
         shutil.copy(file, tmp_path / "behind")
     assert same(record(tmp_path / "behind"), undisturbed)
 
@@ -112,7 +112,7 @@ def test_killed_after_the_last_recording_its_state_is_made_too(
     save_state = VirtualCulture.save_state
 
     def killed_at_the_last(self: VirtualCulture, path: Path, *, sessions: int) -> None:
-        if sessions == 4:
+        if sessions == 3:
             raise KeyboardInterrupt
         save_state(self, path, sessions=sessions)
 
@@ -120,7 +120,7 @@ def test_killed_after_the_last_recording_its_state_is_made_too(
         patched.setattr(VirtualCulture, "save_state", killed_at_the_last)
         with pytest.raises(KeyboardInterrupt):
             record(tmp_path / "series")
-    assert len(list((tmp_path / "series").glob("*.nwb"))) == 4
+    assert len(list((tmp_path / "series").glob("*.nwb"))) == 3
     (tmp_path / "series" / "selection.json").unlink()
     assert same(record(tmp_path / "series"), undisturbed)
     for name in (STATE_FILE, "selection.json"):
@@ -144,7 +144,7 @@ def test_a_series_that_needs_its_state_is_recorded_again_to_have_it(undisturbed:
 
     def again() -> list[Path]:
         return record_virtual_series(
-            lambda: small_culture(1), SHORT, folder, sessions=4, interval_min=2.0, needs_state=True
+            lambda: small_culture(1), SHORT, folder, sessions=3, interval_min=1.0, needs_state=True
         )
 
     assert same(again(), undisturbed)
@@ -162,7 +162,7 @@ def test_a_state_after_something_else_is_not_gone_on_from(undisturbed: list[Path
         culture.save_state(folder / STATE_FILE)
     assert same(record(folder), undisturbed)
     with pytest.raises(Mismatch, match=r"culture.state: expected the state of a series .* choose another folder"):
-        record(folder, sessions=5)
+        record(folder, sessions=4)
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused(undisturbed: list[Path]) -> None:
@@ -213,10 +213,10 @@ def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path]
     with pytest.raises(Mismatch, match="protocol"):
         record(folder, protocol=Protocol((20.0, 80.0), patterns=5, presentations=9, setup_s=0.5, pause_s=0.2))
     other = copied(undisturbed, tmp_path / "other")
-    shutil.copy(other / "recording_0002_min.nwb", other / "recording_0004_min.nwb")
-    with pytest.raises(Mismatch, match=r"recording_0004_min.nwb: expected"):
+    shutil.copy(other / "recording_0001_min.nwb", other / "recording_0002_min.nwb")
+    with pytest.raises(Mismatch, match=r"recording_0002_min.nwb: expected"):
         record(other)
-    (other / "recording_0004_min.nwb").unlink()
+    (other / "recording_0002_min.nwb").unlink()
     (other / STATE_FILE).write_bytes(b"damaged")
     with pytest.raises(InvalidFile, match=r"culture.state: expected the whole state"):
         record(other)
@@ -263,7 +263,7 @@ def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_killed_at_any_moment_it_goes_on_to_the_same_bits(undisturbed: list[Path], tmp_path: Path, seed: int) -> None:
     folder, rng, kills = tmp_path / "series", random.Random(seed), 0
-    command = [sys.executable, "-B", "-c", PROGRAM, str(Path(__file__).parent), str(folder), "4"]
+    command = [sys.executable, "-B", "-c", PROGRAM, str(Path(__file__).parent), str(folder), "3"]
     for _ in range(40):
         process = subprocess.Popen(command, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
         try:

@@ -173,7 +173,7 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
         def update(self, done: float, total: float, note: str = "") -> None:
             told.append((done, total, note))
 
-    evaluation = evaluate(policies, timeline, at_min=14.0, episodes=20, progress=Noting())
+    evaluation = evaluate(policies, timeline, at_min=14.0, episodes=50, progress=Noting())
     assert told == [(i + 1, 8, row.name) for i, row in enumerate(evaluation.rows)]
     assert [row.name for row in evaluation.rows] == [
         "policies",
@@ -221,10 +221,10 @@ def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
     timeline = timeline_of()
     chosen = policy_of(timeline, SHORT, seed=1)
     control = replace(chosen, provenance={"training": {"delivery": "shuffled"}})
-    found = evaluate({"a": control}, timeline, episodes=200, seed=3, limit_resolution=0.25)
+    found = evaluate({"a": control}, timeline, episodes=500, seed=3, limit_resolution=0.25)
     rows = {row.name: row for row in found.rows}
     np.testing.assert_array_equal(rows["policies"].episodes.returns, rows["shuffled"].episodes.returns)
-    assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=200, seed=3).rows[0]
+    assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=500, seed=3).rows[0]
                   .episodes.returns)  # fmt: skip
     assert "as trained: what is delivered is drawn anew" in found.to_text()
     assert found.score(rows["policies"]) is None and found.score(rows["random"]) == 0.0
@@ -265,8 +265,8 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
             assert done <= total == 9
             told.append(note)
 
-    plainly = evaluate(policies, timeline, at_min=14.0, episodes=20, seed=3)
-    found = evaluate(policies, timeline, at_min=14.0, episodes=20, seed=3, limit_resolution=0.25, progress=Noting())
+    plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
+    found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, limit_resolution=0.25, progress=Noting())
     environment = Animat(SHORT, Thresholds(1), 3)
     assert found.limit is not None
     assert replace(found.limit, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
@@ -301,7 +301,7 @@ def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch:
     responses = answers([60, 60, 60, 60, 3], 2)
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
     timeline = fit_timeline([lucky], kind="histogram")
-    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=20, limit_resolution=0.25)
+    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=50, limit_resolution=0.25)
     assert found.limit is not None and found.limit.left_out == ("80 Hz (3)",)
     held = replace(fit_histogram(lucky.only([0, 1, 2, 3])), percentiles=timeline.at(0.0).percentiles)
     assert found.limit.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value

@@ -16,8 +16,10 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.writing import LOCK, alone_in
 from fake_culture import FakeCulture
-from test_live import PROTOCOL, TRAINING
+from test_live import ONE, PROTOCOL
 from test_run_on_recordings import policy_of
+
+pytestmark = pytest.mark.usefixtures("few_redrawn")
 
 OPENING = ["record cl1", "record replay", "run", "run on recordings", "live"]
 
@@ -101,5 +103,5 @@ def test_a_live_run_takes_a_folder_in_which_only_a_file_to_be_locked_is(
     monkeypatch.setattr(fcntl, "flock", files_only)
     with alone_in(tmp_path / "live"), FakeCulture() as culture:
         assert (tmp_path / "live" / LOCK).exists()
-        found = live(TRAINING, culture, PROTOCOL, tmp_path / "live", timetable=Timetable(10, 10, 1e6), episodes=1)
+        found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=Timetable(10, 10, 1e6), episodes=1)
     assert len(found.recordings) == 1

@@ -348,6 +348,7 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
     np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[0].predicted)
 
 
+@pytest.mark.usefixtures("few_redrawn")
 def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
     tmp_path: Path, series: list[Responses]
 ) -> None:
@@ -488,6 +489,7 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     )
 
 
+@pytest.mark.usefixtures("few_redrawn")
 @pytest.mark.parametrize(("rest_min", "warned"), [(20.0, False), (45.0, True)])
 def test_a_recording_much_older_than_the_culture_is_said_to_be(
     tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
@@ -503,6 +505,7 @@ def test_a_recording_much_older_than_the_culture_is_said_to_be(
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
 
 
+@pytest.mark.usefixtures("few_redrawn")
 def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     one, other = policy_of(0, series), policy_of(0, series, presentation=Presentation("mixed", 5))
@@ -519,6 +522,7 @@ def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series
     assert gap.loop.pulses == 5
 
 
+@pytest.mark.usefixtures("few_redrawn")
 def test_a_budget_that_ends_early_leaves_what_was_lived(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, account=Account(Budget(pulses=60)), with_controls=False)
     assert gap.session.ending.by == "budget"
@@ -531,6 +535,7 @@ def test_a_budget_that_ends_early_leaves_what_was_lived(tmp_path: Path, series: 
     gap.to_text()
 
 
+@pytest.mark.usefixtures("few_redrawn")
 class TestCommand:
     """`animat run` and `animat recover`, on a replay of recordings: quick, and with no culture but theirs."""
 

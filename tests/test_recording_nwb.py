@@ -23,7 +23,7 @@ from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
 TEXT = st.text(st.characters(blacklist_characters="\0", blacklist_categories=("Cs",)), max_size=8)
-FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FEW = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @st.composite
@@ -79,7 +79,7 @@ def test_a_saved_recording_reads_back_equal(recording: Recording, tmp_path: Path
     assert read_recording(tmp_path / "a.nwb").equals(recording)
 
 
-@settings(FEW, max_examples=8)
+@settings(FEW, max_examples=4)
 @given(recording=recordings())
 def test_pynwb_finds_every_saved_recording_valid(recording: Recording, tmp_path: Path) -> None:
     import pynwb

@@ -31,6 +31,8 @@ from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
 
+pytestmark = pytest.mark.usefixtures("few_redrawn")
+
 RULE = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=8)
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=20, setup_s=0.1)
 FIVE_HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
@@ -54,7 +56,7 @@ def policy_of(seed: int, frequencies_hz: tuple[float, ...] = FIVE_HZ) -> Policy:
 @pytest.fixture(scope="module")
 def series(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "recordings"
-    record_virtual_series(partial(small_culture, rule=RULE), PROTOCOL, folder, sessions=2, interval_min=2.0)
+    record_virtual_series(partial(small_culture, rule=RULE), PROTOCOL, folder, sessions=2, interval_min=1.0)
     return folder
 
 
@@ -80,11 +82,11 @@ def run(out: Path, policy: Policy, recordings: Path, *more: str) -> int:
 @pytest.mark.parametrize(
     ("more", "has_state", "words"),
     [
-        (["--at-min", "2"], True, ""),
-        (["--at-min", "2", "--state", "{state}"], False, ""),
+        (["--at-min", "1"], True, ""),
+        (["--at-min", "1", "--state", "{state}"], False, ""),
         (["--at-min", "0"], False, ""),
-        (["--at-min", "2"], False, "begins anew at 0 min, and its percentiles are of the recording at 2 min"),
-        (["--at-min", "2", "--culture-seed", "1"], True, "begins anew at 0 min"),
+        (["--at-min", "1"], False, "begins anew at 0 min, and its percentiles are of the recording at 1 min"),
+        (["--at-min", "1", "--culture-seed", "1"], True, "begins anew at 0 min"),
         (["--culture-seed", "2"], True, "of virtual culture 1, and this is virtual culture 2"),
     ],
 )
@@ -120,8 +122,10 @@ def test_recordings_of_no_virtual_culture_are_told(
     assert "the recordings are of no virtual culture, and this is virtual culture 1" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("frequencies_hz", [(5.0, 80.0), (80.0, 5.0), (80.0, 40.0, 20.0, 10.0, 5.0)])
-@pytest.mark.parametrize("is_recorded", [True, False])
+@pytest.mark.parametrize(
+    ("frequencies_hz", "is_recorded"),
+    [((5.0, 80.0), True), ((80.0, 5.0), True), ((80.0, 40.0, 20.0, 10.0, 5.0), True), ((80.0, 5.0), False)],
+)
 def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
     frequencies_hz: tuple[float, ...],
     is_recorded: bool,
@@ -141,8 +145,8 @@ def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
     monkeypatch.setattr("animat.reality_gap.Calibration", Noted)
     policy = policy_of(0, frequencies_hz)
     if is_recorded:
-        assert run(tmp_path / "session", policy, series, "--at-min", "2") == 0
-        recording = read_recording(series / "recording_0002_min.nwb")
+        assert run(tmp_path / "session", policy, series, "--at-min", "1") == 0
+        recording = read_recording(series / "recording_0001_min.nwb")
     else:
         policy.save(tmp_path / "p0.safetensors")
         given = ["--out", str(tmp_path / "session"), "--controls", "random", "--episodes", "1"]
@@ -222,14 +226,11 @@ def over(recordings: Path, by: str) -> Policy:
         pytest.param("electrode", marks=pytest.mark.oracle),
     ],
 )
-def test_whatever_was_recorded_is_run(
-    by: str, series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
+def test_whatever_was_recorded_is_run(by: str, series: Path, tmp_path: Path, small_ones: None) -> None:
     policy = over(series, by)
     policy.save(tmp_path / "p0.safetensors")
     assert Policy.load(tmp_path / "p0.safetensors").conditions == policy.conditions
-    assert run(tmp_path / "session", policy, series, "--at-min", "2") == 0
+    assert run(tmp_path / "session", policy, series, "--at-min", "1") == 0
     session = read_session(tmp_path / "session")
     stimuli = session.recording().stimuli
     # What was delivered is sorted, by the rule that the policy was trained by, into what was chosen to be delivered.
@@ -238,27 +239,23 @@ def test_whatever_was_recorded_is_run(
         sets = [c.electrodes[0] for c in policy.conditions if c.electrodes]
         condition = ByElectrode(tuple(sets)).assign(stimuli).condition[stimuli.is_last_of_presentation]
     assert condition.tolist() == [tick.delivered for tick in session.ticks if tick.patterns]
-    recorded = read_recording(series / "recording_0002_min.nwb").stimuli
+    recorded = read_recording(series / "recording_0001_min.nwb").stimuli
     assert set(stimuli.frequency_hz.tolist()) <= set(recorded.frequency_hz.tolist())
     assert set(stimuli.pattern.tolist()) <= set(recorded.pattern.tolist())
 
 
-def test_policies_of_before_are_run_as_their_recordings_tell(
-    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_policies_of_before_are_run_as_their_recordings_tell(series: Path, tmp_path: Path, small_ones: None) -> None:
     """Files of 0.1.0 have the name of a pattern, and not its electrodes."""
-    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
     policy = over(series, "pattern:1,6,4")
     before = tuple(Condition(each.label, each.value, each.unit) for each in policy.conditions)
-    assert run(tmp_path / "session", replace(policy, conditions=before), series, "--at-min", "2") == 0
+    assert run(tmp_path / "session", replace(policy, conditions=before), series, "--at-min", "1") == 0
     patterns = [tick.patterns[-1] for tick in read_session(tmp_path / "session").ticks if tick.patterns]
     assert set(patterns) == {1, 6, 4}
 
 
 def test_a_culture_is_recorded_first_on_the_electrodes_of_the_policies(
-    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch
+    series: Path, tmp_path: Path, small_ones: None
 ) -> None:
-    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 2)
     sets = {c.label: c.electrodes for c in over(series, "pattern:1,6,4").conditions}
     alone = tuple(replace(c, only_last=False, frequencies_hz=(80.0,)) for c in over(series, "pattern:1,6,4").conditions)
     policy = replace(over(series, "pattern:1,6,4"), conditions=alone, presentation=Presentation("blocked", 1))
@@ -275,7 +272,7 @@ def test_a_culture_is_recorded_first_on_the_electrodes_of_the_policies(
 def test_what_recordings_do_not_tell_is_refused_before_a_culture_is_opened(
     lacks: str, series: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording = read_recording(series / "recording_0002_min.nwb")
+    recording = read_recording(series / "recording_0001_min.nwb")
     column = getattr(recording.stimuli, lacks)
     unknown = np.full_like(column, -1) if lacks == "electrodes" else np.full_like(column, np.nan)
     (tmp_path / "from elsewhere").mkdir()

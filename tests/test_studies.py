@@ -297,7 +297,8 @@ def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Pa
         file.write_bytes(b"garbage")
     else:
         file.unlink()
-    ran = run_study(read_study(TINY), folder, base=TINY.parent, workers=1)
+    with ThreadPoolExecutor(1) as executor:
+        ran = run_study(read_study(TINY), folder, base=TINY.parent, executor=executor)
     assert set(ran.done_now) == {"record"}
     assert files(folder) == files(finished)
 
@@ -373,8 +374,9 @@ def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
         sums_of([tmp_path / "none.nwb"], tmp_path)
 
 
-def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path) -> None:
+def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`recording_0010_min` comes before `recording_02.5_min` by name."""
+    monkeypatch.setattr("animat.studies.pictures.save_figure", lambda figure, path: path)
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
         made = make_up_recording(1, patterns=20, channels=channels)

@@ -16,6 +16,8 @@ from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
 from test_responses import recording
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 QUICK = ["--policies", "1", "--iterations", "64"]
 WARNED = ("other-presentation", "other-calibration", "old-calibration", "other-recording", "no-memory")
 
@@ -63,9 +65,9 @@ def test_policies_of_blocks_are_reported_by_training_and_evaluation(
     blocked = series(tmp_path / "blocked", a_recording(0, "blocked"), a_recording(10, "blocked"))
     trained = ran(capsys, "train", "cartpole", "--recordings", blocked, *QUICK, "--out", str(tmp_path / "b"))
     assert "other-presentation" in warned(trained)
-    evaluated = ran(capsys, "evaluate", str(tmp_path / "b"), "--recordings", blocked, "--episodes", "5")
+    evaluated = ran(capsys, "evaluate", str(tmp_path / "b"), "--recordings", blocked)
     assert "other-presentation" in evaluated["not_met_in_a_closed_loop"]
-    assert main(["evaluate", str(tmp_path / "b"), "--recordings", blocked, "--episodes", "5"]) == 0
+    assert main(["evaluate", str(tmp_path / "b"), "--recordings", blocked]) == 0
     assert (
         "a closed loop on the culture would not meet these returns: see the warnings (other-presentation)"
         in capsys.readouterr().out
@@ -84,7 +86,7 @@ def test_an_unknown_presentation_is_not_told_as_another(tmp_path: Path, capsys: 
     recordings = series(tmp_path / "r", replace(a_recording(0), presentation=None))
     train = ["train", "cartpole", "--recordings", recordings, *QUICK, "--out", str(tmp_path / "p")]
     assert {f["name"] for f in ran(capsys, *train)["findings"]} >= {"unknown-presentation"}
-    assert main(["evaluate", str(tmp_path / "p"), "--recordings", recordings, "--episodes", "5"]) == 0
+    assert main(["evaluate", str(tmp_path / "p"), "--recordings", recordings]) == 0
     said = "whether a closed loop on the culture would meet these returns is not known: see the warnings (unknown-pres"
     assert said in capsys.readouterr().out
     # Another robot's folder is refused by the robot, not by what follows from it.
@@ -98,12 +100,12 @@ def test_the_age_of_the_recording_is_reported(tmp_path: Path, capsys: pytest.Cap
     trained = ran(capsys, "train", "cartpole", "--recordings", recordings, "--duration-min", "20", *QUICK, "--out", out)
     # Trained up to 10 min, and 80 min older by now.
     assert (trained["recorded_at_min"], warned(trained)) == (10.0, {"old-calibration"})
-    evaluate = ["evaluate", out, "--recordings", recordings, "--episodes", "5"]
+    evaluate = ["evaluate", out, "--recordings", recordings]
     assert ran(capsys, *evaluate)["not_met_in_a_closed_loop"] == ["other-recording"]
     assert ran(capsys, *evaluate, "--at-min", "10")["not_met_in_a_closed_loop"] == ["old-calibration"]
     # By default training goes through all recordings, and there is nothing to report.
     ran(capsys, "train", "cartpole", "--recordings", recordings, *QUICK, "--out", str(tmp_path / "all"))
-    evaluated = ran(capsys, "evaluate", str(tmp_path / "all"), "--recordings", recordings, "--episodes", "5")
+    evaluated = ran(capsys, "evaluate", str(tmp_path / "all"), "--recordings", recordings)
     assert (evaluated["recorded_at_min"], evaluated["not_met_in_a_closed_loop"]) == (90.0, [])
 
 

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -97,8 +97,12 @@ def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> lis
     return files
 
 
+@lru_cache(maxsize=8)
 def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """`begin` and `train_chunk` for several policies side by side, to be compiled when they are first called."""
+    """`begin` and `train_chunk` for several policies side by side, to be compiled when they are first called.
+
+    The same for the same arguments: a process that trains one group after another traces them once.
+    """
     beginning = jax.vmap(partial(begin, environment, algorithm))
     chunk = jax.vmap(partial(train_chunk, environment, algorithm), in_axes=(0, None, None, None))
     return (

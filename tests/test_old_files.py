@@ -1,0 +1,101 @@
+"""Files that 0.1.0 wrote are read, and gone on with. Oracle: what the code of that commit said of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.cli import main
+from animat.closed_loop.session import read_session
+from animat.errors import AnimatError
+from animat.execution.jobs import Jobs
+from animat.recordings.reading import read_recordings
+from animat.responses.series import extract_series
+from animat.studies.plan import plan_study
+from animat.studies.run import run_study
+from animat.studies.toml import read_study
+from animat.training.policy import Policy
+from test_studies import Halts
+
+pytestmark = pytest.mark.usefixtures("in_this_process", "few_redrawn")
+
+ARCHIVE = Path(__file__).parent / "data" / "commit_5e75c96.tar.xz"
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("old")
+    shutil.unpack_archive(ARCHIVE, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def told(old: Path) -> dict[str, Any]:
+    said: dict[str, Any] = json.loads((old / "told.json").read_text())
+    return said
+
+
+def test_recordings_are_what_they_were(
+    old: Path, told: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recordings = read_recordings([old / "recordings"])
+    for recording, was in zip(recordings, told["recordings"], strict=True):
+        assert recording.start_min == was["start_min"]
+        assert recording.channels.label.tolist() == was["channels"]
+        assert (len(recording.spike_times_s), len(recording.stimuli)) == (was["spikes"], was["stimuli"])
+        assert recording.spike_times_s.sum() == pytest.approx(was["spike_times_s"], rel=1e-12)
+        assert recording.stimuli.time_s.sum() == pytest.approx(was["stimulus_times_s"], rel=1e-12)
+        assert sorted(set(recording.stimuli.frequency_hz.tolist())) == was["frequencies_hz"]
+        assert str(recording.presentation) == was["presentation"]
+    assert [each.rate_hz.tolist() for each in extract_series(recordings)] == told["rate_hz"]
+    assert main(["inspect", str(old / "recordings")]) == 0
+    assert capsys.readouterr().out.count("usable") == 2
+
+
+def test_a_policy_acts_as_it_did_and_is_evaluated_and_run(
+    old: Path, told: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = Policy.load(old / "policies" / "p0.safetensors")
+    assert [condition.label for condition in policy.conditions] == told["policy"]["conditions"]
+    for seen, was in zip(([0.5, 0.2, 1.0], [0.1, 0.9, -2.0]), told["policy"]["probabilities"], strict=True):
+        np.testing.assert_allclose(policy.probabilities(np.array(seen)), was, rtol=1e-5)
+    given = [str(old / "policies"), "--recordings", str(old / "recordings"), "--json"]
+    assert main(["evaluate", *given]) == 0
+    evaluated = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert [row["name"] for row in evaluated["rows"]][:2] == ["policies", "random"]
+    run = ["--culture", "replay", "--episodes", "1", "--controls", "random", "--out", str(tmp_path / "session")]
+    assert main(["run", *given, *run]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["session"]["ended_by"] == "plan"
+
+
+def test_a_session_is_read_and_its_recording_written_again(old: Path, told: dict[str, Any], tmp_path: Path) -> None:
+    shutil.copytree(old / "session", tmp_path / "session")
+    session = read_session(tmp_path / "session")
+    was = told["session"]
+    assert session.ending.by == was["ended_by"]
+    assert sum(episode.pulses for episode in session.episodes) == was["pulses"]
+    ticks = [[t.contender, t.delivered, t.rate_hz, t.command, t.reward] for t in session.ticks]
+    assert ticks == was["ticks"]
+    for name in ("session.nwb", "ticks.csv"):
+        (tmp_path / "session" / name).unlink()
+    assert main(["recover", str(tmp_path / "session")]) == 0
+    (again,), (before,) = (read_recordings([folder / "session" / "session.nwb"]) for folder in (tmp_path, old))
+    np.testing.assert_array_equal(again.spike_times_s, before.spike_times_s)
+    np.testing.assert_array_equal(again.stimuli.time_s, before.stimuli.time_s)
+
+
+def test_a_study_is_gone_on_with_after_its_five_jobs(old: Path, tmp_path: Path) -> None:
+    shutil.copytree(old, tmp_path / "old")
+    folder, study = tmp_path / "old" / "study", read_study(tmp_path / "old" / "study.toml")
+    jobs = plan_study(study, tmp_path / "old")
+    fingerprint = json.loads((folder / "study.json").read_text())["fingerprint"]
+    left = [job.name for job in Jobs(jobs, folder, folder / "jobs", fingerprint).waiting]
+    done = {"record", "fit", "train/navigation/1-threshold/p0", "controls/navigation/1-threshold"}
+    assert done <= {job.name for job in jobs} - set(left)
+    with pytest.raises(AnimatError, match=f"{left[0]}: halted"):
+        run_study(study, folder, base=tmp_path / "old", executor=Halts())
