@@ -140,7 +140,10 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
         ("shuffled", replace(environment, delivery="shuffled"), calibration.simulator),
     ):
         rolled = roll_out(in_, on, both, 2, episodes=PREDICTED_EPISODES, seed=1)
-        error = np.hypot(rolled.returns.std() / np.sqrt(2 * PREDICTED_EPISODES), rows[name].predicted.std() / np.sqrt(PREDICTED_EPISODES))
+        error = np.hypot(
+            rolled.returns.std() / np.sqrt(2 * PREDICTED_EPISODES),
+            rows[name].predicted.std() / np.sqrt(PREDICTED_EPISODES),
+        )
         assert abs(rolled.returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
     limit = best_return(environment, calibration.simulator, resolution=0.6, episodes=0).value
