@@ -21,6 +21,7 @@ GROUND = (
     "plain_file",
     "progress",
     "records",
+    "registry",
     "tables",
     "writing",
 )

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from animat.coding.mapping import Mapping as Mapping
     from animat.coding.mapping import Thresholds as Thresholds
     from animat.coding.mapping import mapping_named as mapping_named
+    from animat.coding.mapping import register_mapping as register_mapping
     from animat.cultures.base import Culture as Culture
     from animat.cultures.replay import ReplayCulture as ReplayCulture
     from animat.cultures.safety import Limits as Limits
@@ -103,7 +104,7 @@ _WHERE = {
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
     "coding.encoder": ("Encoder",),
-    "coding.mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
+    "coding.mapping": ("Mapping", "Thresholds", "Linear", "register_mapping", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
     "training.settings": ("SAC",),

@@ -100,21 +100,30 @@ def say_findings(findings: Sequence[Finding]) -> None:
         print(f"warning: {sentence}", file=sys.stderr)
 
 
-def policies_for(robot: str | None, path: Path) -> dict[str, Policy]:
-    """The policies of a file or a folder, and a robot of one's own imported for them.
+def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:
+    """The policies of a file or a folder, and a robot and a mapping of one's own imported for them.
 
     Raises:
-        Mismatch: for policies of another robot than was named.
+        Mismatch: for policies of another robot or mapping than was named.
     """
+    from animat.coding.checking import check_mapping
+    from animat.coding.mapping import mapping_named
+    from animat.registry import is_ours
     from animat.robots.checking import check_robot
-    from animat.robots.registry import is_ours, robot_class
+    from animat.robots.registry import REGISTRY
     from animat.training.policy import load_policies
 
-    expected = None if robot is None else robot_class(robot).name
+    expected = None if robot is None else REGISTRY.class_named(robot).name
+    asked = None if mapping is None else mapping_named(mapping)
     policies = load_policies(path)
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
             raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
+        if asked is not None and asked.name != getattr(policy.mapping, "name", None):
+            got = "none" if policy.mapping is None else policy.mapping.name
+            raise Mismatch(f"{name}: expected a policy with the mapping {asked.name}, got one with {got}")
         if not is_ours(policy.robot):
             check_robot(policy.robot)
+        if policy.mapping is not None and not is_ours(policy.mapping):
+            check_mapping(policy.mapping)
     return policies

@@ -20,10 +20,10 @@ class Robots:
     def run(self) -> dict[str, Any]:
         """List them."""
         from animat.errors import InvalidArgument
-        from animat.robots.registry import robot_names
+        from animat.robots.registry import REGISTRY
 
         listed, unusable = {}, {}
-        for name in self.names or robot_names():
+        for name in self.names or REGISTRY.names():
             try:
                 listed[name] = _told(name)
             except Exception as error:

@@ -41,6 +41,8 @@ class Run(Stimulating):
     """A policy file or a folder of them"""
     robot: str | None = None
     """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    mapping: str | None = None
+    """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
     recordings: tuple[Path, ...] = ()
     """Recordings the policies were trained on: their percentiles and prediction; default: the culture is recorded"""
     at_min: float | None = None
@@ -93,7 +95,7 @@ class Run(Stimulating):
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        policies = policies_for(self.robot, self.policies)
+        policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
         fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):

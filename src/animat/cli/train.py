@@ -28,9 +28,9 @@ class Train(Fitting):
     """Files or folders of recordings of one culture"""
     paper: bool = False
     """The paper's setting: 1-threshold, histogram, 10 policies, 60 minutes; default: what works in a closed loop"""
-    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] | None = None
-    """From responses to motor commands; none: the baseline without neurons; default: 9-thresholds, with --paper
-    1-threshold"""
+    mapping: str | None = None
+    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
+    my_package.mappings:Steep; none: the baseline without neurons; default: 9-thresholds, with --paper 1-threshold"""
     policies: int | None = None
     """How many policies, each from its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64
 from numpy.typing import ArrayLike
 
 from animat.coding.encoder import Encoder
-from animat.coding.mapping import N_PERCENTILES, Mapping
+from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.recordings.findings import Finding
@@ -182,7 +182,7 @@ class Loop:
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return plain | {
             "robot": robot_to_dict(self.robot),
-            "mapping": self.mapping.name,
+            "mapping": mapping_to_data(self.mapping),
             "conditions": [condition.label for condition in self.conditions],
             "percentiles": self.percentiles.tolist(),
             "following": self.following is not None,

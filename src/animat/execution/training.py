@@ -15,7 +15,6 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent
-from animat.robots.registry import register_robot
 from animat.training.folder import MANIFEST, describe, expect_trainable, groups_of, is_ours, write_description
 from animat.training.group import CHECKPOINT_S, Group, save_policies, train_group
 from animat.training.policy import Policy
@@ -43,7 +42,7 @@ def train(
         training: what is trained.
         timeline: the culture's simulators; None for a training without neurons.
         folder: where the policies go; made where it is missing. None: nowhere; they are trained in this process, and
-            a training that is stopped begins anew. So can robots that are not registered, and mappings of one's own,
+            a training that is stopped begins anew. So can robots and mappings that are not registered,
             which no file can name.
         workers: processes to use, each pinned to a core of its own; None: as many as there are cores. Not with an
             executor.
@@ -114,7 +113,7 @@ class TrainGroup(Task):
         return {"algorithm": self.group.training.algorithm}
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        register_robot(type(self.group.training.robot))
+        self.group.training.register()
         checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
         return train_into(folder, self.group, checkpoint, progress, checkpoint_s=self.checkpoint_s)
 

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from animat.animat import Animat, Delivery
+from animat.coding.checking import check_mapping
 from animat.coding.mapping import Mapping, mapping_named
 from animat.errors import InvalidArgument
 from animat.neurons.kinds import Kind
@@ -20,6 +21,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
+from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS
@@ -72,7 +74,8 @@ def set_up(
 
     Args:
         robot: its name, or where to import it from (`robot_named`); set by the environment's id, but for `Robot-v0`.
-        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`.
+        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`, or
+            one of your own, also by where to import it from.
         recordings: files or folders of recordings of one culture to make the neurons' simulator of.
         simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions
             of `animat.neurons.made_up` answer.
@@ -108,6 +111,8 @@ def set_up(
     if delivery not in ("chosen", "shuffled"):
         raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
     chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
+    if not is_ours(chosen):
+        check_mapping(chosen)
     return Setup(Animat(body, chosen, simulator.n_conditions, delivery), simulator, labels)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import AnimatError, InvalidArgument, shown
+from animat.errors import AnimatError, InvalidArgument, first_line, shown
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
 
 _STEPS = 3
@@ -104,10 +104,7 @@ def _tried(what: str, call: Callable[..., Any], *arguments: Any) -> Any:
         raise
     except Exception as error:
         # Anything may go wrong in somebody else's robot.
-        said = (str(error).strip().splitlines() or ["no more is known"])[0]
-        raise InvalidArgument(
-            f"{what}: expected it to run under jax.jit, got {type(error).__name__}: {said}"
-        ) from error
+        raise InvalidArgument(f"{what}: expected it to run under jax.jit, got {first_line(error)}") from error
 
 
 def _expect_shape(what: str, value: Any, shape: tuple[int, ...], words: str, kind: type = float) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, first_line, shown
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 
@@ -200,10 +200,7 @@ def grid_for(robot: Robot[Any]) -> Grid:
         raise
     except Exception as error:
         # Anything may go wrong in somebody else's robot.
-        said = (str(error).strip().splitlines() or ["no more is known"])[0]
-        raise InvalidArgument(
-            f"{robot.name}.value_grid: expected a Grid, got {type(error).__name__}: {said}"
-        ) from error
+        raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {first_line(error)}") from error
     if not isinstance(grid, Grid):
         raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {shown(grid)}")
     return grid

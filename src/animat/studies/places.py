@@ -47,8 +47,7 @@ def episodes_file(folder: Path, body: Body, condition: StudyCondition, what: str
 
 def controls_file(folder: Path, body: Body, condition: StudyCondition, what: str = "episodes") -> Path:
     """A table of the controls of a condition's mapping on a robot: their episodes, or random over time."""
-    held = "-held" if condition.percentiles == "first" else ""
-    return folder / "controls" / body.name / f"{condition.mapping}{held}" / f"{what}.csv"
+    return folder / "controls" / body.name / condition.thresholds / f"{what}.csv"
 
 
 def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:

@@ -18,14 +18,16 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 
 from animat.brief import briefly
-from animat.coding.mapping import Mapping, expect_loadable_mapping, mapping_named
+from animat.coding.mapping import REGISTRY as MAPPINGS
+from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file, is_folder
 from animat.records import Number, read_record
 from animat.responses.condition import Condition
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
-from animat.robots.registry import expect_loadable_robot, robot_from_dict, robot_to_dict
+from animat.robots.registry import REGISTRY as ROBOTS
+from animat.robots.registry import robot_from_dict, robot_to_dict
 from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance
 from animat.writing import written_whole
@@ -198,13 +200,13 @@ class Policy:
 
         Raises:
             InvalidFile: if it cannot be written; what stood there before is unchanged.
-            InvalidArgument: for a robot that is not registered or a mapping of one's own: the file could not be loaded.
+            InvalidArgument: for a robot or a mapping that is not registered: the file could not be loaded.
         """
         from safetensors.numpy import save
 
-        expect_loadable_robot(self.robot)
+        ROBOTS.expect_loadable(self.robot)
         if self.mapping is not None:
-            expect_loadable_mapping(self.mapping)
+            MAPPINGS.expect_loadable(self.mapping)
 
         arrays = {"scales": self.scales, "learning_curve": self.learning_curve}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -213,7 +215,7 @@ class Policy:
             "format": FORMAT,
             "hidden_activation": HIDDEN_ACTIVATION,
             "robot": robot_to_dict(self.robot),
-            "mapping": None if self.mapping is None else self.mapping.name,
+            "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "conditions": [asdict(condition) for condition in self.conditions],
             "commands": self.commands,
             "window_ms": self.window_ms,
@@ -231,8 +233,8 @@ class Policy:
         """Read a policy that `save` wrote.
 
         Raises:
-            InvalidFile: if the file is missing, damaged, or not a policy of this format; for one of a robot that is not
-                registered here, with what to import.
+            InvalidFile: if the file is missing, damaged, or not a policy of this format; for one of a robot or
+                a mapping that is not registered here, with what to import.
         """
         path = expect_plain_file(path, _MOST_BYTES)
         arrays, described = _read(path)
@@ -242,7 +244,7 @@ class Policy:
                 biases=tuple(arrays[f"layer{i}.bias"] for i in range(_LAYERS)),
                 scales=arrays["scales"],
                 robot=robot_from_dict(described["robot"]),
-                mapping=None if described["mapping"] is None else mapping_named(described["mapping"]),
+                mapping=None if described["mapping"] is None else mapping_from_data(described["mapping"]),
                 conditions=tuple(Condition(**condition) for condition in described["conditions"]),
                 commands=None if described["commands"] is None else tuple(described["commands"]),
                 window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
