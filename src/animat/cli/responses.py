@@ -13,6 +13,7 @@ from animat.recordings.findings import Finding, warnings_once
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.responses.readouts import Readouts
     from animat.training.policy import Policy
 
 
@@ -43,11 +44,14 @@ class Fitting(Responding):
     allow: tuple[str, ...] = ()
     """Findings to go on in spite of, by name, such as dead-window"""
 
-    def timeline(self, recordings: Sequence[Path], trained: Policy | None = None) -> SimulatorTimeline:
+    def timeline(
+        self, recordings: Sequence[Path], trained: Policy | None = None, readouts: str | Readouts | None = None
+    ) -> SimulatorTimeline:
         """Read the recordings and fit a simulator to each: as those that a policy was trained on, unless asked."""
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_sources
         from animat.responses.conditions import conditions_named
+        from animat.responses.readouts import ALL
         from animat.responses.series import extract_series
         from animat.responses.windows import DEFAULT_WINDOW_MS
 
@@ -62,6 +66,7 @@ class Fitting(Responding):
             self.window_ms or (trained and trained.window_ms) or DEFAULT_WINDOW_MS,
             burst_threshold=fitted.get("burst_threshold") if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
+            readouts=readouts or (ALL if trained is None else trained.readouts),
         )
         timeline = fit_timeline(series, **fit)
         say_findings(timeline.findings)

@@ -83,7 +83,7 @@ class Run(Stimulating):
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.running import check_episodes
-        from animat.coding.mapping import N_PERCENTILES
+        from animat.coding.decoder import percentiles_shape
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.neurons.simulator import check_binning
@@ -109,7 +109,7 @@ class Run(Stimulating):
             calibration = self._calibration(recordings, first, self.at_min)
             check_conditions(first, calibration)
             conditions = calibration.conditions
-        loop, _ = Loop.of_policy(first, np.zeros(N_PERCENTILES), conditions=conditions, **settings)
+        loop, _ = Loop.of_policy(first, np.zeros(percentiles_shape(first.readouts)), conditions=conditions, **settings)
         with (
             ExitStack() as told,
             # Last, as it makes the folder.
@@ -215,6 +215,7 @@ class Run(Stimulating):
             window_ms=first.window_ms or DEFAULT_WINDOW_MS,
             burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
+            readouts=first.readouts,
         )
         return Calibration.of_series(
             series, first, at_min=at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)

@@ -118,7 +118,7 @@ class Linear(Mapping):
         smallest, largest = percentiles[0], percentiles[N_PERCENTILES - 1]
         span = largest - smallest
         # Clipped before dividing: the ends are then exactly -1 and +1, and a span of zero leaves 0 / 1.
-        xp = _namespace(x, percentiles)
+        xp = namespace_of(x, percentiles)
         return xp.clip(2 * x - (largest + smallest), -span, span) / (span + (span == 0))
 
 
@@ -157,7 +157,7 @@ def mapping_named(name: str, /, **parameters: float) -> Mapping:
 def mapping_to_data(mapping: Mapping) -> str | dict[str, Any]:
     """The mapping as JSON data: its name; one of a user's own as `animat.registry.Registry.to_dict`."""
     # What is no dataclass is trained in memory only.
-    return REGISTRY.to_dict(mapping) if is_dataclass(mapping) and not is_ours(mapping) else mapping.name
+    return REGISTRY.to_dict(mapping) if is_dataclass(type(mapping)) and not is_ours(mapping) else mapping.name
 
 
 def mapping_from_data(data: str | dict[str, Any]) -> Mapping:
@@ -166,7 +166,7 @@ def mapping_from_data(data: str | dict[str, Any]) -> Mapping:
     return REGISTRY.from_dict({"name": data, "parameters": {}} if isinstance(data, str) else data)
 
 
-def _namespace(*arrays: Numbers) -> Any:
+def namespace_of(*arrays: Numbers) -> Any:
     """numpy, or the array library of the first array that is of another."""
     for array in arrays:
         if not isinstance(array, np.ndarray | np.generic) and hasattr(array, "__array_namespace__"):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+from animat.coding.decoder import expect_fit
 from animat.errors import InvalidArgument
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
@@ -56,8 +57,8 @@ def train(
         The policies by name, `p0` first.
 
     Raises:
-        InvalidArgument: if neurons are missing for a mapping or given without one, for fewer workers than one or any
-            beside an executor, or as `expect_trainable` does.
+        InvalidArgument: if neurons are missing for a mapping or given without one, for readouts that are not as many as
+            the robot's commands, for fewer workers than one or any beside an executor, or as `expect_trainable` does.
         Mismatch: if the folder holds another training, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
         AnimatError: if a process that trains ends before its time.
@@ -69,6 +70,8 @@ def train(
         )
     expect_workers(workers, executor)
     expect_trainable(training, is_saved=folder is not None)
+    if timeline is not None:
+        expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
     progress = progress or Silent()
     training = training.over(timeline)
     manifest = describe(training, timeline, sources)

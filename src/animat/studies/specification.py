@@ -163,6 +163,11 @@ class Body:
         robot = self.robot()
         if self.name == "culture":
             raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
+        if robot.n_commands > 1:
+            raise InvalidArgument(
+                f"{robot.name}: expected one command, as a study reads all channels as one, got {robot.n_commands}: "
+                "train it with animat train --readouts"
+            )
         if not is_ours(robot):
             # Workers know it by that.
             object.__setattr__(self, "kind", place_of(type(robot)))

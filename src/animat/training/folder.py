@@ -42,6 +42,8 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
     check_robot(training.robot)
     if training.mapping is not None:
         check_mapping(training.mapping)
+    else:
+        training.environment(0)
     if is_saved:
         ROBOTS.expect_loadable(training.robot, in_workers=True)
         if training.mapping is not None:
@@ -72,6 +74,8 @@ def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
         "window_ms": timeline.window_ms,
         "presentation": None if timeline.presentation is None else str(timeline.presentation),
         "recorded_at_min": timeline.start_min.tolist(),
+        # Folders of before have none, and go on.
+        **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
 
 

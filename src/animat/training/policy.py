@@ -18,12 +18,14 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 
 from animat.brief import briefly
+from animat.coding.decoder import expect_fit
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file, is_folder
 from animat.records import Number, read_record
 from animat.responses.condition import Condition
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
@@ -65,6 +67,7 @@ class Policy:
         presentation: how stimuli were presented when the neurons were recorded; None where it is not known.
         provenance: what it was trained on and how, as plain data.
         learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
+        readouts: what is read of the neurons, by the electrodes of each command.
     """
 
     __repr__ = briefly
@@ -80,6 +83,7 @@ class Policy:
     presentation: Presentation | None = None
     provenance: Dict[str, Any] = field(default_factory=dict)
     learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    readouts: Readouts = ALL
 
     def __post_init__(self) -> None:
         self._expect_network()
@@ -90,6 +94,8 @@ class Policy:
         if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
             raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
         expect_provenance(self.provenance)
+        if self.mapping is not None:
+            expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
     def _expect_network(self) -> None:
         """Refuse weights of which no action can be made, or one that means nothing."""
@@ -221,6 +227,7 @@ class Policy:
             "window_ms": self.window_ms,
             "presentation": None if self.presentation is None else asdict(self.presentation),
             "provenance": dict(self.provenance),
+            "readouts": self.readouts.to_dict(),
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
@@ -251,6 +258,8 @@ class Policy:
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
                 provenance=described["provenance"],
                 learning_curve=arrays["learning_curve"],
+                # Files of before read all channels as one.
+                readouts=Readouts.from_dict(described.get("readouts")),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             said = f"nothing called {error}" if isinstance(error, KeyError) else error
