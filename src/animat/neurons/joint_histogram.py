@@ -36,7 +36,7 @@ class JointHistogramSimulator(NeuronSimulator):
         counts: trials of each condition, shape (conditions,).
         percentiles: as in `NeuronSimulator`, shape (readouts, 11).
 
-    Source: the empirical copula, Rüschendorf 1976, doi:10.1214/aos/1176343541.
+    Source: coupling by an empirical copula, Schefzik, Thorarinsdottir and Gneiting 2013, doi:10.1214/13-STS443.
     """
 
     __repr__ = briefly
