@@ -163,7 +163,7 @@ def answers(evidence: Evidence) -> Finding | None:
     if episodes < FEWEST_EPISODES:
         return None
     conditions = np.flatnonzero((lived.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
-    names, read_hz = evidence.calibration.readouts.names, evidence.answered.responses.read_hz
+    names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
     # Of one readout there is no axis.
     of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
     tested = [(i, of) for i in conditions.tolist() for of in of_readouts]
