@@ -69,6 +69,7 @@ def test_a_mapping_is_trained_in_workers_saved_loaded_and_evaluated(package: Pat
     for name, policy in trained.items():
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
     assert mapping_to_data(steep) == {"name": "steep", "parameters": {"slope": 3.0}, "import": STEEP}
+    assert pickle.loads(pickle.dumps(REGISTRY)) is REGISTRY
     assert pickle.loads(pickle.dumps(steep)) == steep and mapping_named("steep", slope=3.0) == steep
 
     forget()

@@ -24,6 +24,7 @@ _IN_MEMORY = "train in memory: train(training, timeline, None)"
 
 
 _registries: dict[type, Registry[Any]] = {}
+"""By what their classes are made of."""
 
 
 class Registry(Generic[Thing]):
@@ -48,7 +49,7 @@ class Registry(Generic[Thing]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The module of the base, or its package, makes the registry.
-        return _registries.__getitem__, (self._base,)
+        return _registry_of, (self._base,)
 
     def register(self, kind: type[Thing]) -> None:
         """Make a class known by its name.
@@ -228,6 +229,10 @@ class Registry(Generic[Thing]):
         except InvalidArgument as error:
             hint = "what a script does belongs under `if __name__ == '__main__':`, as worker processes import it"
             raise InvalidArgument(f"{error}; {hint}") from error
+
+
+def _registry_of(base: type) -> Registry[Any]:
+    return _registries[base]
 
 
 def place_of(kind: type) -> str:
