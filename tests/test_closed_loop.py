@@ -38,6 +38,7 @@ from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByFrequency
 from animat.responses.extraction import extract_responses
+from animat.responses.readouts import ALL
 from animat.robots import Cartpole, Navigation, Robot
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.pulse import PUBLISHED_PULSE
@@ -394,7 +395,7 @@ def test_a_stimulus_is_repeated_at_most_so_often(tmp_path: Path) -> None:
 class RecordedAs:
     """What a loop takes from a policy."""
 
-    robot, mapping, conditions = SHORT, Thresholds(1), CONDITIONS
+    robot, mapping, readouts, conditions = SHORT, Thresholds(1), ALL, CONDITIONS
 
     def __init__(self, presentation: Presentation | None, window_ms: tuple[float, float] | None = (2.0, 10.0)) -> None:
         self.presentation, self.window_ms = presentation, window_ms

@@ -22,6 +22,7 @@ GROUND = (
     "plain_file",
     "progress",
     "records",
+    "registry",
     "tables",
     "writing",
 )

@@ -12,14 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.coding.mapping import MAPPING_NAMES, Linear, Thresholds, mapping_named
+from animat.coding.mapping import REGISTRY, Linear, Thresholds, mapping_named
 from animat.errors import InvalidArgument
 
+NAMES = REGISTRY.names()
 PERCENTILES_HZ = np.array([2.0, 10, 14, 20, 27, 33, 38, 44, 51, 60, 95])
 
 rates_hz = st.floats(0, 1000, allow_nan=False, width=32, allow_subnormal=False)
 percentiles_hz = st.lists(rates_hz, min_size=11, max_size=11).map(lambda values: np.sort(np.array(values)))
-mappings = st.sampled_from([mapping_named(name) for name in MAPPING_NAMES])
+mappings = st.sampled_from([mapping_named(name) for name in NAMES])
 
 TEN_LEVELS = [
     # (response, command): below P10, inside each tenth, and on every threshold
@@ -131,11 +132,11 @@ def test_every_tenth_of_the_responses_gets_its_own_level() -> None:
     np.testing.assert_allclose(counts, 1000, atol=1)
 
 
-@pytest.mark.parametrize("name", MAPPING_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_names_give_the_mapping_back(name: str) -> None:
     assert mapping_named(name).name == name
     assert mapping_named(name) == mapping_named(name)
-    assert len({mapping_named(other) for other in MAPPING_NAMES}) == len(MAPPING_NAMES)
+    assert len({mapping_named(other) for other in NAMES}) == len(NAMES)
 
 
 @pytest.mark.parametrize("name", ["2-thresholds", "", None, ["linear"]])

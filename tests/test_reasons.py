@@ -15,6 +15,7 @@ from animat.reality_gap.passes import Passes
 from animat.reality_gap.predicting import Predicted
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.responses.condition import Condition
+from animat.responses.readouts import Readouts
 from animat.responses.responses import Presented, Responses
 from animat.stimulation.protocol import Presentation
 
@@ -187,3 +188,28 @@ def test_of_few_episodes_no_trend_and_no_share_is_told() -> None:
         returns=answered.returns[:7],
     )
     assert reasons(replace(evidence, answered=few)) == ()
+
+
+def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
+    def on_halves(left: Evidence, right: Evidence) -> Evidence:
+        each = [evidence.answered for evidence in (left, right)]
+        responses = replace(
+            each[0].responses,
+            readouts=Readouts(("left", "right"), ((1,), (2,))),
+            readout_hz=np.stack([one.responses.rate_hz for one in each], axis=1),
+        )
+        answered = replace(each[0], responses=responses, passed=np.stack([one.passed for one in each], axis=1))
+        told = left.predicted
+        passes, anew = (Passes(p.presented, np.stack([p.passed] * 2, -1)) for p in (told.passes, told.passes_anew))
+        recorded = tuple(np.stack([x, x], axis=1) for x in left.calibration.responses_hz)
+        calibration: Any = SimpleNamespace(**{**vars(left.calibration), "responses_hz": recorded})
+        return Evidence(answered, calibration, told._replace(passes=passes, passes_anew=anew), -1)
+
+    check = CHECKS["how often responses pass P50"]
+    same, other = session(3), session(3, rate_hz=lambda condition, rate_hz: rate_hz - 3.0)
+    assert check(on_halves(same, same)) is None
+    found, alone = check(on_halves(same, other)), check(other)
+    assert found is not None and alone is not None
+    assert "80 Hz on right in " in found.sentence and "on left" not in found.sentence
+    # What is told of it is what would be told of it alone.
+    assert found.sentence.replace(" on right", "") == alone.sentence

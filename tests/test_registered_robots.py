@@ -61,8 +61,8 @@ def forgetting() -> Iterator[None]:
 def forget(known: dict[str, type[Robot[Any]]] | None = None) -> None:
     """As in a process that has imported nothing of the user's."""
     ours = {"cartpole": Cartpole, "navigation": Navigation}
-    registry._registered.clear()
-    registry._registered.update(known or ours)
+    registry.REGISTRY._registered.clear()
+    registry.REGISTRY._registered.update(known or ours)
     for name in ("my_package", "my_package.robots"):
         sys.modules.pop(name, None)
 
@@ -215,7 +215,7 @@ def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: p
     def found(*, group: str, name: str | None = None) -> list[EntryPoint]:
         return [point for point in points if group == point.group and name in (None, point.name)]
 
-    monkeypatch.setattr(registry, "entry_points", found)
+    monkeypatch.setattr("importlib.metadata.entry_points", found)
     with pytest.raises(InvalidArgument, match="expected one of cartpole, navigation, rover, tank, got 'plane'"):
         robot_named("plane")
     assert robot_named("rover", gain_m=0.2) == robot_named(ROVER, gain_m=0.2)
@@ -229,7 +229,8 @@ def test_robots_are_listed_with_what_each_can_do(
 ) -> None:
     points = [EntryPoint("rover", ROVER, "animat.robots"), EntryPoint("tank", "my_nowhere:Tank", "animat.robots")]
     monkeypatch.setattr(
-        registry, "entry_points", lambda *, group, name=None: [each for each in points if name in (None, each.name)]
+        "importlib.metadata.entry_points",
+        lambda *, group, name=None: [each for each in points if name in (None, each.name)],
     )
     # A package that is broken hides no robot, and ends with status 1.
     assert main(["robots", "--json"]) == 1

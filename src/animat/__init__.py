@@ -14,11 +14,13 @@ if TYPE_CHECKING:
     from animat.animat import Animat as Animat
     from animat.animat import WithoutNeurons as WithoutNeurons
     from animat.closed_loop.loop import Loop as Loop
+    from animat.coding.decoder import Decoder as Decoder
     from animat.coding.encoder import Encoder as Encoder
     from animat.coding.mapping import Linear as Linear
     from animat.coding.mapping import Mapping as Mapping
     from animat.coding.mapping import Thresholds as Thresholds
     from animat.coding.mapping import mapping_named as mapping_named
+    from animat.coding.mapping import register_mapping as register_mapping
     from animat.cultures.base import Culture as Culture
     from animat.cultures.replay import ReplayCulture as ReplayCulture
     from animat.cultures.safety import Limits as Limits
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
     from animat.responses.extraction import extract_responses as extract_responses
     from animat.responses.inspection import Inspection as Inspection
     from animat.responses.inspection import inspect_recording as inspect_recording
+    from animat.responses.readouts import Readouts as Readouts
     from animat.responses.responses import Responses as Responses
     from animat.responses.series import extract_series as extract_series
     from animat.robots import Cartpole as Cartpole
@@ -95,6 +98,7 @@ _WHERE = {
     "cultures.replay": ("ReplayCulture",),
     "responses.condition": ("Condition",),
     "responses.conditions": ("conditions_named",),
+    "responses.readouts": ("Readouts",),
     "responses.responses": ("Responses",),
     "responses.extraction": ("extract_responses",),
     "responses.series": ("extract_series",),
@@ -103,7 +107,8 @@ _WHERE = {
     "neurons.memory": ("fit_memory",),
     "neurons.timeline": ("SimulatorTimeline", "fit_timeline"),
     "coding.encoder": ("Encoder",),
-    "coding.mapping": ("Mapping", "Thresholds", "Linear", "mapping_named"),
+    "coding.decoder": ("Decoder",),
+    "coding.mapping": ("Mapping", "Thresholds", "Linear", "register_mapping", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
     "animat": ("Animat", "WithoutNeurons"),
     "training.settings": ("SAC",),

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from animat.coding.decoder import decoded, expect_fit
 from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import AT_FIRST, Answer, NeuronSimulator
@@ -22,7 +23,8 @@ Delivery = Literal["chosen", "shuffled"]
 
 Uniforms = Float[Array, " noise"]
 Number = Float[Array, ""]
-Actuated = tuple[Array, Answer, Number]
+Command = Float[Array, "*commands"]
+Actuated = tuple[Array, Answer, Command]
 
 
 class EpisodeState(NamedTuple):
@@ -48,8 +50,8 @@ class Outcome(NamedTuple):
         terminated: the task ended by itself (fell, reached).
         truncated: the episode limit ended it; never together with `terminated`.
         delivered: the condition that reached the neurons (the action itself, where there are none).
-        rate_hz: the response x, Hz per channel (NaN without neurons).
-        command: the motor command u in [-1, 1].
+        rate_hz: the response x, Hz per channel (NaN without neurons); of several readouts, shape (readouts,).
+        command: the motor command u in [-1, 1]; of several, shape (commands,).
     """
 
     state: EpisodeState
@@ -57,8 +59,8 @@ class Outcome(NamedTuple):
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
     delivered: Array
-    rate_hz: Number
-    command: Number
+    rate_hz: Float[Array, "*readouts"]
+    command: Command
 
 
 class Environment(abc.ABC, Generic[RobotState]):
@@ -132,7 +134,7 @@ class Animat(Environment[RobotState]):
 
     Attributes:
         robot: the body and its task.
-        mapping: from a response to a motor command.
+        mapping: from the response of a readout to a motor command.
         n_conditions: how many conditions the agent picks from.
         delivery: `"chosen"`: the neurons get the agent's condition; `"shuffled"`: one drawn anew at each iteration,
             whatever the agent chose (the paper's control condition, section 3.2).
@@ -156,8 +158,9 @@ class Animat(Environment[RobotState]):
             raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
         if self.delivery == "shuffled":
             action = jnp.minimum((uniforms[1] * self.n_conditions).astype(jnp.int32), self.n_conditions - 1)
+        expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[0], past)
-        return action, answer, self.mapping.command(answer.rate_hz, simulator.percentiles)
+        return action, answer, decoded(self.mapping, answer.rate_hz, simulator.percentiles)
 
 
 @dataclass(frozen=True)
@@ -167,10 +170,20 @@ class WithoutNeurons(Environment[RobotState]):
     Attributes:
         robot: the body and its task.
         commands: the commands to pick from, such as (-1, 1) for the cartpole; None: any command in [-1, 1].
+
+    Raises:
+        InvalidArgument: for a robot of several commands.
     """
 
     robot: Robot[RobotState]
     commands: tuple[float, ...] | None
+
+    def __post_init__(self) -> None:
+        if self.robot.n_commands > 1:
+            raise InvalidArgument(
+                f"robot: expected one command for a baseline without neurons, got {self.robot.name}, which takes "
+                f"{self.robot.n_commands}; train it with a mapping"
+            )
 
     @property
     def n_actions(self) -> int | None:

@@ -73,6 +73,12 @@ def shown(value: object, most: int = 80) -> str:
     return text if len(text) <= most else f"{text[:most]}... ({len(text):,} characters)"
 
 
+def first_line(error: BaseException) -> str:
+    """What somebody else's code raised: its type, and the first line of what it says."""
+    lines = str(error).strip().splitlines() or ["no more is known"]
+    return f"{type(error).__name__}: {lines[0]}"
+
+
 def out_of_memory(error: BaseException) -> str | None:
     """That memory was too little, with how much was asked for at the last where that is told; None for another error.
 

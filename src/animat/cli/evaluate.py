@@ -25,6 +25,8 @@ class Evaluate(Fitting):
     """Episodes of each policy and control"""
     robot: str | None = None
     """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    mapping: str | None = None
+    """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
     limit: bool = False
@@ -40,7 +42,7 @@ class Evaluate(Fitting):
         from animat.evaluation.rollouts import check_at_once
         from animat.progress import Bar
 
-        policies = policies_for(self.robot, self.policies)
+        policies = policies_for(self.robot, self.mapping, self.policies)
         check_at_once("--episodes", self.episodes, len(policies))
         through_neurons = any(policy.mapping is not None for policy in policies.values())
         # On what they were trained on, unless asked otherwise.

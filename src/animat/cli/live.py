@@ -27,8 +27,9 @@ class Live(Stimulating):
 
     robot: Positional[str] = "cartpole"
     """The robot to drive: cartpole, navigation, or one of your own, such as my_package.robots:Rover"""
-    mapping: Literal["1-threshold", "9-thresholds", "linear"] = "9-thresholds"
-    """From responses to motor commands"""
+    mapping: str = "9-thresholds"
+    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
+    my_package.mappings:Steep"""
     policies: int = 4
     """How many policies, each from its own random numbers"""
     order: Literal["mixed", "blocked"] = "mixed"

@@ -13,6 +13,7 @@ from animat.recordings.findings import Finding, warnings_once
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.responses.readouts import Readouts
     from animat.training.policy import Policy
 
 
@@ -43,11 +44,14 @@ class Fitting(Responding):
     allow: tuple[str, ...] = ()
     """Findings to go on in spite of, by name, such as dead-window"""
 
-    def timeline(self, recordings: Sequence[Path], trained: Policy | None = None) -> SimulatorTimeline:
+    def timeline(
+        self, recordings: Sequence[Path], trained: Policy | None = None, readouts: str | Readouts | None = None
+    ) -> SimulatorTimeline:
         """Read the recordings and fit a simulator to each: as those that a policy was trained on, unless asked."""
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_sources
         from animat.responses.conditions import conditions_named
+        from animat.responses.readouts import ALL
         from animat.responses.series import extract_series
         from animat.responses.windows import DEFAULT_WINDOW_MS
 
@@ -62,6 +66,7 @@ class Fitting(Responding):
             self.window_ms or (trained and trained.window_ms) or DEFAULT_WINDOW_MS,
             burst_threshold=fitted.get("burst_threshold") if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
+            readouts=readouts or (ALL if trained is None else trained.readouts),
         )
         timeline = fit_timeline(series, **fit)
         say_findings(timeline.findings)
@@ -100,21 +105,30 @@ def say_findings(findings: Sequence[Finding]) -> None:
         print(f"warning: {sentence}", file=sys.stderr)
 
 
-def policies_for(robot: str | None, path: Path) -> dict[str, Policy]:
-    """The policies of a file or a folder, and a robot of one's own imported for them.
+def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:
+    """The policies of a file or a folder, and a robot and a mapping of one's own imported for them.
 
     Raises:
-        Mismatch: for policies of another robot than was named.
+        Mismatch: for policies of another robot or mapping than was named.
     """
+    from animat.coding.checking import check_mapping
+    from animat.coding.mapping import mapping_named
+    from animat.registry import is_ours
     from animat.robots.checking import check_robot
-    from animat.robots.registry import is_ours, robot_class
+    from animat.robots.registry import REGISTRY
     from animat.training.policy import load_policies
 
-    expected = None if robot is None else robot_class(robot).name
+    expected = None if robot is None else REGISTRY.class_named(robot).name
+    asked = None if mapping is None else mapping_named(mapping)
     policies = load_policies(path)
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
             raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
+        if asked is not None and asked.name != getattr(policy.mapping, "name", None):
+            got = "none" if policy.mapping is None else policy.mapping.name
+            raise Mismatch(f"{name}: expected a policy with the mapping {asked.name}, got one with {got}")
         if not is_ours(policy.robot):
             check_robot(policy.robot)
+        if policy.mapping is not None and not is_ours(policy.mapping):
+            check_mapping(policy.mapping)
     return policies

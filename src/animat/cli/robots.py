@@ -20,10 +20,10 @@ class Robots:
     def run(self) -> dict[str, Any]:
         """List them."""
         from animat.errors import InvalidArgument
-        from animat.robots.registry import robot_names
+        from animat.robots.registry import REGISTRY
 
         listed, unusable = {}, {}
-        for name in self.names or robot_names():
+        for name in self.names or REGISTRY.names():
             try:
                 listed[name] = _told(name)
             except Exception as error:
@@ -37,6 +37,8 @@ class Robots:
             observed = ", ".join(f"{each['name']} ({each['unit']})" for each in robot["observes"])
             parameters = " ".join(f"{key}={_short(value)}" for key, value in robot["parameters"].items())
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
+            if robot["commands"] > 1:
+                print(f"  takes {robot['commands']} commands: train it with as many --readouts")
             for sentence in (*robot["lacks"].values(), *robot["caveats"]):
                 print(f"  {sentence}")
         for name, why in unusable.items():
@@ -58,6 +60,7 @@ def _told(name: str) -> dict[str, Any]:
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],
         "observes": [{"name": each.name, "unit": each.unit} for each in robot.quantities],
         "parameters": robot_to_dict(robot)["parameters"],
+        "commands": robot.n_commands,
         "can": [name for name in WITHOUT if name not in lacks],
         "lacks": lacks,
         "caveats": list(robot.caveats()),

@@ -41,6 +41,8 @@ class Run(Stimulating):
     """A policy file or a folder of them"""
     robot: str | None = None
     """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    mapping: str | None = None
+    """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
     recordings: tuple[Path, ...] = ()
     """Recordings the policies were trained on: their percentiles and prediction; default: the culture is recorded"""
     at_min: float | None = None
@@ -81,7 +83,7 @@ class Run(Stimulating):
         from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.running import check_episodes
-        from animat.coding.mapping import N_PERCENTILES
+        from animat.coding.decoder import percentiles_shape
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.neurons.simulator import check_binning
@@ -93,7 +95,7 @@ class Run(Stimulating):
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        policies = policies_for(self.robot, self.policies)
+        policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
         fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):
@@ -107,7 +109,7 @@ class Run(Stimulating):
             calibration = self._calibration(recordings, first, self.at_min)
             check_conditions(first, calibration)
             conditions = calibration.conditions
-        loop, _ = Loop.of_policy(first, np.zeros(N_PERCENTILES), conditions=conditions, **settings)
+        loop, _ = Loop.of_policy(first, np.zeros(percentiles_shape(first.readouts)), conditions=conditions, **settings)
         with (
             ExitStack() as told,
             # Last, as it makes the folder.
@@ -211,6 +213,7 @@ class Run(Stimulating):
             window_ms=first.window_ms or DEFAULT_WINDOW_MS,
             burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
+            readouts=first.readouts,
         )
         return Calibration.of_series(
             series, first, at_min=at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)

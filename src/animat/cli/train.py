@@ -28,9 +28,12 @@ class Train(Fitting):
     """Files or folders of recordings of one culture"""
     paper: bool = False
     """The paper's setting: 1-threshold, histogram, 10 policies, 60 minutes; default: what works in a closed loop"""
-    mapping: Literal["1-threshold", "9-thresholds", "linear", "none"] | None = None
-    """From responses to motor commands; none: the baseline without neurons; default: 9-thresholds, with --paper
-    1-threshold"""
+    mapping: str | None = None
+    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
+    my_package.mappings:Steep; none: the baseline without neurons; default: 9-thresholds, with --paper 1-threshold"""
+    readouts: str = "all"
+    """What becomes a command each: all channels as one; halves or quadrants of the array; or a file of groups of
+    electrodes, {"left": [1, 2], "right": [3, 4]}. As many as the robot takes commands"""
     policies: int | None = None
     """How many policies, each from its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
@@ -56,8 +59,10 @@ class Train(Fitting):
 
     def run(self) -> dict[str, Any]:
         """Train."""
+        from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
         from animat.progress import Bar
+        from animat.responses.readouts import ALL, count_readouts, read_readouts
         from animat.robots.registry import robot_named
         from animat.training.specification import Training
 
@@ -69,6 +74,11 @@ class Train(Fitting):
         robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
+        readouts = read_readouts(self.readouts)
+        if mapping != "none":
+            expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
+        elif readouts != ALL:
+            raise InvalidArgument(f"--readouts: expected none without neurons, got {self.readouts}")
         training = Training(
             robot=robot,
             mapping=None if mapping == "none" else mapping_named(mapping),
@@ -89,7 +99,7 @@ class Train(Fitting):
         for caveat in robot.caveats():
             print(f"warning: {caveat}", file=sys.stderr)
         fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
-        timeline = None if mapping == "none" else fitting.timeline(self.recordings)
+        timeline = None if mapping == "none" else fitting.timeline(self.recordings, readouts=readouts)
 
         if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.allow:
             raise UnusableData(
@@ -150,8 +160,12 @@ def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
 
 def _control(timeline: SimulatorTimeline) -> str:
     """How much the conditions differ, which bounds what any controller can do."""
-    shares = timeline.fidelities[0].in_simulator
-    told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
+    shares, names = timeline.fidelities[0].in_simulator, timeline.readouts.names
+    if len(names) == 1:
+        told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
+    else:
+        of_each = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, of, strict=True)) for of in shares)
+        told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
     said = next((f.sentence for f in timeline.findings if f.name == "difference"), None)
     first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
     return "\n".join([first, *([said] if said else []), *_memories(timeline)])

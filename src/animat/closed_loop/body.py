@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import ArrayLike
 
 from animat.robots.base import Robot
 
@@ -48,7 +49,7 @@ class Body:
         self._key = jax.random.key(int(rng.integers(2**31)))
         # Compiled now: in the middle of an episode it would cost some hundred milliseconds.
         self.reset(0)
-        self.step(0.0)
+        self.step(np.zeros(() if robot.n_commands == 1 else robot.n_commands))
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
         """Start an episode where the robot draws it; returns what is observed.
@@ -59,8 +60,8 @@ class Body:
         self._state, observation = self._start(self._key, number)
         return np.asarray(observation, np.float64)
 
-    def step(self, u: float) -> Moved:
-        """Move by a command in [-1, 1]."""
+    def step(self, u: ArrayLike) -> Moved:
+        """Move by a command in [-1, 1], or by several."""
         uniforms = self._rng.random(self.robot.noise_size, dtype=np.float32)
-        self._state, reward, terminated, observation = self._step(uniforms, self._state, np.float32(u))
+        self._state, reward, terminated, observation = self._step(uniforms, self._state, np.asarray(u, np.float32))
         return Moved(float(reward), bool(terminated), np.asarray(observation, np.float64))

@@ -62,11 +62,11 @@ class HandMadeRule:
 
     Attributes:
         robot: one with a `heuristic`.
-        means: the mean command of each condition.
+        means: the mean command of each condition; of several commands, one of each.
     """
 
     robot: Robot[Any]
-    means: tuple[float, ...]
+    means: tuple[Any, ...]
 
     def __post_init__(self) -> None:
         # Now: what JAX compiles for a first call would come late in a loop.
@@ -74,8 +74,9 @@ class HandMadeRule:
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
         """The nearest."""
-        wanted = float(capability(self.robot, "heuristic")(observation))
-        return int(np.argmin(np.abs(np.array(self.means, np.float32) - np.float32(wanted))))
+        wanted = np.asarray(capability(self.robot, "heuristic")(observation), np.float32)
+        apart = np.array(self.means, np.float32) - wanted
+        return int(np.argmin(np.abs(apart) if apart.ndim == 1 else np.linalg.norm(apart, axis=1)))
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def controls(
     robot: Robot[Any],
     labels: Sequence[str],
     *,
-    means: Sequence[float] | None,
+    means: Sequence[Any] | None,
     policies: Mapping[str, Controller] | None = None,
 ) -> list[Contender]:
     """The controls of the study.
@@ -140,7 +141,7 @@ def controls(
     Args:
         robot: that is driven.
         labels: of the conditions, in the order of their index.
-        means: the mean command of each condition, for the rule made by hand; None: without that control.
+        means: the mean command (or commands) of each condition, for the rule made by hand; None: without that control.
         policies: by name, who act in turn under the silent and the shuffled control; without any these two are left
             out.
     """

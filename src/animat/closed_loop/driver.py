@@ -74,13 +74,19 @@ class Driver:
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         self._following = None if loop.following is None else Following(loop.following)
         self._percentiles = loop.percentiles
+        self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
         self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
         self._begun: Counter[str] = Counter()
         self._presented = self._stretches = 0
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
-        self._last_command = 0.0
+        self._last_command = self._at_rest
         self._unmoved: tuple[Stretch, Sequence[Stimulus], dict[str, Any]] | None = None
+
+    @property
+    def _at_rest(self) -> float | tuple[float, ...]:
+        n = self._loop.robot.n_commands
+        return 0.0 if n == 1 else (0.0,) * n
 
     @property
     def unfinished(self) -> Record | None:
@@ -108,7 +114,7 @@ class Driver:
         self._begun[contender.name] += 1
         controller = contender.acting(turn)
         observation = self._start(episode, turn)
-        self._last_command = 0.0
+        self._last_command = self._at_rest
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
@@ -196,6 +202,10 @@ class Driver:
         late_s = float(np.max(pulse_time_s - due_at_s))
         late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
         rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
+        x_hz, readout_hz = rate_hz[0], ()
+        if not loop.readouts.are_all:
+            x_hz = loop.readouts.read(stretch, self._members, after_s, loop.window_ms)[0]
+            readout_hz = tuple(np.atleast_1d(x_hz).tolist())
         self._last_pulse_s = self._zero_s + float(after_s[0])
         is_burst = bool(active_ratio[0] > loop.burst_threshold)
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_lead_in
@@ -222,17 +232,18 @@ class Driver:
             "truncated": False,
             "late_s": late_s,
             "decided_s": decided_s,
+            "readout_hz": readout_hz,
         }
         self._presented += 1
         if self._following is not None and stimuli and (contender.calibrates or is_lead_in) and not is_burst:
-            self._following.add(delivered, float(rate_hz[0]))
+            self._following.add(delivered, x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
             if not (again or is_lead_in):
-                tick |= self._move(tick["rate_hz"], is_burst, iteration)
+                tick |= self._move(x_hz, is_burst, iteration)
         finally:
             # Whatever happens to the robot, what the culture did is written down.
             finished = Tick(**tick)
@@ -240,12 +251,13 @@ class Driver:
             self._unmoved = None
         return finished, again
 
-    def _move(self, rate_hz: float, is_burst: bool, iteration: int) -> dict[str, Any]:
+    def _move(self, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int) -> dict[str, Any]:
         loop = self._loop
         handled: Handled = "skipped" if is_burst and loop.on_burst == "skip" else "used"
         if handled == "used":
             # In float32, as when it was trained: a response that lies on a percentile is then on it here as well.
-            self._last_command = float(loop.mapping.command(np.float32(rate_hz), self._percentiles))
+            command = self._decoder.command(np.asarray(x_hz, np.float32)[()], self._percentiles)
+            self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
         self._expect("the robot")
         try:
             moved = self._body.step(self._last_command)

@@ -23,23 +23,22 @@ class Following:
     recording would hold now, and not of what a policy likes to choose.
 
     Args:
-        responses_hz: non-burst responses of each condition, in the order of time. Where a condition has more than
-            `MOST_FOLLOWED`, the newest count, of all conditions the same part.
+        responses_hz: non-burst responses of each condition, in the order of time, shape (responses,), or (responses,
+            readouts). Where a condition has more than `MOST_FOLLOWED`, the newest count, of all conditions the same
+            part.
     """
 
-    def __init__(self, responses_hz: Sequence[Float64[np.ndarray, " responses"]]) -> None:
+    def __init__(self, responses_hz: Sequence[Float64[np.ndarray, "responses *readouts"]]) -> None:
         part = min(1.0, MOST_FOLLOWED / max(len(each) for each in responses_hz))
-        self._newest = [
-            deque((float(x) for x in each), maxlen=max(1, round(part * len(each)))) for each in responses_hz
-        ]
+        self._newest = [deque(each, maxlen=max(1, round(part * len(each)))) for each in responses_hz]
         self.seen = 0
 
-    def add(self, condition: int, rate_hz: float) -> None:
-        """A new non-burst response to a condition."""
+    def add(self, condition: int, rate_hz: Float64[np.ndarray, "*readouts"]) -> None:
+        """A new non-burst response to a condition, of all readouts."""
         self._newest[condition].append(rate_hz)
         self.seen += 1
 
-    def percentiles(self) -> Float32[np.ndarray, " percentiles"]:
-        """P0, P10, ..., P100 of all together, in Hz, shape (11,)."""
+    def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
+        """P0, P10, ..., P100 of all together, in Hz, shape (11,), or (readouts, 11)."""
         pooled = np.concatenate([np.array(each) for each in self._newest])
-        return np.asarray(np.percentile(pooled, np.linspace(0, 100, N_PERCENTILES)), np.float32)
+        return np.asarray(np.percentile(pooled, np.linspace(0, 100, N_PERCENTILES), axis=0).T, np.float32)

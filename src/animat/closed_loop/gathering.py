@@ -108,7 +108,7 @@ class SessionFiles:
     def __enter__(self) -> Self:
         beside = self._stack.enter_context(written_whole(self._folder / TICKS_FILE))
         file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
-        self._table = TickTable(file, self._header.conditions, self._header.observed)
+        self._table = TickTable(file, self._header.conditions, self._header.observed, self._header.readouts)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, shown
 from animat.recordings.recording import Channels
+from animat.responses.readouts import Readouts
 from animat.robots.base import Robot
 from animat.robots.registry import robot_from_dict
 from animat.stimulation.protocol import Presentation
@@ -35,6 +36,7 @@ class Header:
         contenders: their names.
         observed: the columns of the robot's observation, with their units.
         loop: all settings, as JSON.
+        readouts: names of the groups of channels that were read; none where all channels were read as one.
     """
 
     channels: Channels
@@ -47,6 +49,7 @@ class Header:
     contenders: tuple[str, ...]
     observed: tuple[str, ...]
     loop: str
+    readouts: tuple[str, ...] = ()
 
 
 def observed_columns(robot: Robot[Any]) -> list[str]:
@@ -83,6 +86,8 @@ def read_header(file: Path, words: Mapping[str, Any]) -> Header:
     try:
         channels = Channels(np.array(label, np.str_), np.array(electrode, np.int64), np.array(x_um), np.array(y_um))
         presentation = Presentation("mixed", int(pulses))
+        # Logs of before read all channels as one.
+        readouts = Readouts.from_dict(of.at("loop.readouts"))
         # Logs of before had the robot alone.
         observed = (
             of.texts("observed") if "observed" in words else observed_columns(robot_from_dict(of.at("loop.robot")))
@@ -100,6 +105,7 @@ def read_header(file: Path, words: Mapping[str, Any]) -> Header:
         tuple(of.text("name", each, f"contenders[{i}].") for i, each in enumerate(contenders)),
         tuple(observed),
         json.dumps(words["loop"]),
+        () if readouts.are_all else readouts.names,
     )
 
 

@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import ArrayLike
 
+from animat.coding.decoder import Decoder, expect_fit
 from animat.coding.encoder import Encoder
-from animat.coding.mapping import N_PERCENTILES, Mapping
+from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.robots.registry import robot_to_dict
@@ -39,6 +41,10 @@ class Trained(Protocol):
     @property
     def mapping(self) -> Mapping | None:
         """From a response to a command; None for a policy without neurons."""
+
+    @property
+    def readouts(self) -> Readouts:
+        """What is read of the neurons."""
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
@@ -65,7 +71,8 @@ class Loop:
         robot: that is driven.
         mapping: from a response to a command.
         conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
-        percentiles: of the simulator that the policy was trained on, in Hz, shape (11,).
+        percentiles: of the simulator that the policy was trained on, in Hz, shape (11,); of several readouts
+            (readouts, 11).
         following: non-burst responses of each condition in that recording, Hz, in the order of time; where given, the
             percentiles follow the culture (see `animat.closed_loop.following`). None: they are held.
         pulses: of a presentation.
@@ -84,6 +91,7 @@ class Loop:
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
+        readouts: groups of channels that are read, by their electrodes: one for each command of the robot.
 
     Raises:
         InvalidArgument: for a setting that cannot be.
@@ -93,8 +101,8 @@ class Loop:
     robot: Robot[Any]
     mapping: Mapping
     conditions: tuple[Condition, ...]
-    percentiles: Float32[np.ndarray, " percentiles"] = field(repr=False)
-    following: tuple[Float64[np.ndarray, " responses"], ...] | None = field(default=None, repr=False)
+    percentiles: Float32[np.ndarray, "*readouts percentiles"] = field(repr=False)
+    following: tuple[Float64[np.ndarray, "responses *readouts"], ...] | None = field(default=None, repr=False)
     pulses: int = 1
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
     burst_threshold: float = 1.0
@@ -107,11 +115,16 @@ class Loop:
     lead_in: int | None = None
     patience_s: float = 10.0
     real_time: bool = False
+    readouts: Readouts = ALL
 
     def __post_init__(self) -> None:
+        expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
         percentiles = np.array(self.percentiles, np.float32)
-        if percentiles.shape != (N_PERCENTILES,) or not np.all(np.diff(percentiles) >= 0):
-            raise InvalidArgument(f"percentiles: expected {N_PERCENTILES} rising numbers in Hz, got {self.percentiles}")
+        if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):
+            of_each = f" for each of {len(self.readouts)} readouts" if len(self.readouts) > 1 else ""
+            raise InvalidArgument(
+                f"percentiles: expected {N_PERCENTILES} rising numbers in Hz{of_each}, got {self.percentiles}"
+            )
         percentiles.setflags(write=False)
         object.__setattr__(self, "percentiles", percentiles)
         check_window(self.window_ms)
@@ -149,6 +162,11 @@ class Loop:
         """What its actions are as stimuli."""
         return Encoder(self.conditions, self.pulses)
 
+    @property
+    def decoder(self) -> Decoder:
+        """What its responses are as commands."""
+        return Decoder(self.mapping, self.readouts)
+
     @classmethod
     def of_policy(
         cls, policy: Trained, percentiles: ArrayLike, *, pulses: int | None = None, **settings: Any
@@ -156,8 +174,9 @@ class Loop:
         """The loop that a policy was trained for, and where it differs from how the policy's recordings were made.
 
         Args:
-            policy: its robot, mapping, conditions, window and presentation are taken, but for those in `settings`.
-            percentiles: of the simulator that it was trained on, in Hz, shape (11,).
+            policy: its robot, mapping, readouts, conditions, window and presentation are taken, but for those in
+                `settings`.
+            percentiles: of the simulator that it was trained on, in Hz, shape (11,), or (readouts, 11).
             pulses: of a presentation; None: as many as in its recordings (1 where that is not known).
             settings: the other attributes.
 
@@ -169,7 +188,12 @@ class Loop:
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses
-        settings = {"conditions": policy.conditions, "window_ms": policy.window_ms, **settings}
+        settings = {
+            "conditions": policy.conditions,
+            "window_ms": policy.window_ms,
+            "readouts": policy.readouts,
+            **settings,
+        }
         if settings["window_ms"] is None:
             del settings["window_ms"]
         loop = cls(
@@ -182,10 +206,11 @@ class Loop:
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return plain | {
             "robot": robot_to_dict(self.robot),
-            "mapping": self.mapping.name,
+            "mapping": mapping_to_data(self.mapping),
             "conditions": [condition.label for condition in self.conditions],
             "percentiles": self.percentiles.tolist(),
             "following": self.following is not None,
+            "readouts": self.readouts.to_dict(),
             "pulse": self.pulse.to_list(),
         }
 

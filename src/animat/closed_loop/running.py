@@ -82,7 +82,8 @@ def run_session(
 
     Raises:
         InvalidArgument: for a culture that is closed or stopped, no contenders, or a session in the folder already.
-        Mismatch: for conditions on electrodes that the culture cannot stimulate.
+        Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
+            read.
         InvalidFile: if the log cannot be begun.
     """
     planned = [episodes] * len(contenders) if isinstance(episodes, int) else list(episodes)
@@ -338,6 +339,7 @@ def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episod
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if loop.patterns is not None and loop.patterns > len(culture.patterns):
         raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")
+    loop.readouts.members(culture.channels)
     if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(
             f"conditions: expected electrodes that the {culture.name} culture can stimulate "

@@ -26,12 +26,13 @@ class Tick:
         pulse_time_s: when each pulse really began.
         read_after_s: the pulse that the response was read after, or when it would have come.
         spikes: in the response window.
-        rate_hz: x.
+        rate_hz: x of all channels.
+        readout_hz: x of each readout, where these are groups of channels; else empty.
         active_ratio: share of channels that spiked in the window.
         is_burst: whether that is above the threshold.
         handled: what was done with the response; `"lead-in"` before the robot of an episode moves; `"unfinished"` if
             something went wrong before the robot had moved.
-        command: the robot was moved by; None where it was not.
+        command: the robot was moved by, one for each readout where there are several; None where it was not moved.
         reward: of the step.
         observation: after the step.
         terminated: the task ended by itself.
@@ -57,7 +58,7 @@ class Tick:
     active_ratio: float
     is_burst: bool
     handled: Handled
-    command: float | None
+    command: float | tuple[float, ...] | None
     reward: float | None
     observation: tuple[float, ...]
     terminated: bool
@@ -65,13 +66,16 @@ class Tick:
     late_s: float
     decided_s: float
     wall_s: float
+    readout_hz: tuple[float, ...] = ()
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """From what `vars` gave, through JSON."""
-        values = {each.name: data[each.name] for each in fields(cls)}
-        for name in ("patterns", "pulse_time_s", "observation"):
-            values[name] = tuple(values[name])
+        # Logs of before know of no readouts.
+        values = {each.name: data[each.name] for each in fields(cls) if each.name != "readout_hz"}
+        values["readout_hz"] = data.get("readout_hz", ())
+        for name, value in values.items():
+            values[name] = tuple(value) if isinstance(value, list) else value
         return cls(**values)
 
 

@@ -41,12 +41,19 @@ class TickTable:
         file: open for text, without translation of line ends.
         conditions: their names, which `chosen` and `delivered` are told by.
         observed: the columns of the robot's observation.
+        readouts: names of groups of channels, each with a column of its `rate_hz` and, where they are several, of its
+            `command`; none where all channels are read as one.
     """
 
-    def __init__(self, file: TextIO, conditions: Sequence[str], observed: Sequence[str]) -> None:
+    def __init__(
+        self, file: TextIO, conditions: Sequence[str], observed: Sequence[str], readouts: Sequence[str] = ()
+    ) -> None:
         self._writer = csv.writer(file, lineterminator="\n")
-        self._conditions, self._observed = conditions, len(observed)
-        self._writer.writerow((*HEAD, *observed, *TAIL))
+        self._conditions, self._observed, self._readouts = conditions, len(observed), len(readouts)
+        names = [name.replace(" ", "_") for name in readouts]
+        commands = [f"command_{name}" for name in names] if len(names) > 1 else ["command"]
+        head = [each for column in HEAD for each in (commands if column == "command" else [column])]
+        self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))
 
     def add(self, tick: Mapping[str, Any]) -> None:
         """Write a tick, as in the words of its record.
@@ -54,10 +61,11 @@ class TickTable:
         Raises:
             OSError: if it cannot be written.
         """
-        self._writer.writerow(_row(tick, self._conditions, self._observed))
+        self._writer.writerow(_row(tick, self._conditions, self._observed, self._readouts))
 
 
-def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int) -> list[Any]:
+def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int, readouts: int) -> list[Any]:
+    command = tick["command"]
     row = [
         tick["number"],
         tick["read_after_s"],
@@ -74,8 +82,9 @@ def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int) -> l
         tick["active_ratio"],
         int(tick["is_burst"]),
         tick["handled"],
-        tick["command"],
+        *(command if isinstance(command, Sequence) else (command,) * max(1, readouts)),
         tick["reward"],
+        *(tick["readout_hz"] if readouts else ()),
         *(tick["observation"] or (None,) * observed),
         int(tick["terminated"]),
         int(tick["truncated"]),

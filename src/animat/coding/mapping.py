@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass
-from typing import Any, TypeAlias, final
+from dataclasses import dataclass, is_dataclass
+from typing import Any, TypeAlias, TypeVar, final
 
 import numpy as np
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument
+from animat.registry import Registry, is_ours
 
 N_PERCENTILES = 11
 """P0 (the smallest response), P10, ..., P90, P100 (the largest): what every mapping is given."""
@@ -27,7 +28,7 @@ class Mapping(abc.ABC):
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """The name that `mapping_named` knows it by; all that a file needs to hold to give it back."""
+        """The name that `mapping_named` knows it by; in a class of a user's own a plain attribute, `name = "steep"`."""
 
     @abc.abstractmethod
     def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
@@ -117,64 +118,55 @@ class Linear(Mapping):
         smallest, largest = percentiles[0], percentiles[N_PERCENTILES - 1]
         span = largest - smallest
         # Clipped before dividing: the ends are then exactly -1 and +1, and a span of zero leaves 0 / 1.
-        xp = _namespace(x, percentiles)
+        xp = namespace_of(x, percentiles)
         return xp.clip(2 * x - (largest + smallest), -span, span) / (span + (span == 0))
 
 
-_KNOWN: dict[str, Mapping] = {mapping.name: mapping for mapping in (Thresholds(1), Thresholds(9), Linear())}
+REGISTRY: Registry[Mapping] = Registry(
+    "mapping",
+    Mapping,  # type: ignore[type-abstract]
+    {mapping.name: mapping for mapping in (Thresholds(1), Thresholds(9), Linear())},
+    reserved=("none",),
+)
+"""An installed package announces its mappings in the entry point group `animat.mappings`."""
 
-MAPPING_NAMES: tuple[str, ...] = tuple(_KNOWN)
-"""The names that `mapping_named` knows."""
-
-
-def mapping_named(name: str) -> Mapping:
-    """The mapping called `1-threshold`, `9-thresholds` or `linear`.
-
-    Raises:
-        InvalidArgument: for any other name.
-    """
-    try:
-        return _KNOWN[name]
-    except (KeyError, TypeError):
-        raise InvalidArgument(f"mapping: expected one of {', '.join(MAPPING_NAMES)}, got {shown(name)}") from None
+Kind = TypeVar("Kind", bound=type[Mapping])
 
 
-def expect_loadable_mapping(mapping: Mapping) -> None:
-    """Refuse a mapping that a file could name and nothing could give back.
+def register_mapping(kind: Kind) -> Kind:
+    """Make a mapping known by its name, so that policies with it can be saved and loaded; a decorator of its class.
+
+    Args:
+        kind: a frozen dataclass of all parameters, with a `name` and a `command` (see `Mapping`).
 
     Raises:
-        InvalidArgument: for a mapping of one's own, which cannot be registered yet.
+        InvalidArgument: for another class, one that lacks a method, or a name that another mapping has.
     """
-    if _KNOWN.get(mapping.name) != mapping:
-        raise InvalidArgument(
-            f"mapping: expected one that a policy's file can name ({', '.join(MAPPING_NAMES)}), got one of one's own "
-            f"({type(mapping).__name__}), with which no policy could be loaded again; until mappings can be "
-            "registered, train in memory: train(training, timeline, None)"
-        )
+    REGISTRY.register(kind)
+    return kind
 
 
-def check_mapping(mapping: Mapping) -> None:
-    """Ask a mapping for a few commands, and refuse it if they are none.
+def mapping_named(name: str, /, **parameters: float) -> Mapping:
+    """The mapping called `1-threshold`, `9-thresholds` or `linear`, or one of a user's own.
 
-    Raises:
-        InvalidArgument: naming what was expected and what came.
+    Args and errors: as `animat.registry.Registry.named`.
     """
-    kind = type(mapping).__name__
-    if not isinstance(mapping, Mapping):
-        raise InvalidArgument(f"mapping: expected a mapping or the name of one, got {shown(mapping)}")
-    x, percentiles = np.linspace(0.0, 12.0, 25, dtype=np.float32), np.linspace(1.0, 11.0, 11, dtype=np.float32)
-    try:
-        u = np.asarray(mapping.command(x, percentiles))
-        hash(mapping)
-    except Exception as error:
-        # Anything may go wrong in somebody else's mapping.
-        said = (str(error).strip().splitlines() or ["no more is known"])[0]
-        raise InvalidArgument(f"{kind}.command: expected commands, got {type(error).__name__}: {said}") from error
-    if u.shape != x.shape or not np.all(np.abs(u) <= 1):
-        raise InvalidArgument(f"{kind}.command: expected {len(x)} commands from -1 to 1, got {shown(u.tolist())}")
+    return REGISTRY.named(name, **parameters)
 
 
-def _namespace(*arrays: Numbers) -> Any:
+def mapping_to_data(mapping: Mapping) -> str | dict[str, Any]:
+    """The mapping as JSON data: its name; one of a user's own as `animat.registry.Registry.to_dict`."""
+    # What is no dataclass is trained in memory only.
+    return REGISTRY.to_dict(mapping) if is_dataclass(type(mapping)) and not is_ours(mapping) else mapping.name
+
+
+def mapping_from_data(data: str | dict[str, Any]) -> Mapping:
+    """The mapping that `mapping_to_data` made this of; errors as `animat.registry.Registry.from_dict`."""
+    # No file makes anything be imported.
+    return REGISTRY.from_dict({"name": data, "parameters": {}} if isinstance(data, str) else data)
+
+
+def namespace_of(*arrays: Numbers) -> Any:
     """numpy, or the array library of the first array that is of another."""
     for array in arrays:
         if not isinstance(array, np.ndarray | np.generic) and hasattr(array, "__array_namespace__"):

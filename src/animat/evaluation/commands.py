@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
 from animat.animat import Animat, Environment
+from animat.coding.decoder import decoded
 from animat.coding.mapping import Mapping, Thresholds
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
@@ -131,6 +132,20 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     return Commands(np.arange(n_actions), levels, probabilities)
 
 
+def mean_commands(
+    environment: Environment[Any], simulator: NeuronSimulator | None
+) -> tuple[np.ndarray, Float64[np.ndarray, "actions *commands"]]:
+    """What an environment is handed for each action, and the mean command that it leads to.
+
+    Args and errors: as `commands_of`. Several commands are averaged over 2048 responses of equal probability.
+    """
+    if isinstance(environment, Animat) and simulator is not None and environment.robot.n_commands > 1:
+        commands = decoded(environment.mapping, _responses(simulator), jnp.asarray(simulator.percentiles))
+        return np.arange(environment.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
+    of_one = commands_of(environment, simulator)
+    return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
+
+
 def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
     """How many classes of the past make a difference: one where nothing is remembered.
 
@@ -199,7 +214,7 @@ def _pasts(simulator: MemorySimulator) -> Float[Array, "classes pasts"]:
     return recorded[np.minimum(rows, len(recorded) - 1)]
 
 
-def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses"]:
+def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses *readouts"]:
     """Responses to each condition at evenly spaced quantiles, whatever was before."""
     uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
     quantile = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))

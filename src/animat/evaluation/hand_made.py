@@ -7,11 +7,10 @@ from typing import Any, final
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from animat.animat import Environment
-from animat.evaluation.commands import commands_of
+from animat.evaluation.commands import mean_commands
 from animat.evaluation.rollouts import Actor
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.capabilities import capability
@@ -25,11 +24,12 @@ class HandMade(Actor):
 
     Attributes:
         actions: what the environment is handed for each action, shape (1, actions), for one actor.
-        means: the mean command of each, the same shape.
+        means: the mean command of each, the same shape; of several commands shape (1, actions, commands), and the
+            nearest is by the straight line.
     """
 
     actions: Array
-    means: Float[Array, "*actors actions"]
+    means: Float[Array, "..."]
 
     def act(
         self,
@@ -38,7 +38,9 @@ class HandMade(Actor):
         uniforms: Float[Array, " episodes"],
     ) -> Array:
         wanted = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
-        return self.actions[jnp.argmin(jnp.abs(self.means - wanted[:, None]), axis=1)]
+        apart = self.means - wanted[:, None]
+        distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
+        return self.actions[jnp.argmin(distance, axis=1)]
 
 
 def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) -> HandMade:
@@ -49,6 +51,5 @@ def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) 
     """
     # It raises for a robot without one.
     capability(environment.robot, "heuristic")
-    commands = commands_of(environment, simulator)
-    means = np.sum(commands.levels * commands.probabilities, axis=1)
-    return HandMade(jnp.asarray(commands.actions)[None], jnp.asarray(means, jnp.float32)[None])
+    actions, means = mean_commands(environment, simulator)
+    return HandMade(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])

@@ -154,7 +154,7 @@ def with_intervals(
     rng = np.random.default_rng(seed)
     simulators = [fit(each) for each in (responses, *(responses.redrawn(rng) for _ in range(resamples)))]
     grid = _rough(grid_for(environments[0].robot), resolution)
-    rates_hz = [responses.rates_of(i) for i in range(len(responses.conditions))]
+    rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
     differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE
     known = []
     for optimum, environment in zip(optima, environments, strict=True):

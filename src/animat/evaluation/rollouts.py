@@ -94,7 +94,8 @@ class Episodes:
         terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
         presented: how often the neurons got each condition, in all episodes together, shape (actors, conditions); no
             conditions without neurons.
-        passed: how often the response was P50 or more, the same shape.
+        passed: how often the response was P50 or more, the same shape; of several readouts each on its own, shape
+            (actors, conditions, readouts).
     """
 
     __repr__ = briefly
@@ -103,7 +104,7 @@ class Episodes:
     lengths: Int64[np.ndarray, "actors episodes"]
     terminated: Bool[np.ndarray, "actors episodes"]
     presented: Int64[np.ndarray, "actors conditions"]
-    passed: Int64[np.ndarray, "actors conditions"]
+    passed: Int64[np.ndarray, "actors conditions *readouts"]
 
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
@@ -183,6 +184,7 @@ def _roll_out(
     keys: Key[Array, " actors"],
 ) -> tuple[Array, Array, Array, Array, Array]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
+    readouts = () if simulator is None else simulator.percentiles.shape[:-1]
 
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
         start, key = jax.random.split(key)
@@ -192,7 +194,7 @@ def _roll_out(
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),
             jnp.zeros(n_conditions, jnp.int32),
-            jnp.zeros(n_conditions, jnp.int32),
+            jnp.zeros((n_conditions, *readouts), jnp.int32),
             jnp.zeros(episodes, bool),
         )
         return carry, jax.random.split(key, environment.robot.episode_limit)
@@ -209,9 +211,10 @@ def _roll_out(
         lengths = lengths + going
         if simulator is not None:
             delivered = going[:, None] & (outcome.delivered[:, None] == jnp.arange(n_conditions))
-            passes = outcome.rate_hz >= simulator.percentiles[N_PERCENTILES // 2]
+            passes = outcome.rate_hz >= simulator.percentiles[..., N_PERCENTILES // 2]
             presented = presented + delivered.sum(axis=0)
-            passed = passed + (delivered & passes[:, None]).sum(axis=0)
+            of_each = delivered.reshape(*delivered.shape, *(1 for _ in readouts))
+            passed = passed + (of_each & passes[:, None]).sum(axis=0)
         going = going & ~(outcome.terminated | outcome.truncated)
         return outcome.state, going, returns, lengths, presented, passed, terminated
 

@@ -222,7 +222,7 @@ def evaluate(
         InvalidArgument: for no policies, fewer episodes than one, or an `at_min`, a seed or a resolution that is none.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
-    alike = ("robot", "mapping", "conditions", "commands", "percentiles", "delivery")
+    alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery")
     first = first_of_alike(policies, alike, "evaluate it alone")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, which the policies were trained on, got {robot.name}")
@@ -313,6 +313,11 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
         )
     if others := other_stimulus(policy.conditions, timeline.conditions):
         raise Mismatch(f"conditions: {others} in the recordings")
+    if policy.readouts != timeline.readouts:
+        raise Mismatch(
+            f"readouts: expected {', '.join(policy.readouts.names)}, of the electrodes that the policies were trained "
+            f"on, got {', '.join(timeline.readouts.names)}, of others"
+        )
     found = []
     if policy.window_ms != timeline.window_ms:
         found.append(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from animat.errors import AnimatError, out_of_memory
+from animat.errors import AnimatError, first_line, out_of_memory
 from animat.execution.receipts import digest_of
 from animat.progress import Progress
 
@@ -107,6 +107,5 @@ def memory_of(task: Task) -> str:
 
 
 def _unforeseen(error: Exception) -> str:
-    lines = str(error).strip().splitlines() or ["no more is known"]
     place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {lines[0]} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"
+    return f"{first_line(error)} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+from animat.coding.decoder import expect_fit
 from animat.errors import InvalidArgument
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent
-from animat.robots.registry import register_robot
 from animat.training.folder import MANIFEST, describe, expect_trainable, groups_of, is_ours, write_description
 from animat.training.group import CHECKPOINT_S, Group, save_policies, train_group
 from animat.training.policy import Policy
@@ -43,7 +43,7 @@ def train(
         training: what is trained.
         timeline: the culture's simulators; None for a training without neurons.
         folder: where the policies go; made where it is missing. None: nowhere; they are trained in this process, and
-            a training that is stopped begins anew. So can robots that are not registered, and mappings of one's own,
+            a training that is stopped begins anew. So can robots and mappings that are not registered,
             which no file can name.
         workers: processes to use, each pinned to a core of its own; None: as many as there are cores. Not with an
             executor.
@@ -57,8 +57,8 @@ def train(
         The policies by name, `p0` first.
 
     Raises:
-        InvalidArgument: if neurons are missing for a mapping or given without one, for fewer workers than one or any
-            beside an executor, or as `expect_trainable` does.
+        InvalidArgument: if neurons are missing for a mapping or given without one, for readouts that are not as many as
+            the robot's commands, for fewer workers than one or any beside an executor, or as `expect_trainable` does.
         Mismatch: if the folder holds another training, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
         AnimatError: if a process that trains ends before its time.
@@ -70,6 +70,8 @@ def train(
         )
     expect_workers(workers, executor)
     expect_trainable(training, is_saved=folder is not None)
+    if timeline is not None:
+        expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
     progress = progress or Silent()
     training = training.over(timeline)
     manifest = describe(training, timeline, sources)
@@ -114,7 +116,7 @@ class TrainGroup(Task):
         return {"algorithm": self.group.training.algorithm}
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        register_robot(type(self.group.training.robot))
+        self.group.training.register()
         checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
         return train_into(folder, self.group, checkpoint, progress, checkpoint_s=self.checkpoint_s)
 

@@ -23,7 +23,10 @@ Rows = Float32[np.ndarray, "environments numbers"]
 
 
 class Step(NamedTuple):
-    """What one iteration gave, each of shape (environments, ...); rates in Hz, commands in [-1, 1]."""
+    """What one iteration gave, each of shape (environments, ...); rates in Hz, commands in [-1, 1].
+
+    Of several readouts rates and commands have an axis of them.
+    """
 
     states: Rows
     observations: Rows
@@ -61,8 +64,10 @@ class CompiledAnimat:
         given[:, 1:] = rng.random((n, self._noise_size), np.float32)
         rows = np.asarray(self._functions.step(given, states, self._simulator))
         states, rest = self._split(rows, self._size)
-        observations, outcome = self._split(rest, rest.shape[1] - 6)
-        reward, terminated, truncated, delivered, rate_hz, command = outcome.T
+        n_commands = self._animat.robot.n_commands
+        observations, outcome = self._split(rest, rest.shape[1] - 4 - 2 * n_commands)
+        reward, terminated, truncated, delivered, *answered = outcome.T
+        rate_hz, command = answered if n_commands == 1 else np.split(outcome[:, 4:], 2, axis=1)
         return Step(
             states,
             observations,
@@ -108,9 +113,7 @@ def _compiled(animat: Animat[Any]) -> _Functions:
 
     def step(given: Array, state: Array, simulator: Any) -> Array:
         outcome: Outcome = animat.advance(given[1:], unpack(state), given[0].astype(jnp.int32), simulator)
-        numbers = outcome[1:]
-        return jnp.concatenate(
-            [pack(outcome.state), animat.observe(outcome.state), jnp.stack([jnp.float32(x) for x in numbers])]
-        )
+        numbers = [jnp.ravel(x).astype(jnp.float32) for x in outcome[1:]]
+        return jnp.concatenate([pack(outcome.state), animat.observe(outcome.state), *numbers])
 
     return _Functions(flat.size, jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))))

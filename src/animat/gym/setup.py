@@ -12,6 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from animat.animat import Animat, Delivery
+from animat.coding.checking import check_mapping
+from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
 from animat.errors import InvalidArgument
 from animat.neurons.kinds import Kind
@@ -20,7 +22,9 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
+from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS
 from animat.robots.registry import robot_named
@@ -65,6 +69,7 @@ def set_up(
     conditions: str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     kind: Kind | None = None,
+    readouts: str | Readouts = ALL,
     delivery: Delivery = "chosen",
     **parameters: float,
 ) -> Setup:
@@ -72,7 +77,8 @@ def set_up(
 
     Args:
         robot: its name, or where to import it from (`robot_named`); set by the environment's id, but for `Robot-v0`.
-        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`.
+        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`, or
+            one of your own, also by where to import it from.
         recordings: files or folders of recordings of one culture to make the neurons' simulator of.
         simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions
             of `animat.neurons.made_up` answer.
@@ -81,6 +87,7 @@ def set_up(
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
         window_ms: when a response is read after its stimulus.
         kind: `histogram` (the paper), `empirical` or `memory`; None: what suits the recordings (`fit_timeline`).
+        readouts: of the recordings, as many as the robot takes commands: `halves`, `quadrants`, or groups.
         delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
         parameters: of the robot, `pole_mass_kg=0.55`.
 
@@ -95,27 +102,36 @@ def set_up(
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     if recordings is None:
-        reading = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
+        reading: dict[str, Any] = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
+        reading["readouts"] = (readouts, ALL)
         for name, (got, usual) in (reading | {"window_ms": (tuple(window_ms), DEFAULT_WINDOW_MS)}).items():
             if got != usual:
                 raise InvalidArgument(f"{name}: expected only with recordings, of which it says how they are read")
     if recordings is not None:
-        simulator, labels = _simulator_of(recordings, at_min, conditions, window_ms, kind)
+        simulator, labels = _simulator_of(recordings, at_min, conditions, window_ms, kind, readouts)
     elif simulator is not None:
         labels = tuple(f"condition {i}" for i in range(simulator.n_conditions))
     else:
         simulator, labels = made_up_simulator(), LABELS
     if delivery not in ("chosen", "shuffled"):
         raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
+    expect_fit(body.name, body.n_commands, simulator.n_readouts)
     chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
+    if not is_ours(chosen):
+        check_mapping(chosen)
     return Setup(Animat(body, chosen, simulator.n_conditions, delivery), simulator, labels)
 
 
 def _simulator_of(
-    recordings: Paths, at_min: float | None, conditions: str | None, window_ms: tuple[float, float], kind: Kind | None
+    recordings: Paths,
+    at_min: float | None,
+    conditions: str | None,
+    window_ms: tuple[float, float],
+    kind: Kind | None,
+    readouts: str | Readouts,
 ) -> tuple[NeuronSimulator, tuple[str, ...]]:
     by = None if conditions is None else conditions_named(conditions)
-    timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms), kind=kind)
+    timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=readouts), kind=kind)
     for sentence in warnings_once(timeline.findings):
         warnings.warn(sentence, stacklevel=3)
     row = 0 if at_min is None else timeline.row_asked_for(at_min)

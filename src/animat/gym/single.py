@@ -24,7 +24,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
     `truncated` at the robot's `episode_limit`, never both.
 
     `info` of a step: `delivered`, the condition that reached the neurons; `rate_hz`, how they answered (Hz per
-    channel); `command`, the motor command in [-1, 1] made of it.
+    channel); `command`, the motor command in [-1, 1] made of it. Of several readouts both are arrays.
 
     Everything random comes from the generator that `reset(seed=...)` seeds.
 
@@ -45,7 +45,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
         self._compiled = CompiledAnimat(self.setup)
         self._states: Float32[np.ndarray, "1 numbers"] | None = None
         self._shown: list[Float32[np.ndarray, " observations"]] = []
-        self._command = 0.0
+        self._command: float | Float32[np.ndarray, " commands"] = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -66,11 +66,11 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
             raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {action!r}")
         after: Step = self._compiled.step(self._states, np.array([action]), self.np_random)
         self._states = after.states
-        self._command = float(after.command[0])
+        self._command = after.command[0] if np.ndim(after.command[0]) else float(after.command[0])
         self._show(after.observations[0])
         info = {
             "delivered": int(after.delivered[0]),
-            "rate_hz": float(after.rate_hz[0]),
+            "rate_hz": after.rate_hz[0] if np.ndim(after.rate_hz[0]) else float(after.rate_hz[0]),
             "command": self._command,
         }
         return (

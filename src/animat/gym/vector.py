@@ -54,7 +54,9 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         self._states: Rows | None = None
         self._ended: Bool[np.ndarray, " environments"] = np.zeros(num_envs, bool)
         self._shown: list[list[Float32[np.ndarray, " observations"]]] = [[] for _ in range(num_envs)]
-        self._commands = np.zeros(num_envs, np.float32)
+        n_commands = self.setup.animat.robot.n_commands
+        self._at_rest = np.zeros(num_envs if n_commands == 1 else (num_envs, n_commands), np.float32)
+        self._commands = self._at_rest
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Rows, dict[str, Any]]:
         """Start all episodes; one seed decides all of them, and `options` are not used."""
@@ -62,7 +64,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         states, observations = self._compiled.start(self.num_envs, self.np_random)
         self._states = states
         self._ended = np.zeros(self.num_envs, bool)
-        self._show(observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, bool))
+        self._show(observations, self._at_rest, np.ones(self.num_envs, bool))
         return observations, {}
 
     def step(
@@ -98,8 +100,10 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         self._ended = terminated | truncated
         info: dict[str, Any] = {}
         for name in IN_INFO:
-            info[name], info[f"_{name}"] = np.where(going, getattr(after, name), 0), going.copy()
-        self._show(observations, np.where(going, after.command, np.float32(0)), begun)
+            value = getattr(after, name)
+            info[name] = np.where(going.reshape(-1, *(1 for _ in value.shape[1:])), value, value.dtype.type(0))
+            info[f"_{name}"] = going.copy()
+        self._show(observations, info["command"], begun)
         return observations, rewards, terminated, truncated, info
 
     def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
@@ -111,14 +115,14 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
             raise gymnasium.error.ResetNeeded("render: expected episodes that reset() started, got none")
         robot = self.setup.animat.robot
         return tuple(
-            draw_robot(robot, shown[-1], command=float(u), earlier=shown[:-1])
+            draw_robot(robot, shown[-1], command=u if np.ndim(u) else float(u), earlier=shown[:-1])
             for shown, u in zip(self._shown, self._commands, strict=True)
         )
 
     def _show(
         self,
         observations: Rows,
-        commands: Float32[np.ndarray, " environments"],
+        commands: Float32[np.ndarray, "environments *commands"],
         begun: Bool[np.ndarray, " environments"],
     ) -> None:
         """Keep what pictures need; the observations themselves are the user's, so they are copied."""

@@ -11,7 +11,6 @@ from animat.errors import AnimatError
 from animat.execution.task import Task
 from animat.live.exchange import Exchange
 from animat.progress import Progress
-from animat.robots.registry import register_robot
 from animat.training.group import Group, SideBySide, save_policies
 
 
@@ -38,7 +37,7 @@ class TrainAlongside(Task):
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         training = self.group.training
-        register_robot(type(training.robot))
+        training.register()
         swaps: list[dict[str, Any]] = []
         # The policies tell what they were trained on, the last of it known only in the end.
         group = replace(self.group, provenance={**self.group.provenance, "swaps": swaps})

@@ -83,6 +83,11 @@ def check_plan(
     """
     if training.mapping is None:
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
+    if (n := training.robot.n_commands) > 1:
+        raise InvalidArgument(
+            f"robot: expected one command, as a live run reads all channels as one, got {training.robot.name}, which "
+            f"takes {n}: record, train with --readouts, and run"
+        )
     expect_trainable(training, is_saved=True)
     # How long it takes does not depend on which electrodes are pulsed.
     patterns, places = np.zeros((protocol.patterns, 1), np.int64), [(0,)] * protocol.n_places

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import HistogramSimulator, NeuronSimulator
 from animat.recordings.findings import Finding
@@ -24,15 +25,18 @@ class Fidelity:
 
     Attributes:
         labels: the conditions.
-        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,).
-        in_simulator: the same from the simulator, shape (conditions,).
-        n_above_range: non-burst responses above a histogram's range, which were counted into its last bin.
+        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,); of several readouts
+            (conditions, readouts).
+        in_simulator: the same from the simulator, the same shape.
+        n_above_range: non-burst responses, of any readout, above a histogram's range, counted into its last bin.
+        readouts: their names.
     """
 
     labels: tuple[str, ...]
-    in_data: Float[np.ndarray, " conditions"]
-    in_simulator: Float[np.ndarray, " conditions"]
+    in_data: Float[np.ndarray, "conditions *readouts"]
+    in_simulator: Float[np.ndarray, "conditions *readouts"]
     n_above_range: int
+    readouts: tuple[str, ...] = ("all",)
 
     @property
     def largest_loss(self) -> float:
@@ -48,12 +52,10 @@ class Fidelity:
         """
         found = []
         loss = np.abs(self.in_data - self.in_simulator)
-        worst = int(np.argmax(loss))
+        worst = np.unravel_index(np.argmax(loss), loss.shape)
         if loss[worst] > LARGEST_LOSS:
-            changed = (
-                f"changes P(x >= P50) of {self.labels[worst]} from {self.in_data[worst]:.2f} to "
-                f"{self.in_simulator[worst]:.2f}"
-            )
+            of = self.labels[worst[0]] + (f" on {self.readouts[worst[1]]}" if loss.ndim == 2 else "")
+            changed = f"changes P(x >= P50) of {of} from {self.in_data[worst]:.2f} to {self.in_simulator[worst]:.2f}"
             value = float(loss[worst])
             if of_memory:
                 sentence = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
@@ -81,11 +83,11 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; of a
     simulator with memory, of 200 after each past that it knows.
     """
-    median = float(simulator.percentiles[5])
-    kept = ~responses.is_burst
+    median_hz = np.asarray(simulator.percentiles, np.float32)[..., 5]
+    kept, read_hz = ~responses.is_burst, responses.read_hz.astype(np.float32)
     in_data = np.array(
         [
-            np.mean(responses.rate_hz[kept & (responses.condition == c)].astype(np.float32) >= np.float32(median))
+            np.mean(read_hz[kept & (responses.condition == c)] >= median_hz, axis=0)
             for c in range(len(responses.conditions))
         ]
     )
@@ -93,14 +95,15 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     if isinstance(simulator, MemorySimulator):
         x = _drawn_after_each(simulator)
     above = 0
-    if isinstance(simulator, HistogramSimulator):
-        above = int(np.count_nonzero(responses.rate_hz[kept].astype(np.float32) > np.asarray(simulator.edges_hz)[-1]))
+    if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
+        above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
-    return Fidelity(labels, in_data, np.asarray(jnp.mean(x >= median, axis=1), np.float64), above)
+    in_simulator = np.asarray(jnp.mean(x >= median_hz, axis=1), np.float64)
+    return Fidelity(labels, in_data, in_simulator, above, responses.readouts.names)
 
 
 @jax.jit
-def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws"]:
+def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws *readouts"]:
     """Evenly spaced quantiles of every condition; compiled once for all simulators of a shape."""
     uniforms = (jnp.arange(20_000) + 0.5) / 20_000
     draw = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
@@ -108,15 +111,16 @@ def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws"
 
 
 @jax.jit
-def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions draws"]:
+def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions draws *readouts"]:
     """Evenly spaced answers to every condition after each past that one of its own responses had."""
     uniforms = (jnp.arange(200) + 0.5) / 200
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     rows = jnp.arange(simulator.before.shape[1])
 
-    def of_condition(condition: Int[Array, ""]) -> Float[Array, " draws"]:
+    def of_condition(condition: Int[Array, ""]) -> Float[Array, "draws *readouts"]:
         # What is padded is stood for by those that are there, over and over.
         before = simulator.before[condition][rows % simulator.followers[condition]]
-        return answer(condition, uniforms, before).rate_hz.ravel()
+        rate_hz = answer(condition, uniforms, before).rate_hz
+        return rate_hz.reshape(-1, *rate_hz.shape[2:])
 
     return jax.vmap(of_condition)(jnp.arange(simulator.n_conditions))

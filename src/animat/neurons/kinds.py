@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from animat.errors import InvalidArgument
+from animat.neurons.joint_histogram import fit_joint_histogram
 from animat.neurons.memory import Memory, fit_memory
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
 from animat.responses.responses import Responses
@@ -22,12 +23,15 @@ def fit_simulator(
     room: int | None = None,
     memory: Memory | None = None,
 ) -> NeuronSimulator:
-    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others, `memory` of one.
+    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others and of
+    histograms of several readouts, `memory` of one.
 
     Raises:
         InvalidArgument: for another kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
         UnusableData: if a condition has no non-burst response.
     """
+    if kind == "histogram" and len(responses.readouts) > 1:
+        return fit_joint_histogram(responses, bins=bins, range_hz=range_hz, room=room)
     if kind == "histogram":
         return fit_histogram(responses, bins=bins, range_hz=range_hz)
     if kind == "empirical":

@@ -24,7 +24,8 @@ class Memory(NamedTuple):
         p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
 
     with p the past before a response, p' after it, r the response's rank (the share of all responses below it) and m
-    the mean rank of its condition. All are in [0, 1]; 0 after silence.
+    the mean rank of its condition. All are in [0, 1]; 0 after silence. Ranks are of the response of all channels, also
+    where several readouts are read.
 
     Attributes:
         decay: of the past before; 0: only the last presentation is remembered.
@@ -59,7 +60,8 @@ class MemorySimulator(EmpiricalSimulator):
     Attributes:
         before: the past of each of a condition's responses, rising, padded with infinity, shape (conditions, most
             responses).
-        after_hz: the response itself, in that order, shape (conditions, most responses).
+        after_hz: the response itself, in that order, shape (conditions, most responses); of several readouts of one
+            trial each, shape (conditions, most responses, readouts).
         left: what it leaves in the past, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most responses).
         followers: how many of them there are, shape (conditions,): those before which no burst came.
         nearest: k of each condition, shape (conditions,).
@@ -72,7 +74,7 @@ class MemorySimulator(EmpiricalSimulator):
     __repr__ = briefly
 
     before: Float[Stored, "*recordings conditions values"]
-    after_hz: Float[Stored, "*recordings conditions values"]
+    after_hz: Float[Stored, "..."]
     left: Float[Stored, "*recordings conditions values"]
     followers: Int[Stored, "*recordings conditions"]
     nearest: Int[Stored, "*recordings conditions"]
@@ -124,12 +126,12 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     ranked = _Ranked(responses)
     memory = memory or _found(ranked)
     past = ranked.pasts(memory)
-    shape = values.values_hz.shape
-    before, after, left = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+    shape = values.values_hz.shape[:2]
+    before, after, left = np.full(shape, np.inf), np.zeros(values.values_hz.shape), np.zeros(shape)
     for condition, rows in enumerate(ranked.rows):
         in_order = rows[np.argsort(past[rows], kind="stable")]
         before[condition, : len(rows)] = past[in_order]
-        after[condition, : len(rows)] = responses.rate_hz[in_order]
+        after[condition, : len(rows)] = responses.read_hz[in_order]
         left[condition, : len(rows)] = _left(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(

@@ -33,24 +33,27 @@ class Answer(NamedTuple):
     """A response, and what is remembered after it.
 
     Attributes:
-        rate_hz: x, Hz per channel.
+        rate_hz: x, Hz per channel; of several readouts one each, shape (readouts,).
         past: in [0, 1]: 0 after silence, larger the more the culture was driven and has answered of late (see
             `animat.neurons.memory`).
     """
 
-    rate_hz: Float[Array, ""]
+    rate_hz: Float[Array, "*readouts"]
     past: Float[Array, ""]
 
 
 class NeuronSimulator(abc.ABC):
     """What a culture answers to each condition, as a pytree of arrays; so a refresh changes data, never code.
 
+    Where several readouts are read, one draw answers for all of them.
+
     Attributes:
-        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,).
+        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,); of
+            several readouts shape (readouts, 11).
         has_memory: whether what it answers depends on what was before.
     """
 
-    percentiles: Float[Stored, "*recordings percentiles"]
+    percentiles: Float[Stored, "*any percentiles"]
     has_memory: ClassVar[bool] = False
 
     @property
@@ -58,9 +61,17 @@ class NeuronSimulator(abc.ABC):
     def n_conditions(self) -> int:
         """How many conditions it answers to."""
 
+    @property
+    def n_readouts(self) -> int:
+        """For how many readouts it answers at once."""
+        return 1 if self.percentiles.ndim == 1 else int(self.percentiles.shape[0])
+
     @abc.abstractmethod
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
-        """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies."""
+    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
+        """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies.
+
+        Of several readouts, which have no order, any function of a uniform that has their joint law.
+        """
 
     def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], past: Float[Array, ""]) -> Answer:
         """What is answered to a condition, by a uniform in [0, 1), after a past in [0, 1] (0: silence).
@@ -70,7 +81,9 @@ class NeuronSimulator(abc.ABC):
         return Answer(self.quantile(condition, uniform), past)
 
     @final
-    def sample(self, key: PRNGKeyArray, condition: Int[Array, ""], past: float | Array = AT_FIRST) -> Float[Array, ""]:
+    def sample(
+        self, key: PRNGKeyArray, condition: Int[Array, ""], past: float | Array = AT_FIRST
+    ) -> Float[Array, "*readouts"]:
         """Draw one response x to a condition, in Hz per channel, after a past in [0, 1]."""
         return self.answer(condition, jax.random.uniform(key), jnp.asarray(past, jnp.float32)).rate_hz
 
@@ -93,19 +106,25 @@ class HistogramSimulator(NeuronSimulator):
 
     cumulative: Float[Stored, "*recordings conditions edges"]
     edges_hz: Float[Stored, "*recordings edges"]
-    percentiles: Float[Stored, "*recordings percentiles"]
+    percentiles: Float[Stored, "*any percentiles"]
 
     @property
     def n_conditions(self) -> int:
         return self.cumulative.shape[-2]
 
     def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
-        cumulative = self.cumulative[condition]
-        # Twenty comparisons beat a binary search, and an empty bin is never chosen: its two edges share a value.
-        bin_ = jnp.sum(uniform >= cumulative[1:-1])
-        low, high = cumulative[bin_], cumulative[bin_ + 1]
-        within = (uniform - low) / (high - low)
-        return self.edges_hz[bin_] + within * (self.edges_hz[bin_ + 1] - self.edges_hz[bin_])
+        return quantile_of(self.cumulative[condition], self.edges_hz, uniform)
+
+
+def quantile_of(
+    cumulative: Float[Stored, " edges"], edges_hz: Float[Stored, " edges"], uniform: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The quantile of one histogram (see `HistogramSimulator`)."""
+    # Twenty comparisons beat a binary search, and an empty bin is never chosen: its two edges share a value.
+    bin_ = jnp.sum(uniform >= cumulative[1:-1])
+    low, high = cumulative[bin_], cumulative[bin_ + 1]
+    within = (uniform - low) / (high - low)
+    return jnp.asarray(edges_hz[bin_] + within * (edges_hz[bin_ + 1] - edges_hz[bin_]))
 
 
 @jax.tree_util.register_dataclass
@@ -113,25 +132,27 @@ class HistogramSimulator(NeuronSimulator):
 class EmpiricalSimulator(NeuronSimulator):
     """The measured responses themselves: one of a condition's values is drawn, so nothing is lost to binning.
 
-    x(q) = v_(floor(q n)), v the n sorted values of the condition.
+    x(q) = v_(floor(q n)), v the n sorted values of the condition. Of several readouts a value is a whole trial, and
+    trials are sorted by the response of all channels together.
 
     Attributes:
-        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses).
+        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses); of several
+            readouts (conditions, most responses, readouts).
         counts: how many of them there are, shape (conditions,).
         percentiles: as in `NeuronSimulator`.
     """
 
     __repr__ = briefly
 
-    values_hz: Float[Stored, "*recordings conditions values"]
+    values_hz: Float[Stored, "..."]
     counts: Int[Stored, "*recordings conditions"]
-    percentiles: Float[Stored, "*recordings percentiles"]
+    percentiles: Float[Stored, "*any percentiles"]
 
     @property
     def n_conditions(self) -> int:
-        return self.values_hz.shape[-2]
+        return self.counts.shape[-1]
 
-    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, ""]:
+    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
         count = self.counts[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
         row = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -200,7 +221,7 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
     room = int(counts.max()) if room is None else room
     if counts.max() > room:
         raise InvalidArgument(f"room: expected at least {counts.max()}, the largest condition's responses, got {room}")
-    table = np.stack([np.pad(np.sort(x), (0, room - len(x)), mode="edge") for x in values])
+    table = np.stack([_padded(x, room) for x in values])
     return EmpiricalSimulator(
         jnp.asarray(table, jnp.float32), jnp.asarray(counts, jnp.int32), pooled_percentiles(responses)
     )
@@ -208,27 +229,34 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
 
 def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
     """A culture that always answers 0, beside the percentiles of the one that did not: the silent control."""
-    conditions = simulator.n_conditions
+    conditions, readouts = simulator.n_conditions, simulator.percentiles.shape[:-1]
     return EmpiricalSimulator(
-        jnp.zeros((conditions, 1), jnp.float32), jnp.ones(conditions, jnp.int32), simulator.percentiles
+        jnp.zeros((conditions, 1, *readouts), jnp.float32), jnp.ones(conditions, jnp.int32), simulator.percentiles
     )
 
 
-def pooled_percentiles(responses: Responses) -> Float[Array, " percentiles"]:
+def pooled_percentiles(responses: Responses) -> Float[Array, "*readouts percentiles"]:
     """P0, P10, ..., P100 of the non-burst responses of all conditions together, interpolated linearly, in Hz."""
-    return jnp.asarray(np.percentile(_non_burst(responses), PERCENTILES), jnp.float32)
+    return jnp.asarray(np.percentile(_non_burst(responses), PERCENTILES, axis=0).T, jnp.float32)
 
 
-def _non_burst(responses: Responses) -> Float64[np.ndarray, " responses"]:
-    kept: Float64[np.ndarray, " responses"] = responses.rate_hz[~responses.is_burst]
+def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts"]:
+    kept: Float64[np.ndarray, "responses *readouts"] = responses.read_hz[~responses.is_burst]
     if not len(kept):
         raise UnusableData("responses: expected at least one non-burst response, got none")
     return kept
 
 
-def _by_condition(responses: Responses) -> list[Float64[np.ndarray, " responses"]]:
-    kept = ~responses.is_burst
-    values = [responses.rate_hz[kept & (responses.condition == c)] for c in range(len(responses.conditions))]
+def _padded(values: Float64[np.ndarray, "responses *readouts"], room: int) -> Float64[np.ndarray, "room *readouts"]:
+    """With the last one over and over."""
+    return np.concatenate([values, np.repeat(values[-1:], room - len(values), axis=0)])
+
+
+def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *readouts"]]:
+    """The non-burst responses of each condition, sorted by those of all channels together."""
+    order = np.argsort(responses.read_hz if responses.read_hz.ndim == 1 else responses.rate_hz, kind="stable")
+    kept = order[~responses.is_burst[order]]
+    values = [responses.read_hz[kept[responses.condition[kept] == c]] for c in range(len(responses.conditions))]
     for condition, x in zip(responses.conditions, values, strict=True):
         if not len(x):
             raise UnusableData(

@@ -18,6 +18,7 @@ from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, other_stimulus
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 
@@ -49,6 +50,7 @@ class SimulatorTimeline:
             active channels above which a response was left out of each.
         findings: what was noticed in the recordings and in the fits, with the minute in front.
         responses: that the simulators were made of; none where they come from elsewhere.
+        readouts: that they answer for, the same in every recording.
     """
 
     __repr__ = briefly
@@ -62,6 +64,7 @@ class SimulatorTimeline:
     findings: tuple[Finding, ...]
     fitted: dict[str, Any] = field(default_factory=dict)
     responses: tuple[Responses, ...] = ()
+    readouts: Readouts = ALL
 
     def __len__(self) -> int:
         return len(self.start_min)
@@ -121,7 +124,7 @@ def fit_timeline(
 
     Raises:
         InvalidArgument: if there are no responses or the kind is unknown.
-        Mismatch: if the recordings differ in conditions, window or presentation, or two share a minute.
+        Mismatch: if the recordings differ in conditions, window, presentation or readouts, or two share a minute.
         UnusableData: if a condition of a recording has no non-burst response.
     """
     if not series:
@@ -132,7 +135,7 @@ def fit_timeline(
     if kind is None:
         kind = "histogram" if blocked else "memory"
     for other in ordered[1:]:
-        for name in ("conditions", "window_ms", "presentation"):
+        for name in ("conditions", "window_ms", "presentation", "readouts"):
             if getattr(other, name) != getattr(first, name):
                 raise Mismatch(
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
@@ -172,10 +175,11 @@ def fit_timeline(
             "burst_thresholds": [float(responses.threshold) for responses in ordered],
         },
         responses=tuple(ordered),
+        readouts=first.readouts,
     )
 
 
 def _words(value: object) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], Condition):
         return ", ".join(condition.label for condition in value)
-    return str(value)
+    return ", ".join(value.names) if isinstance(value, Readouts) else str(value)

@@ -25,7 +25,8 @@ class Answered:
         episode: which of `returns` each one belongs to, shape (responses,).
         late_s: by how much its pulses came late, shape (responses,).
         moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
-        passed: whether it was P50 or more, as P50 was held or had followed by then, shape (responses,).
+        passed: whether it was P50 or more, as P50 was held or had followed by then, shape (responses,); of several
+            readouts each on its own, shape (responses, readouts).
         returns: of the episodes, in the order of time, shape (episodes,).
     """
 
@@ -33,16 +34,17 @@ class Answered:
     episode: Int64[np.ndarray, " responses"]
     late_s: Float64[np.ndarray, " responses"]
     moved: Bool[np.ndarray, " responses"]
-    passed: Bool[np.ndarray, " responses"]
+    passed: Bool[np.ndarray, "responses *readouts"]
     returns: Float64[np.ndarray, " episodes"]
 
     @property
     def passes(self) -> Passes:
         """Of the responses that moved the robot in each episode, shape (episodes, conditions)."""
-        counts = np.zeros((2, len(self.returns), len(self.responses.conditions)), np.int64)
-        np.add.at(counts[0], (self.episode, self.responses.condition), self.moved)
-        np.add.at(counts[1], (self.episode, self.responses.condition), self.moved & self.passed)
-        return Passes(*counts)
+        shape, readouts = (len(self.returns), len(self.responses.conditions)), self.passed.shape[1:]
+        presented, passed = np.zeros(shape, np.int64), np.zeros((*shape, *readouts), np.int64)
+        np.add.at(presented, (self.episode, self.responses.condition), self.moved)
+        np.add.at(passed, (self.episode[self.moved], self.responses.condition[self.moved]), self.passed[self.moved])
+        return Passes(presented, passed)
 
     @property
     def span_min(self) -> float:
@@ -61,24 +63,29 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     """
     whole = [each for each in session.episodes if each.contender in policies and each.is_whole]
     place = {each.number: row for row, each in enumerate(whole)}
-    p50_hz = float(loop.percentiles[N_PERCENTILES // 2])
+    p50_hz = np.asarray(loop.percentiles, np.float64)[..., N_PERCENTILES // 2]
     presented: list[tuple[int, float, bool, float, float]] = []
-    acted: list[tuple[int, int, float, float, bool, bool]] = []
+    acted: list[tuple[int, int, float, float, bool]] = []
+    passes: list[Bool[np.ndarray, "*readouts"]] = []
+    read_hz: list[Sequence[float]] = []
     for words in session.log.records.words():
         if words["kind"] == "percentiles":
-            p50_hz = words["percentiles_hz"][N_PERCENTILES // 2]
+            p50_hz = np.array(words["percentiles_hz"], np.float64)[..., N_PERCENTILES // 2]
         tick = words.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
         if tick["iteration"] >= 0 and tick["episode"] in place:
-            moved, passed = tick["handled"] == "used", tick["rate_hz"] >= p50_hz
-            acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved, passed))
+            moved = tick["handled"] == "used"
+            read_hz.append(tick.get("readout_hz") or [tick["rate_hz"]])
+            passes.append(loop.readouts.alone(np.array(read_hz[-1])) >= p50_hz)
+            acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved))
         presented.append(
             (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])
         )
     condition, rate_hz, is_burst, first_s, read_s = _columns(presented, 5)
-    episode, at, late_s, active_ratio, moved, passed = _columns(acted, 6)
+    episode, at, late_s, active_ratio, moved = _columns(acted, 5)
     at = at.astype(np.int64)
+    x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
     before_s = np.concatenate([[-np.inf], read_s[:-1]])
     every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), first_s - before_s > SILENCE_S)
     responses = Responses(
@@ -95,9 +102,12 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
         time_s=read_s[at],
         presented=every,
         place=at,
+        readouts=loop.readouts,
+        readout_hz=None if loop.readouts.are_all else x_hz,
     )
     returns = np.array([each.total for each in whole], np.float64)
-    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), passed.astype(bool), returns)
+    passed = np.array(passes, bool).reshape(len(acted), *loop.decoder.percentiles_shape[:-1])
+    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), passed, returns)
 
 
 def _columns(rows: Sequence[tuple[float, ...]], n: int) -> Float64[np.ndarray, "columns rows"]:

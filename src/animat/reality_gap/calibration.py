@@ -16,6 +16,7 @@ from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import FITTED, Policy
@@ -31,7 +32,8 @@ class Calibration:
     Attributes:
         simulator: of the recording.
         redrawn: simulators of bootstrap samples of its responses: what so many could as well have been.
-        responses_hz: non-burst responses of each condition, in the order of time.
+        responses_hz: non-burst responses of each condition, in the order of time, shape (responses,); of several
+            readouts (responses, readouts).
         burst_threshold: ratio of active channels above which its responses were bursts.
         burst_share: of its responses.
         drift: of the recordings up to it; None where one recording tells none.
@@ -39,11 +41,12 @@ class Calibration:
         conditions, window_ms, presentation: of the recording.
         findings: what was noticed.
         fitted: how the simulators were made, as `Policy.fitted`.
+        readouts: that they answer for.
     """
 
     simulator: NeuronSimulator
     redrawn: tuple[NeuronSimulator, ...]
-    responses_hz: tuple[Float64[np.ndarray, " responses"], ...]
+    responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
     burst_threshold: float
     burst_share: float
     drift: MedianDrift | None
@@ -53,9 +56,10 @@ class Calibration:
     presentation: Presentation | None
     findings: tuple[Finding, ...]
     fitted: dict[str, Any]
+    readouts: Readouts = ALL
 
     @property
-    def percentiles(self) -> Float64[np.ndarray, " percentiles"]:
+    def percentiles(self) -> Float64[np.ndarray, "*readouts percentiles"]:
         """P0, P10, ..., P100 of the non-burst responses, Hz."""
         return np.asarray(self.simulator.percentiles, np.float64)
 
@@ -97,7 +101,7 @@ class Calibration:
         calibration = cls(
             simulator=simulator,
             redrawn=tuple(fit_simulator(responses.redrawn(rng), memory=memory, **fit) for _ in range(REDRAWN)),
-            responses_hz=tuple(responses.rates_of(i) for i in range(len(responses.conditions))),
+            responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
             drift=median_drift([each for each in timeline.responses if each.start_min <= start_min]),
@@ -107,12 +111,13 @@ class Calibration:
             presentation=timeline.presentation,
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
+            readouts=timeline.readouts,
         )
         held = policy is not None and policy.percentiles == "first"
         return calibration.holding(timeline.with_first_percentiles().at(start_min).percentiles) if held else calibration
 
     def holding(self, percentiles: Any) -> Self:
-        """The same with one set of percentiles in all simulators, shape (11,): they do not move with the responses."""
+        """The same with one set of percentiles in all simulators: they do not move with the responses."""
 
         def held(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]

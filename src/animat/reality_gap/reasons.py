@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -162,24 +162,30 @@ def answers(evidence: Evidence) -> Finding | None:
     episodes, recorded_hz = len(lived.passed), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
         return None
-    tested = np.flatnonzero((lived.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
+    conditions = np.flatnonzero((lived.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
+    names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
+    # Of one readout there is no axis.
+    of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
+    tested = [(i, of) for i in conditions.tolist() for of in of_readouts]
     told, most = [], 0.0
-    for i in tested.tolist():
-        n, passed = lived.presented[:, i], lived.passed[:, i]
-        share, expected = float(passed.sum() / n.sum()), float(predicted.passes.share[i])
+    for i, of in tested:
+        at: Any = (i, *of)
+        n, passed = lived.presented[:, i], lived.passed[:, *at]
+        share, expected = float(passed.sum() / n.sum()), float(predicted.passes.share[at])
         between = episodes / (episodes - 1) * float(np.sum((passed - share * n) ** 2)) / float(n.sum()) ** 2
         error = max(between, _variance(share, int(n.sum()))) ** 0.5
-        anew = float(np.nanvar(predicted.passes_anew.share[:, i]))
+        anew = float(np.nanvar(predicted.passes_anew.share[:, *at]))
         expected_error = max(anew, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = share - expected
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < LEVEL / len(tested) and abs(difference) >= LEAST_SHARE:
             most = max(most, difference, key=abs)
-            of_condition = evidence.answered.responses.condition == i
+            lived_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
+            on = f" on {names[of[0]]}" if of else ""
             told.append(
-                f"{_conditions(evidence)[i].label} in {share:.2f} +- {error:.2f} ({expected:.2f} +- "
-                f"{expected_error:.2f}; mean {evidence.answered.responses.rate_hz[of_condition].mean():.3g} Hz, "
-                f"{recorded_hz[i].mean():.3g} in the recording)"
+                f"{_conditions(evidence)[i].label}{on} in {share:.2f} +- {error:.2f} ({expected:.2f} +- "
+                f"{expected_error:.2f}; mean {lived_hz:.3g} Hz, "
+                f"{recorded_hz[i][:, *of].mean():.3g} in the recording)"
             )
     if not told:
         return None

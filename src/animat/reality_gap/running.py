@@ -142,7 +142,7 @@ def run_policies(
         contenders += controls(
             loop.robot,
             [condition.label for condition in loop.conditions],
-            means=None if rule is None else np.ravel(rule.means).tolist(),
+            means=None if rule is None else np.asarray(rule.means)[0].tolist(),
             policies=acting,
         )
     else:
@@ -253,15 +253,15 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
 
     Raises:
         InvalidArgument: for none.
-        Mismatch: if they differ in robot, mapping, conditions, presentation, response window, or in how the simulators
-            were made that they were trained on.
+        Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, or in how the
+            simulators were made that they were trained on.
     """
-    alike = ("robot", "mapping", "conditions", "presentation", "window_ms", "fitted")
+    alike = ("robot", "mapping", "readouts", "conditions", "presentation", "window_ms", "fitted")
     return first_of_alike(policies, alike, "run it alone")
 
 
 def check_conditions(first: Policy, calibration: Calibration) -> None:
-    """Raise unless a calibration is for the conditions that policies pick from.
+    """Raise unless a calibration is for the conditions that policies pick from, and the readouts that they act by.
 
     Raises:
         Mismatch: if it is not.
@@ -272,6 +272,11 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
         raise Mismatch(
             f"conditions: expected {', '.join(c.label for c in first.conditions)}, which the policies pick from, got "
             f"recordings with {', '.join(c.label for c in calibration.conditions)}"
+        )
+    if first.readouts != calibration.readouts:
+        raise Mismatch(
+            f"readouts: expected {', '.join(first.readouts.names)}, of the electrodes that the policies were trained "
+            f"on, got recordings read as {', '.join(calibration.readouts.names)}"
         )
     if others := other_stimulus(first.conditions, calibration.conditions):
         raise Mismatch(f"conditions: {others} in the recordings: run on those that the policies were trained on")

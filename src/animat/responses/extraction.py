@@ -14,6 +14,7 @@ from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import BurstSeparation, separate_bursts
 from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
 from animat.responses.quality.responses import findings_on, findings_without_times
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Presented, Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 
@@ -26,11 +27,12 @@ def responses_of(
     by: Conditions | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
+    readouts: Readouts = ALL,
 ) -> Responses:
     """The responses of a recording (`extract_responses`) or of a table (`responses_of_table`)."""
     if isinstance(source, Recording):
-        return extract_responses(source, by, window_ms, burst_threshold)
-    return responses_of_table(source, by, window_ms, burst_threshold)
+        return extract_responses(source, by, window_ms, burst_threshold, readouts)
+    return responses_of_table(source, by, window_ms, burst_threshold, readouts)
 
 
 def extract_responses(
@@ -38,6 +40,7 @@ def extract_responses(
     by: Conditions | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
+    readouts: Readouts = ALL,
 ) -> Responses:
     """The response to the last pulse of every presentation that has a condition.
 
@@ -54,10 +57,12 @@ def extract_responses(
         by: what makes a condition; by frequency where it is known, else all in one.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
+        readouts: groups of channels whose x is read too, in the same windows; bursts are told by all channels.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
         UnusableData: for a recording without channels.
+        Mismatch: for one whose channels do not read all electrodes of the readouts.
 
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
         only where it finds two groups).
@@ -72,6 +77,10 @@ def extract_responses(
     # Those without a condition are read too: they are what came before others.
     rate_hz, active_ratio = read_windows(recording, stimuli.time_s[presented], window_ms)
     responses, assignment, bursts = _sorted(recording, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    if not readouts.are_all and responses.time_s is not None:
+        members = readouts.members(recording.channels)
+        readout_hz = readouts.read(recording, members, responses.time_s, window_ms)
+        responses = replace(responses, readouts=readouts, readout_hz=readout_hz)
     return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))
 
 
@@ -80,6 +89,7 @@ def responses_of_table(
     by: Conditions | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
+    readouts: Readouts = ALL,
 ) -> Responses:
     """The response to the last pulse of every presentation that has a condition, of a table of counts or rates.
 
@@ -91,6 +101,7 @@ def responses_of_table(
         window_ms: the window that was counted in, where the table does not say; one that it says goes before the
             default one.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
+        readouts: groups of channels whose x is read too, in the same windows; bursts are told by all channels.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
@@ -115,6 +126,10 @@ def responses_of_table(
     active_ratio = np.mean(table.values[presented] > 0, axis=1)
     responses, assignment, bursts = _sorted(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
     found = findings_without_times(responses, table.stimuli, assignment, bursts)
+    if not readouts.are_all:
+        members, values = readouts.members(table.channels), table.values[presented[responses.presentations[1]]]
+        readout_hz = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1) * scale
+        responses = replace(responses, readouts=readouts, readout_hz=readouts.alone(readout_hz))
     return replace(responses, findings=(*assumed, *found))
 
 

@@ -14,6 +14,7 @@ from animat.errors import Mismatch
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
+from animat.responses.readouts import ALL, Readouts
 from animat.stimulation.protocol import Presentation
 
 
@@ -70,6 +71,9 @@ class Responses:
         place: where among them each response is, shape (responses,).
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None where it is not known.
         burst_threshold: the threshold that was given in place of Otsu's; None: none was.
+        readouts: what is read of each response; by default all channels as one.
+        readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None for all channels as
+            one, whose x is `rate_hz`.
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
@@ -94,6 +98,8 @@ class Responses:
     place: Int64[np.ndarray, " responses"] | None = None
     by: str | None = None
     burst_threshold: float | None = None
+    readouts: Readouts = ALL
+    readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {
@@ -111,6 +117,14 @@ class Responses:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         self._check_places()
+        if (self.readout_hz is None) != self.readouts.are_all:
+            raise Mismatch("responses.readout_hz: expected some where readouts are groups of channels, and only there")
+        if self.readout_hz is not None:
+            array = np.array(self.readout_hz, np.float64)
+            if array.shape != (shape := (len(self),) if len(self.readouts) == 1 else (len(self), len(self.readouts))):
+                raise Mismatch(f"responses.readout_hz: expected shape {shape}, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, "readout_hz", array)
         if len(self) and not (self.condition.min() >= 0 and self.condition.max() < len(self.conditions)):
             raise Mismatch(
                 f"responses.condition: expected indices of {len(self.conditions)} conditions, "
@@ -145,6 +159,21 @@ class Responses:
         presented, place = self.presentations
         before_hz = np.concatenate([[0.0], np.where(presented.is_burst, np.nan, presented.rate_hz)])[:-1]
         return np.asarray(np.where(presented.is_rested, 0.0, before_hz)[place])
+
+    @property
+    def read_hz(self) -> Float64[np.ndarray, "responses *readouts"]:
+        """x of the readouts, Hz: what simulators are made of, and decoders read."""
+        return self.rate_hz if self.readout_hz is None else self.readout_hz
+
+    def read_of(self, condition: int) -> Float64[np.ndarray, "non_bursts *readouts"]:
+        """x of the readouts in the non-burst responses to one condition, in Hz."""
+        return np.asarray(self.read_hz[(self.condition == condition) & ~self.is_burst])
+
+    def of_readout(self, readout: int) -> Responses:
+        """The responses of one of several readouts, as if it were all that is read."""
+        rate_hz = self.read_hz[:, readout]
+        # What was presented without a condition is known of all channels only.
+        return replace(self, rate_hz=rate_hz, readouts=ALL, readout_hz=None, presented=None, place=None)
 
     @property
     def non_burst_rate_hz(self) -> Float64[np.ndarray, " non_bursts"]:
@@ -188,9 +217,12 @@ class Responses:
     def _rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
         """Some of the responses; what was presented before them is kept."""
         presented, place = self.presentations
-        columns = {name: getattr(self, name)[rows] for name in ("condition", "rate_hz", "active_ratio", "is_burst")}
-        time_s = None if self.time_s is None else self.time_s[rows]
-        return replace(self, **columns, time_s=time_s, presented=presented, place=place[rows])
+        columns: dict[str, Any] = {
+            name: getattr(self, name)[rows] for name in ("condition", "rate_hz", "active_ratio", "is_burst")
+        }
+        for name in ("time_s", "readout_hz"):
+            columns[name] = None if getattr(self, name) is None else getattr(self, name)[rows]
+        return replace(self, **columns, presented=presented, place=place[rows])
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
         """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""

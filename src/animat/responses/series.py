@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.conditions import Conditions
 from animat.responses.extraction import responses_of
+from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS
 
@@ -34,6 +35,7 @@ def extract_series(
     *,
     burst_threshold: float | None = None,
     allow: Sequence[str] = (),
+    readouts: str | Readouts = ALL,
 ) -> list[Responses]:
     """Extract the responses of recordings that are to be learned from.
 
@@ -43,18 +45,22 @@ def extract_series(
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         allow: names of findings (`"dead-window"`) to go on in spite of.
+        readouts: groups of channels, the same electrodes in all recordings; `halves` and `quadrants` are those of the
+            first one.
 
     Raises:
         UnusableData: if a finding says that learning from a recording makes no sense, and is not in `allow`.
-        InvalidArgument: for a name in `allow` of no finding that refuses.
+        InvalidArgument: for a name in `allow` of no finding that refuses, or readouts that the channels cannot have.
+        Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     check_allowed(allow)
     series = []
     for recording in recordings:
         try:
-            responses = responses_of(recording, by, window_ms, burst_threshold)
-        except UnusableData as error:
-            raise UnusableData(f"the recording at {recording.start_min:g} min: {error}") from error
+            readouts = readouts_on(readouts, recording.channels)
+            responses = responses_of(recording, by, window_ms, burst_threshold, readouts)
+        except (UnusableData, Mismatch) as error:
+            raise type(error)(f"the recording at {recording.start_min:g} min: {error}") from error
         for finding in (*noticed(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
                 raise UnusableData(

@@ -58,7 +58,7 @@ class Quantity:
 
 
 class Robot(abc.ABC, Generic[State]):
-    """A body with a task, driven by one motor command u in [-1, 1] an iteration.
+    """A body with a task, driven by a motor command u in [-1, 1] an iteration, or by several.
 
     Implementations are frozen dataclasses whose fields are all parameters, with units in their names: they compare,
     hash (so they are static under `jax.jit`) and go to JSON. JAX is imported when the robot first moves, not before:
@@ -77,6 +77,9 @@ class Robot(abc.ABC, Generic[State]):
 
     name: ClassVar[str]
     """What `animat.robots.robot_named` knows it by."""
+
+    n_commands: ClassVar[int] = 1
+    """How many motor commands it takes at once, each the command of a readout (`animat.coding.decoder`)."""
 
     noise_size: ClassVar[int] = 0
     """How many uniform random numbers in [0, 1) one iteration consumes."""
@@ -106,14 +109,14 @@ class Robot(abc.ABC, Generic[State]):
 
     @abc.abstractmethod
     def advance(
-        self, uniforms: Float[Array, " noise_size"], state: State, u: Float[Array, ""]
+        self, uniforms: Float[Array, " noise_size"], state: State, u: Float[Array, "*commands"]
     ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
         """One iteration, with its random numbers given: no random generator runs inside.
 
         Args:
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration.
-            u: the motor command, in [-1, 1].
+            u: the motor command, in [-1, 1]; of several, shape (n_commands,).
 
         Returns:
             the state after the iteration, the reward in the task's own units, and whether the task ended.
@@ -124,7 +127,9 @@ class Robot(abc.ABC, Generic[State]):
         """What a controller sees of `state`, in the units of `quantities`, float32, shape (observations,)."""
 
     @final
-    def step(self, key: Array, state: State, u: Float[Array, ""]) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
+    def step(
+        self, key: Array, state: State, u: Float[Array, "*commands"]
+    ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
         """One iteration, its random numbers drawn from `key`; arguments and results as in `advance`."""
         import jax
 

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import AnimatError, InvalidArgument, shown
+from animat.errors import AnimatError, InvalidArgument, first_line, shown
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
 
 _STEPS = 3
+MOST_COMMANDS = 64
 
 
 def check_robot(robot: Robot[Any]) -> None:
@@ -29,6 +30,7 @@ def check_robot(robot: Robot[Any]) -> None:
 
     name = _named(robot)
     observations, noise = len(robot.quantities), robot.noise_size
+    one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)
 
     def episode(key: Any) -> Any:
@@ -39,7 +41,7 @@ def check_robot(robot: Robot[Any]) -> None:
         # Commands at both ends and in the middle.
         for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
             uniforms = jnp.full(noise, 0.5, jnp.float32)
-            step = _tried(f"{name}.advance", robot.advance, uniforms, state, jnp.asarray(u))
+            step = _tried(f"{name}.advance", robot.advance, uniforms, state, jnp.full(one_command, u))
             if not isinstance(step, tuple) or len(step) != 3:
                 raise InvalidArgument(f"{name}.advance: expected (state, reward, whether it ended), got {shown(step)}")
             after, reward, ended = step
@@ -50,7 +52,7 @@ def check_robot(robot: Robot[Any]) -> None:
             told.append((after, seen, jnp.asarray(reward, jnp.float32)))
             if heuristic is not None:
                 command = _tried(f"{name}.heuristic", heuristic, seen)
-                _expect_shape(f"{name}.heuristic", command, (), "a command")
+                _expect_shape(f"{name}.heuristic", command, one_command, "a command")
                 wanted.append(jnp.asarray(command, jnp.float32))
         return told, wanted
 
@@ -60,8 +62,8 @@ def check_robot(robot: Robot[Any]) -> None:
     except InvalidArgument as error:
         # JAX has put a note of its own to it.
         raise InvalidArgument(str(error)) from error.__cause__
-    if not all(abs(command) <= 1 for command in commands):
-        got = ", ".join(f"{command:g}" for command in commands)
+    if not np.all(np.abs(commands) <= 1):
+        got = ", ".join(f"{command:g}" for command in np.ravel(commands))
         raise InvalidArgument(f"{name}.heuristic: expected commands from -1 to 1, got {got}")
     for state, seen, reward in told:
         for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
@@ -74,7 +76,11 @@ def _named(robot: Any) -> str:
     kind = type(robot).__name__
     if not isinstance(robot, Robot):
         raise InvalidArgument(f"robot: expected a robot or the name of one, got {shown(robot)}")
-    for name, least, most in (("noise_size", 0, 10_000), ("episode_limit", 1, LONGEST_EPISODE)):
+    for name, least, most in (
+        ("n_commands", 1, MOST_COMMANDS),
+        ("noise_size", 0, 10_000),
+        ("episode_limit", 1, LONGEST_EPISODE),
+    ):
         value = getattr(robot, name, None)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
             raise InvalidArgument(f"{kind}.{name}: expected a whole number from {least} to {most}, got {shown(value)}")
@@ -104,10 +110,7 @@ def _tried(what: str, call: Callable[..., Any], *arguments: Any) -> Any:
         raise
     except Exception as error:
         # Anything may go wrong in somebody else's robot.
-        said = (str(error).strip().splitlines() or ["no more is known"])[0]
-        raise InvalidArgument(
-            f"{what}: expected it to run under jax.jit, got {type(error).__name__}: {said}"
-        ) from error
+        raise InvalidArgument(f"{what}: expected it to run under jax.jit, got {first_line(error)}") from error
 
 
 def _expect_shape(what: str, value: Any, shape: tuple[int, ...], words: str, kind: type = float) -> None:

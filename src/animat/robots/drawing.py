@@ -37,7 +37,7 @@ def draw_robot(
     robot: Robot[Any],
     observation: Float[np.ndarray, " observations"],
     *,
-    command: float = 0.0,
+    command: float | Float[np.ndarray, " commands"] = 0.0,
     earlier: Sequence[Float[np.ndarray, " observations"]] = (),
     height_px: int = 360,
 ) -> Picture:
@@ -46,7 +46,7 @@ def draw_robot(
     Args:
         robot: one with a method `draw`.
         observation: in the robot's own units.
-        command: the motor command u in [-1, 1] that led here.
+        command: the motor command u in [-1, 1] that led here; of several, all or the one that they all were.
         earlier: the observations of the episode before this one.
         height_px: height of the picture; its width follows.
 
@@ -56,6 +56,8 @@ def draw_robot(
     Raises:
         InvalidArgument: for a robot that has no such method, or one that gives no picture.
     """
+    if robot.n_commands > 1:
+        command = np.broadcast_to(command, robot.n_commands)
     drawn = capability(robot, "draw")(np.asarray(observation, np.float64), command, earlier, height_px)
     picture = np.asarray(drawn)
     if picture.shape[2:] != (3,) or picture.dtype != np.uint8:

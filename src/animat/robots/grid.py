@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, first_line, shown
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 
@@ -191,8 +191,10 @@ def grid_for(robot: Robot[Any]) -> Grid:
     """The robot's own grid, its `value_grid`.
 
     Raises:
-        InvalidArgument: for a robot that has none, or has none with its parameters.
+        InvalidArgument: for a robot that has none, has none with its parameters, or takes several commands.
     """
+    if robot.n_commands > 1:
+        raise InvalidArgument(f"{robot.name}: expected one command for a best possible return, got {robot.n_commands}")
     make = capability(robot, "value_grid")
     try:
         grid = make()
@@ -200,10 +202,7 @@ def grid_for(robot: Robot[Any]) -> Grid:
         raise
     except Exception as error:
         # Anything may go wrong in somebody else's robot.
-        said = (str(error).strip().splitlines() or ["no more is known"])[0]
-        raise InvalidArgument(
-            f"{robot.name}.value_grid: expected a Grid, got {type(error).__name__}: {said}"
-        ) from error
+        raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {first_line(error)}") from error
     if not isinstance(grid, Grid):
         raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {shown(grid)}")
     return grid

@@ -75,7 +75,7 @@ class Control(StudyTask):
         study, timeline = as_recorded(self.study, folder)
         condition, robot = replace(self.plain, delivery="chosen"), self.body.name
         setting = setting_of(study, self.body, condition, timeline)
-        name = f"controls-{condition.mapping}" + ("-held" if condition.percentiles == "first" else "")
+        name = f"controls-{condition.thresholds}"
         arm = named_mapping(condition.mapping, condition.percentiles)
         networks = _networks(study, folder, self.body, self.plain) if is_usual(self.plain) else None
         parts = []

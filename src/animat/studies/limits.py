@@ -35,8 +35,8 @@ def kinds_of(study: Study) -> list[StudyCondition]:
 
 
 def rough_kinds(study: Study) -> list[StudyCondition]:
-    """Of `kinds_of`, those whose limit is computed at every recording: the linear mapping's would take long."""
-    return [kind for kind in kinds_of(study) if kind.through_neurons and kind.mapping != "linear"]
+    """Of `kinds_of`, those whose limit is computed at every recording; of mappings without steps that is long."""
+    return [kind for kind in kinds_of(study) if kind.has_steps]
 
 
 def limits_of_all(folder: Path, robot: str, what: str = "limits") -> list[Limit]:

@@ -47,8 +47,7 @@ def paths_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
 
 def controls_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
     """The episodes of the controls of a condition's mapping on a robot."""
-    held = "-held" if condition.percentiles == "first" else ""
-    return folder / "controls" / body.name / f"{condition.mapping}{held}" / "episodes.npz"
+    return folder / "controls" / body.name / condition.thresholds / "episodes.npz"
 
 
 def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:

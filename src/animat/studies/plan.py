@@ -69,7 +69,7 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
     for kind in kinds_of(study):
         plain = plain_condition(study, kind)
         groups = [f"train/{body.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies)]
-        name = f"controls/{body.name}/{kind.mapping}" + ("-held" if kind.percentiles == "first" else "")
+        name = f"controls/{body.name}/{kind.thresholds}"
         jobs.append(Job(name, Control(study, body, plain), (*groups, *neurons), 6))
     resolution = body.limit_resolution or study.limit_resolution
     cost_s = 40 * resolution ** len(body.robot().quantities) + 10

@@ -8,6 +8,8 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
+from animat.coding.checking import check_mapping
+from animat.coding.mapping import mapping_named
 from animat.errors import InvalidFile
 from animat.execution.jobs import Jobs, expect_workers
 from animat.execution.task import UNFINISHED
@@ -81,6 +83,9 @@ def run_study(
             for body in study.robots:
                 if ":" in body.kind:
                     check_robot(body.robot())
+            for condition in study.conditions:
+                if ":" in condition.mapping:
+                    check_mapping(mapping_named(condition.mapping))
             took_s = left.run(workers=workers, executor=executor, progress=progress or Silent())
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     return Ran(folder, folder / REPORT, len(jobs), took_s)

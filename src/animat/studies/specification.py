@@ -11,18 +11,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, AliasChoices, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
-from animat.coding.mapping import MAPPING_NAMES
+from animat.coding.mapping import Thresholds, mapping_named
 from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
 from animat.recordings.made_up import MadeUpCulture
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
+from animat.registry import is_ours, place_of
 from animat.robots.base import MOST_AT_ONCE, Robot
-from animat.robots.registry import is_ours, place_of, robot_named
+from animat.robots.registry import robot_named
 from animat.stimulation.protocol import Protocol
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
-MAPPINGS = (*MAPPING_NAMES, "none")
-"""Names of mappings that a condition may have; none is the baseline without neurons."""
 MOST_SESSIONS, MOST_PRESENTATIONS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
 """Recordings, presentations in each, and entries of a list; `docs/studies.md` states them."""
 MOST_TRAINED = 20_000
@@ -164,6 +163,11 @@ class Body:
         robot = self.robot()
         if self.name == "culture":
             raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
+        if robot.n_commands > 1:
+            raise InvalidArgument(
+                f"{robot.name}: expected one command, as a study reads all channels as one, got {robot.n_commands}: "
+                "train it with animat train --readouts"
+            )
         if not is_ours(robot):
             # Workers know it by that.
             object.__setattr__(self, "kind", place_of(type(robot)))
@@ -184,7 +188,8 @@ class StudyCondition:
 
     Attributes:
         name: what it is called in tables and folders.
-        mapping: from responses to commands; `"none"` is the baseline without neurons.
+        mapping: from responses to commands, or where to import one from, `my_package.mappings:Steep`, which is filled
+            in for mappings that are not ours; `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
         percentiles: of the mapping: `"moving"` with the simulator, or held from the `"first"` recording.
@@ -199,8 +204,9 @@ class StudyCondition:
     trained: Flag = True
 
     def __post_init__(self) -> None:
-        if self.mapping not in MAPPINGS:
-            raise InvalidArgument(f"mapping: expected one of {', '.join(MAPPINGS)}, got {shown(self.mapping)}")
+        if self.through_neurons and not is_ours(mapping := mapping_named(self.mapping)):
+            # Workers know it by that.
+            object.__setattr__(self, "mapping", place_of(type(mapping)))
 
     @property
     def slug(self) -> str:
@@ -211,6 +217,17 @@ class StudyCondition:
     def through_neurons(self) -> bool:
         """Whether there are neurons in it."""
         return self.mapping != "none"
+
+    @property
+    def thresholds(self) -> str:
+        """Its mapping and how the percentiles are held, as a folder's name."""
+        name = mapping_named(self.mapping).name if self.through_neurons else self.mapping
+        return name + ("-held" if self.percentiles == "first" else "")
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether its mapping gives a few commands only, with which best possible returns are quick."""
+        return self.through_neurons and isinstance(mapping_named(self.mapping), Thresholds)
 
     @property
     def learns_one_recording(self) -> bool:

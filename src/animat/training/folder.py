@@ -12,12 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from animat.coding.mapping import check_mapping, expect_loadable_mapping
+from animat.coding.checking import check_mapping
+from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.differences import description_in, fingerprint_of, first_difference, of_another
 from animat.errors import InvalidFile, Mismatch
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
-from animat.robots.registry import expect_loadable_robot
+from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.group import Group, split_groups
 from animat.training.specification import Training
 from animat.writing import written_whole
@@ -40,10 +41,12 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
     check_robot(training.robot)
     if training.mapping is not None:
         check_mapping(training.mapping)
+    else:
+        training.environment(0)
     if is_saved:
-        expect_loadable_robot(training.robot, in_workers=True)
+        ROBOTS.expect_loadable(training.robot, in_workers=True)
         if training.mapping is not None:
-            expect_loadable_mapping(training.mapping)
+            MAPPINGS.expect_loadable(training.mapping, in_workers=True)
 
 
 def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
@@ -69,6 +72,8 @@ def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
         "window_ms": timeline.window_ms,
         "presentation": None if timeline.presentation is None else str(timeline.presentation),
         "recorded_at_min": timeline.start_min.tolist(),
+        # Folders of before have none, and go on.
+        **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
 
 

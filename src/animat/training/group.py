@@ -20,6 +20,7 @@ from animat.errors import InvalidFile
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
+from animat.responses.readouts import ALL
 from animat.training.policy import Policy
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
@@ -177,6 +178,7 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
         commands=training.commands,
         window_ms=timeline.window_ms if timeline else None,
         presentation=timeline.presentation if timeline else None,
+        readouts=timeline.readouts if timeline else ALL,
         provenance=group.provenance,
         learning_curve=curve,
     )

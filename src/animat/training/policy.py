@@ -18,14 +18,18 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 
 from animat.brief import briefly
-from animat.coding.mapping import Mapping, expect_loadable_mapping, mapping_named
+from animat.coding.decoder import expect_fit
+from animat.coding.mapping import REGISTRY as MAPPINGS
+from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file, is_folder
 from animat.records import Number, read_record
 from animat.responses.condition import Condition
+from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
-from animat.robots.registry import expect_loadable_robot, robot_from_dict, robot_to_dict
+from animat.robots.registry import REGISTRY as ROBOTS
+from animat.robots.registry import robot_from_dict, robot_to_dict
 from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance
 from animat.writing import written_whole
@@ -63,6 +67,7 @@ class Policy:
         presentation: how stimuli were presented when the neurons were recorded; None where it is not known.
         provenance: what it was trained on and how, as plain data.
         learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
+        readouts: what is read of the neurons, by the electrodes of each command.
     """
 
     __repr__ = briefly
@@ -78,6 +83,7 @@ class Policy:
     presentation: Presentation | None = None
     provenance: Dict[str, Any] = field(default_factory=dict)
     learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    readouts: Readouts = ALL
 
     def __post_init__(self) -> None:
         self._expect_network()
@@ -88,6 +94,8 @@ class Policy:
         if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
             raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
         expect_provenance(self.provenance)
+        if self.mapping is not None:
+            expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
     def _expect_network(self) -> None:
         """Refuse weights of which no action can be made, or one that means nothing."""
@@ -203,13 +211,13 @@ class Policy:
 
         Raises:
             InvalidFile: if it cannot be written; what stood there before is unchanged.
-            InvalidArgument: for a robot that is not registered or a mapping of one's own: the file could not be loaded.
+            InvalidArgument: for a robot or a mapping that is not registered: the file could not be loaded.
         """
         from safetensors.numpy import save
 
-        expect_loadable_robot(self.robot)
+        ROBOTS.expect_loadable(self.robot)
         if self.mapping is not None:
-            expect_loadable_mapping(self.mapping)
+            MAPPINGS.expect_loadable(self.mapping)
 
         arrays = {"scales": self.scales, "learning_curve": self.learning_curve}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -218,12 +226,13 @@ class Policy:
             "format": FORMAT,
             "hidden_activation": HIDDEN_ACTIVATION,
             "robot": robot_to_dict(self.robot),
-            "mapping": None if self.mapping is None else self.mapping.name,
+            "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "conditions": [asdict(condition) for condition in self.conditions],
             "commands": self.commands,
             "window_ms": self.window_ms,
             "presentation": None if self.presentation is None else asdict(self.presentation),
             "provenance": dict(self.provenance),
+            "readouts": self.readouts.to_dict(),
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
@@ -236,8 +245,8 @@ class Policy:
         """Read a policy that `save` wrote.
 
         Raises:
-            InvalidFile: if the file is missing, damaged, or not a policy of this format; for one of a robot that is not
-                registered here, with what to import.
+            InvalidFile: if the file is missing, damaged, or not a policy of this format; for one of a robot or
+                a mapping that is not registered here, with what to import.
         """
         path = expect_plain_file(path, _MOST_BYTES)
         arrays, described = _read(path)
@@ -247,13 +256,15 @@ class Policy:
                 biases=tuple(arrays[f"layer{i}.bias"] for i in range(_LAYERS)),
                 scales=arrays["scales"],
                 robot=robot_from_dict(described["robot"]),
-                mapping=None if described["mapping"] is None else mapping_named(described["mapping"]),
+                mapping=None if described["mapping"] is None else mapping_from_data(described["mapping"]),
                 conditions=tuple(Condition(**condition) for condition in described["conditions"]),
                 commands=None if described["commands"] is None else tuple(described["commands"]),
                 window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
                 provenance=described["provenance"],
                 learning_curve=arrays["learning_curve"],
+                # Files of before read all channels as one.
+                readouts=Readouts.from_dict(described.get("readouts")),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             said = f"nothing called {error}" if isinstance(error, KeyError) else error

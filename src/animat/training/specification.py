@@ -10,11 +10,12 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 import numpy as np
 
 from animat.animat import Animat, Delivery, Environment, WithoutNeurons
-from animat.coding.mapping import Mapping, mapping_named
+from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.errors import InvalidArgument, shown
 from animat.neurons.timeline import SimulatorTimeline
+from animat.registry import is_ours
 from animat.robots.base import Robot
-from animat.robots.registry import robot_named, robot_to_dict
+from animat.robots.registry import register_robot, robot_named, robot_to_dict
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
 Percentiles = Literal["moving", "first"]
@@ -101,6 +102,12 @@ class Training:
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
 
+    def register(self) -> None:
+        """Make its robot and its mapping known in a process that they came to, so that policies can be loaded there."""
+        register_robot(type(self.robot))
+        if self.mapping is not None and not is_ours(self.mapping):
+            register_mapping(type(self.mapping))
+
     @property
     def rounds(self) -> int:
         """Rounds of training; in each, every one of `algorithm.environments` does one iteration."""
@@ -133,7 +140,7 @@ class Training:
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return plain | {
             "robot": robot_to_dict(self.robot),
-            "mapping": None if self.mapping is None else self.mapping.name,
+            "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "algorithm": asdict(self.algorithm),
             "chunks": CHUNKS,
         }

@@ -1,0 +1,88 @@
+"""Whether a mapping keeps to the contract, seen on a few responses, before anything is trained."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from animat.coding.mapping import N_PERCENTILES, Mapping
+from animat.errors import InvalidArgument, first_line, shown
+
+_RESPONSES_HZ = np.linspace(0.0, 12.0, 25, dtype=np.float32)
+_PERCENTILES_HZ = {
+    "": np.linspace(1.0, 11.0, N_PERCENTILES, dtype=np.float32),
+    " where all percentiles are equal": np.full(N_PERCENTILES, 6.0, np.float32),
+    " where all percentiles are 0": np.zeros(N_PERCENTILES, np.float32),
+}
+"""Of a culture that answers, of one that always answers the same, and of one that is silent."""
+
+
+def check_mapping(mapping: Mapping) -> None:
+    """Ask a mapping for a few commands, in numpy and under `jax.jit`, and refuse it if they are none.
+
+    Args:
+        mapping: of any class.
+
+    Raises:
+        InvalidArgument: naming what was expected and what came.
+    """
+    if not isinstance(mapping, Mapping):
+        raise InvalidArgument(f"mapping: expected a mapping or the name of one, got {shown(mapping)}")
+    kind = type(mapping).__name__
+    try:
+        hash(mapping)
+    except Exception as error:
+        raise InvalidArgument(
+            f"{kind}: expected a frozen dataclass of plain parameters ({first_line(error)})"
+        ) from error
+    for where, percentiles in _PERCENTILES_HZ.items():
+        u = _commands(mapping, _RESPONSES_HZ, percentiles)
+        _expect_commands(kind, u, where)
+        for i in (0, -1):
+            one = _commands(mapping, _RESPONSES_HZ[i], percentiles)
+            if one.shape != () or not one == u[i]:
+                raise InvalidArgument(
+                    f"{kind}.command: expected the same for one response as among several, {u[i]:g}, got "
+                    f"{shown(one.tolist())}"
+                )
+        _expect_same(mapping, u, percentiles)
+
+
+def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
+    try:
+        return np.asarray(mapping.command(x, percentiles))
+    except Exception as error:
+        # Anything may go wrong in somebody else's mapping.
+        raise InvalidArgument(
+            f"{type(mapping).__name__}.command: expected commands, got {first_line(error)}"
+        ) from error
+
+
+def _expect_commands(kind: str, u: Any, where: str) -> None:
+    n = len(_RESPONSES_HZ)
+    # Also false for NaN.
+    if u.shape != (n,) or u.dtype.kind not in "fiu" or not np.all(np.abs(u) <= 1):
+        raise InvalidArgument(f"{kind}.command: expected {n} commands from -1 to 1{where}, got {shown(u.tolist())}")
+    if falls := np.flatnonzero(np.diff(u) < 0).tolist():
+        i = falls[0]
+        raise InvalidArgument(
+            f"{kind}.command: expected commands that never fall as the response rises{where}, got {u[i]:g} at "
+            f"{_RESPONSES_HZ[i]:g} Hz and {u[i + 1]:g} at {_RESPONSES_HZ[i + 1]:g} Hz"
+        )
+
+
+def _expect_same(mapping: Mapping, u: Any, percentiles: Any) -> None:
+    """Training asks for commands under `jax.jit`, and a closed loop in numpy."""
+    import jax
+
+    kind = type(mapping).__name__
+    try:
+        compiled = np.asarray(jax.jit(mapping.command)(_RESPONSES_HZ, percentiles))
+    except Exception as error:
+        raise InvalidArgument(f"{kind}.command: expected it to run under jax.jit, got {first_line(error)}") from error
+    if compiled.shape != u.shape or not np.allclose(compiled, u, atol=1e-4):
+        raise InvalidArgument(
+            f"{kind}.command: expected the same under jax.jit as in numpy, {shown(u.tolist())}, got "
+            f"{shown(compiled.tolist())}"
+        )

@@ -1,0 +1,100 @@
+"""Histograms of several readouts that are drawn together: each keeps its own law, and trials keep what they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from animat.brief import briefly
+from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, quantile_of
+from animat.responses.responses import Responses
+
+_BELOW_ONE = float(np.nextafter(np.float32(1.0), np.float32(0.0)))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class JointHistogramSimulator(NeuronSimulator):
+    """A histogram per condition and readout, drawn together by the ranks of one recorded trial (an empirical copula).
+
+    Of the n trials of a condition one is drawn, all equally likely. With r_d the rank of readout d in it, from 0, and w
+    uniform in [0, 1), the same for all readouts of the trial:
+
+        x_d = Q_d((r_d + w) / n),    Q_d: the quantiles of the histogram of readout d
+
+    So each readout alone has the law of its histogram (the paper's), and the readouts have the rank correlation of the
+    recording. Tied responses are ranked at random, apart for each readout.
+
+    Attributes:
+        cumulative: share of a condition's responses below each edge, shape (readouts, conditions, bins + 1).
+        edges_hz: the bins' edges, shape (readouts, bins + 1).
+        ranks: of the readouts in each trial, padded with 0, shape (conditions, most trials, readouts).
+        counts: trials of each condition, shape (conditions,).
+        percentiles: as in `NeuronSimulator`, shape (readouts, 11).
+
+    Source: coupling by an empirical copula, Schefzik, Thorarinsdottir and Gneiting 2013, doi:10.1214/13-STS443.
+    """
+
+    __repr__ = briefly
+
+    cumulative: Float[Stored, "*recordings readouts conditions edges"]
+    edges_hz: Float[Stored, "*recordings readouts edges"]
+    ranks: Float[Stored, "*recordings conditions trials readouts"]
+    counts: Int[Stored, "*recordings conditions"]
+    percentiles: Float[Stored, "*recordings readouts percentiles"]
+
+    @property
+    def n_conditions(self) -> int:
+        return self.counts.shape[-1]
+
+    def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, " readouts"]:
+        """The responses of all readouts, of the trial that a uniform in [0, 1) draws."""
+        count = jnp.asarray(self.counts)[condition]
+        # float32 rounds a uniform just under 1 times a count up to the count.
+        trial = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
+        shares = (jnp.asarray(self.ranks)[condition, trial] + (uniform * count - trial)) / count
+        return jax.vmap(quantile_of)(
+            jnp.asarray(self.cumulative)[:, condition],
+            jnp.asarray(self.edges_hz),
+            jnp.clip(shares, 0.0, _BELOW_ONE),
+        )
+
+
+def fit_joint_histogram(
+    responses: Responses, *, bins: int = 20, range_hz: float | None = None, room: int | None = None
+) -> JointHistogramSimulator:
+    """Fit a histogram per condition to each readout, and keep the ranks of the readouts in each trial.
+
+    Args:
+        responses: of several readouts.
+        bins, range_hz: as in `fit_histogram`.
+        room: how many trials a condition has room for, so that simulators of several recordings stack; None: as many
+            as the largest condition needs.
+
+    Raises:
+        InvalidArgument, UnusableData: as `fit_histogram` does.
+    """
+    every = [responses.of_readout(d) for d in range(len(responses.readouts))]
+    alone = [fit_histogram(each, bins=bins, range_hz=range_hz) for each in every]
+    of_condition = [
+        np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in range(len(responses.conditions))
+    ]
+    counts = np.array([len(rows) for rows in of_condition])
+    ranks = np.zeros((len(counts), max(int(counts.max()), room or 0), len(alone)))
+    # Of one seed: the same responses make the same simulator.
+    rng = np.random.default_rng(0)
+    for condition, rows in enumerate(of_condition):
+        for d in range(len(alone)):
+            order = np.lexsort((rng.random(len(rows)), responses.read_hz[rows, d]))
+            ranks[condition, order, d] = np.arange(len(rows))
+    return JointHistogramSimulator(
+        jnp.stack([each.cumulative for each in alone]),
+        jnp.stack([each.edges_hz for each in alone]),
+        jnp.asarray(ranks, jnp.float32),
+        jnp.asarray(counts, jnp.int32),
+        jnp.stack([each.percentiles for each in alone]),
+    )

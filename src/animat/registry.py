@@ -1,0 +1,255 @@
+"""Robots and mappings by name: registered, announced by an installed package, or imported; and as plain data."""
+
+from __future__ import annotations
+
+import copyreg
+import dataclasses
+import importlib
+import importlib.metadata
+import json
+import re
+import sys
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar
+
+from animat.errors import InvalidArgument, first_line, shown
+
+Thing = TypeVar("Thing")
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}")
+_PLACE = re.compile(r"[\w.]{1,200}:[\w.<>]{1,200}")
+_IN_MEMORY = "train in memory: train(training, timeline, None)"
+
+
+_registries: dict[type, Registry[Any]] = {}
+"""By what their classes are made of."""
+
+
+class Registry(Generic[Thing]):
+    """The classes of one noun by their names, ours and those of a user's own.
+
+    Args:
+        noun: what a message calls one, and the option of the command line that names one: `robot`.
+        base: what all of its classes are made of; each has a `name`, and is a frozen dataclass of its parameters.
+        ours: those of animat that have a name of their own each, and no class for themselves.
+        reserved: names that none may have.
+    """
+
+    def __init__(
+        self, noun: str, base: type[Thing], ours: Mapping[str, Thing] | None = None, reserved: Collection[str] = ()
+    ) -> None:
+        self.noun, self.entry_points = noun, f"animat.{noun}s"
+        self._base, self._ours, self._reserved = base, dict(ours or {}), (*(ours or {}), *reserved)
+        self._registered: dict[str, type[Thing]] = {}
+        self.kinds: Mapping[str, type[Thing]] = MappingProxyType(self._registered)
+        """What is registered so far, by name."""
+        _registries[base] = self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The module of the base, or its package, makes the registry.
+        return _registry_of, (self._base,)
+
+    def register(self, kind: type[Thing]) -> None:
+        """Make a class known by its name.
+
+        Raises:
+            InvalidArgument: for another class, one that lacks a method, or a name that another one has.
+        """
+        noun = self.noun
+        if not (isinstance(kind, type) and issubclass(kind, self._base)):
+            raise InvalidArgument(f"{noun}: expected a class made of animat.{self._base.__name__}, got {shown(kind)}")
+        place = place_of(kind)
+        if missing := sorted(getattr(kind, "__abstractmethods__", ())):
+            raise InvalidArgument(
+                f"{place}: expected the methods of a {noun}, got a class without {', '.join(missing)}"
+            )
+        if not getattr(getattr(kind, "__dataclass_params__", None), "frozen", False):
+            raise InvalidArgument(f"{place}: expected a frozen dataclass, got a class without @dataclass(frozen=True)")
+        name = getattr(kind, "name", None)
+        if not (isinstance(name, str) and _NAME.fullmatch(name)):
+            raise InvalidArgument(f"{place}.name: expected letters, digits, - and _, a letter first, got {shown(name)}")
+        other = place_of(self._registered[name]) if name in self._registered else "animat's own"
+        if name in self._reserved or (name in self._registered and other != place):
+            raise InvalidArgument(
+                f"{place}.name: expected one that no other {noun} has, got {name!r}, which is {other}"
+            )
+        self._registered[name] = kind
+        if kind.__module__ == "__main__":
+            # In a worker, __main__ is the worker: what a script defines is found there by the name of its file.
+            copyreg.pickle(kind, self._reduced)
+
+    def named(self, name: str, /, **parameters: Any) -> Thing:
+        """The one of this name, with these parameters in place of its defaults.
+
+        Args:
+            name: of one that is registered or that an installed package announces in the entry point group
+                `entry_points`; or where to import one from, `my_package.robots:Rover`, which registers it.
+            parameters: fields of its class.
+
+        Raises:
+            InvalidArgument: for a name or parameter that is not known, a value that is refused, or one that cannot be
+                imported or registered.
+        """
+        if isinstance(name, str) and name in self._ours and not parameters:
+            return self._ours[name]
+        kind = self.class_named(name)
+        known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        for parameter in parameters:
+            if parameter not in known:
+                raise InvalidArgument(
+                    f"{name}: expected parameters among {', '.join(known) or 'none'}, got {shown(parameter)}"
+                )
+        try:
+            return kind(**parameters)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"{name}: {error}") from error
+        except Exception as error:
+            raise InvalidArgument(f"{name}: expected it to be made of {parameters}, got {first_line(error)}") from error
+
+    def names(self) -> tuple[str, ...]:
+        """The names that are known here: ours, of what is registered, then of what packages announce."""
+        announced = importlib.metadata.entry_points(group=self.entry_points)
+        return tuple(dict.fromkeys([*self._ours, *self._registered, *(point.name for point in announced)]))
+
+    def class_named(self, name: str) -> type[Thing]:
+        """The class of this name; arguments and errors as those of `named`."""
+        kind = self._kind(name)
+        if kind is None:
+            raise InvalidArgument(
+                f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}; "
+                "one of your own is named by its module:Class"
+            )
+        return kind
+
+    def to_dict(self, thing: Thing) -> dict[str, Any]:
+        """As JSON data, all parameters named: `{"name": "cartpole", "parameters": {"force_n": 1.0, ...}}`.
+
+        Of one that is not ours it also says where it is imported from: `"import": "my_package.robots:Rover"`.
+        """
+        data = {"name": thing.name, "parameters": dataclasses.asdict(thing)}  # type: ignore[attr-defined, call-overload]
+        return data if is_ours(thing) else data | {"import": place_of(type(thing))}
+
+    def from_dict(self, data: Mapping[str, Any]) -> Thing:
+        """What `to_dict` made this of.
+
+        Raises:
+            InvalidArgument: for data of another form, or a name or parameter that is not known; of what is not
+                registered here it says what to import. Nothing is imported because a file says so.
+        """
+        noun = self.noun
+        if (
+            not isinstance(data, Mapping)
+            or not {"name", "parameters"} <= set(data) <= {"name", "parameters", "import"}
+            or not isinstance(data["parameters"], Mapping)
+            or ":" in str(data["name"])
+        ):
+            raise InvalidArgument(f'{noun}: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
+        if "import" in data and not _PLACE.fullmatch(str(data["import"])):
+            raise InvalidArgument(f"{noun}: expected to be imported from module:Class, got {shown(data['import'])}")
+        if "import" in data and self._kind(data["name"]) is None:
+            place = str(data["import"])
+            raise InvalidArgument(
+                f"{noun}: expected one that is registered, got {shown(data['name'])}: import {place.partition(':')[0]} "
+                f"first (on the command line: --{noun} {place})"
+            )
+        return self.named(data["name"], **{name: _frozen(value) for name, value in data["parameters"].items()})
+
+    def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:
+        """Refuse what a file could name and nothing could give back.
+
+        Args:
+            thing: of any class.
+            in_workers: whether processes of their own have to import it.
+
+        Raises:
+            InvalidArgument: for one that is not registered, or that no worker could import.
+        """
+        noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
+        if name in self._ours and self._ours[name] == thing:
+            return
+        if self._registered.get(name) is not kind or self._again(thing) != thing:
+            raise InvalidArgument(
+                f"{noun}: expected one that is registered, as a policy's file names its {noun}, got {kind.__name__}, "
+                f"which is not: write @animat.register_{noun} above its class, or {_IN_MEMORY}"
+            )
+        place = place_of(kind)
+        if in_workers and ("<locals>" in place or place.startswith("__main__:")):
+            raise InvalidArgument(
+                f"{noun}: expected a class at the top of a file, which worker processes can import, got {place}: put "
+                f"it into a file, or {_IN_MEMORY}"
+            )
+
+    def _again(self, thing: Thing) -> Thing:
+        return self.from_dict(json.loads(json.dumps(self.to_dict(thing))))
+
+    def _kind(self, name: Any) -> type[Thing] | None:
+        if not isinstance(name, str):
+            return None
+        if name in self._registered:
+            return self._registered[name]
+        if ":" in name:
+            return self._imported(name)
+        for point in importlib.metadata.entry_points(group=self.entry_points, name=name):
+            found: Any = self._imported(point.value)
+            if found.name != name:
+                raise InvalidArgument(
+                    f"{self.noun}: expected {point.value} to have the name {name!r}, got {found.name!r}"
+                )
+            return found  # type: ignore[no-any-return]
+        return None
+
+    def _imported(self, place: str) -> type[Thing]:
+        for kind in self._registered.values():
+            if place_of(kind) == place:
+                return kind
+        noun, (module, _, name) = self.noun, place.partition(":")
+        if module.endswith(".py"):
+            meant = f"{Path(module).stem}:{name}"
+            raise InvalidArgument(
+                f"{noun}: expected a module and its class, such as {meant}, got a file, {shown(place)}"
+            )
+        try:
+            found: type[Thing] = getattr(importlib.import_module(module), name)
+        except InvalidArgument:
+            raise
+        except (Exception, SystemExit) as error:
+            # Anything may go wrong in somebody else's module.
+            raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}") from error
+        self.register(found)
+        return found
+
+    def _reduced(self, thing: Thing) -> tuple[Any, ...]:
+        return self._remade, (place_of(type(thing)), dataclasses.asdict(thing))  # type: ignore[call-overload]
+
+    def _remade(self, place: str, parameters: dict[str, Any]) -> Thing:
+        try:
+            return self._imported(place)(**parameters)
+        except InvalidArgument as error:
+            hint = "what a script does belongs under `if __name__ == '__main__':`, as worker processes import it"
+            raise InvalidArgument(f"{error}; {hint}") from error
+
+
+def _registry_of(base: type) -> Registry[Any]:
+    return _registries[base]
+
+
+def place_of(kind: type) -> str:
+    """Where a class can be imported from, as `module:Class`; that of a script is by the name of its file."""
+    module = kind.__module__
+    if module == "__main__":
+        main = sys.modules[module]
+        spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+        module = spec.name if spec else Path(file).stem if file else module
+    return f"{module}:{kind.__qualname__}"
+
+
+def is_ours(thing: object) -> bool:
+    """Whether every animat has it, so that its name alone tells which it is."""
+    return type(thing).__module__.startswith("animat.")
+
+
+def _frozen(value: Any) -> Any:
+    """What was a tuple before it was JSON: parameters can be hashed, and lists cannot."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value

@@ -1,0 +1,206 @@
+"""Readouts: groups of channels whose responses become a command each, told by the electrodes that the channels read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
+from animat.plain_file import read_plain_text
+from animat.recordings.recording import Channels
+from animat.responses.windows import Spiking, spikes_in
+from animat.stimulation.places import NAMED, count_places, electrodes_of
+from animat.tables import UNKNOWN
+
+_NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
+"""Of the groups that `NAMED` makes; left is the smaller x, top the smaller y."""
+_MOST_BYTES = 2**20
+MOST_READOUTS = 64
+
+
+@dataclass(frozen=True)
+class Readouts:
+    """Named groups of channels; by default one of all channels (the paper).
+
+    Attributes:
+        names: of the groups, in the order of the commands.
+        electrodes: of each group, rising; None: one group of all channels, whatever they read. An electrode may be in
+            several groups.
+
+    Raises:
+        InvalidArgument: for names or electrodes that are none, or names without electrodes.
+    """
+
+    names: tuple[str, ...] = ("all",)
+    electrodes: tuple[tuple[int, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.electrodes is None:
+            if self.names != ("all",):
+                raise InvalidArgument(f"readouts: expected electrodes of each of {shown(self.names)}, got none")
+            return
+        is_named = all(isinstance(name, str) and 0 < len(name) <= 40 and name.isprintable() for name in self.names)
+        if not is_named or len(set(self.names)) < len(self.names) or not 0 < len(self.names) <= MOST_READOUTS:
+            raise InvalidArgument(
+                f"readouts: expected 1 to {MOST_READOUTS} names, each once, of 1 to 40 letters, got {shown(self.names)}"
+            )
+        groups = [tuple(group) for group in self.electrodes]
+        are_electrodes = all(group and all(type(e) is int and 0 <= e < 2**63 for e in group) for group in groups)
+        if len(groups) != len(self.names) or not are_electrodes:
+            raise InvalidArgument(
+                f"readouts: expected the numbers of some electrodes for each of {len(self.names)} groups, got "
+                f"{shown(self.electrodes)}"
+            )
+        object.__setattr__(self, "electrodes", tuple(tuple(sorted(set(group))) for group in groups))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def are_all(self) -> bool:
+        """Whether it is one group of all channels."""
+        return self.electrodes is None
+
+    def members(self, channels: Channels) -> Bool[np.ndarray, "readouts channels"]:
+        """Which channels of a table are in each group.
+
+        Raises:
+            Mismatch: for channels that do not read all of the electrodes.
+        """
+        if self.electrodes is None:
+            return np.ones((1, len(channels)), np.bool_)
+        for name, group in zip(self.names, self.electrodes, strict=True):
+            if missing := sorted(set(group) - set(channels.electrode.tolist())):
+                told = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+                raise Mismatch(
+                    f"readouts: expected channels that read all {len(group)} electrodes of the readout {name!r}, got "
+                    f"none that read {len(missing)} of them ({told})"
+                )
+        return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
+
+    def read(
+        self,
+        recording: Spiking,
+        members: Bool[np.ndarray, "readouts channels"],
+        after_s: Float64[np.ndarray, " windows"],
+        window_ms: tuple[float, float],
+    ) -> Float64[np.ndarray, "windows *readouts"]:
+        """The response x of each group in the window after each of some times, Hz per channel.
+
+            x = S / (T N),  S: spikes of the group's N channels in a window of T
+
+        Edges are as in `animat.responses.windows.count_spikes`.
+
+        Args:
+            recording: the spikes.
+            members: of its channels (`members`).
+            after_s: of the pulses, in seconds on the clock of the spikes.
+            window_ms: start and end of the window after each.
+
+        Returns:
+            A row a window; without the axis of readouts where there is one.
+        """
+        window, spike = spikes_in(recording, after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3)
+        channel = recording.spike_channels[spike]
+        spikes = np.array([np.bincount(window[group[channel]], minlength=len(after_s)) for group in members])
+        rate_hz = spikes.T / ((window_ms[1] - window_ms[0]) * 1e-3 * members.sum(axis=1))
+        return self.alone(rate_hz)
+
+    def alone(self, values: Float64[np.ndarray, "*any readouts"]) -> Float64[np.ndarray, "*any_readouts"]:
+        """Values of each group, without their axis where there is one group: the paper's shapes."""
+        return values[..., 0] if len(self) == 1 else values
+
+    def to_dict(self) -> dict[str, Any] | None:
+        """As JSON data, in the order of the groups; None: one group of all channels."""
+        if self.electrodes is None:
+            return None
+        return {"names": list(self.names), "electrodes": [list(group) for group in self.electrodes]}
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Readouts:
+        """What `to_dict` made this of.
+
+        Raises:
+            InvalidArgument: for anything else.
+        """
+        if data is None:
+            return cls()
+        if not (isinstance(data, Mapping) and set(data) == {"names", "electrodes"}):
+            raise InvalidArgument(f"readouts: expected names and electrodes, got {shown(data)}")
+        names, groups = data["names"], data["electrodes"]
+        if not (isinstance(names, list) and isinstance(groups, list) and all(isinstance(g, list) for g in groups)):
+            raise InvalidArgument(f"readouts: expected lists of names and of electrodes, got {shown(data)}")
+        return cls(tuple(names), tuple(map(tuple, groups)))
+
+
+ALL = Readouts()
+"""One readout of all channels: the paper's."""
+
+
+def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
+    """The name of readouts (`all`, `halves`, `quadrants`), or those in a file: `{"left": [1, 2], "right": [3, 4]}`.
+
+    Raises:
+        InvalidFile: naming the file, what was expected and what came.
+    """
+    if text == "all":
+        return ALL
+    if text in NAMED:
+        return str(text)
+    try:
+        written = read_plain_text(text, _MOST_BYTES)
+    except InvalidFile as error:
+        raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(NAMED)}") from error
+    try:
+        data = json.loads(written)
+        if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
+            raise InvalidArgument(
+                f'readouts: expected electrodes by the names of groups, {{"left": [1, 2], "right": [3, 4]}}, got '
+                f"{shown(data)}"
+            )
+        return Readouts(tuple(data), tuple(map(tuple, data.values())))
+    except InvalidArgument as error:
+        raise InvalidFile(f"{text}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise InvalidFile(f"{text}: readouts: expected JSON, got {error}") from error
+
+
+def count_readouts(readouts: str | Readouts) -> int:
+    """How many there are."""
+    return count_places(readouts) if isinstance(readouts, str) else len(readouts)
+
+
+def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
+    """Readouts by the electrodes of a table of channels.
+
+    Halves are the electrodes with the smaller and the larger x, as many in each as can be; each is cut by y for
+    quadrants, as places are (`animat.stimulation.places`).
+
+    Args:
+        readouts: `halves`, `quadrants`, or groups that are known.
+        channels: of a recording.
+
+    Raises:
+        InvalidArgument: for channels of which it is not known which electrode they read and where it is, or too few.
+        Mismatch: for channels that do not read all electrodes of the groups.
+    """
+    if isinstance(readouts, str):
+        electrodes, first = np.unique(channels.electrode, return_index=True)
+        if UNKNOWN in electrodes or len(electrodes) < count_places(readouts):
+            raise InvalidArgument(
+                f"readouts: expected channels whose electrodes are known to cut into {readouts}, "
+                f"{count_places(readouts)} or more, got {np.count_nonzero(electrodes != UNKNOWN)} of "
+                f"{len(channels)} channels"
+            )
+        if not channels.has_positions:
+            raise InvalidArgument(f"readouts: expected channels whose positions are known to cut into {readouts}")
+        groups = electrodes_of(readouts, electrodes, channels.x_um[first], channels.y_um[first])
+        return Readouts(_NAMES[readouts], groups)
+    readouts.members(channels)
+    return readouts

@@ -1,0 +1,307 @@
+"""A robot with two commands, from an empty file to a closed loop: each command is that of its own readout."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from animat.animat import WithoutNeurons
+from animat.cli import main
+from animat.closed_loop.contenders import Contender, HandMadeRule, OneCondition, random_control
+from animat.closed_loop.following import Following
+from animat.closed_loop.header import read_header
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.closed_loop.session import read_session
+from animat.coding.mapping import Thresholds
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.evaluation.table import evaluate
+from animat.execution.training import train
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.reality_gap import Calibration, run_policies
+from animat.reality_gap.answered import answered
+from animat.recordings.made_up import write_made_up_series
+from animat.recordings.recording import Recording
+from animat.responses.extraction import extract_responses
+from animat.responses.readouts import ALL, Readouts
+from animat.responses.series import extract_series
+from animat.robots import Cartpole, Robot
+from animat.robots.checking import check_robot
+from animat.stimulation.protocol import Protocol
+from animat.training.policy import Policy
+from animat.training.specification import Training
+from fake_culture import CHANNELS, FakeCulture
+from test_training import SMALL
+from two_wheels import FILE, Wheels
+
+PROTOCOL = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    with FakeCulture() as culture:
+        return culture.record(PROTOCOL, 0)
+
+
+@pytest.fixture(scope="module")
+def timeline(recording: Recording) -> SimulatorTimeline:
+    return fit_timeline(extract_series([recording], readouts="halves", burst_threshold=0.95))
+
+
+@pytest.fixture(scope="module")
+def policies(timeline: SimulatorTimeline) -> dict[str, Policy]:
+    return train(
+        Training(Wheels(episode_limit=8), "9-thresholds", policies=2, iterations=480, algorithm=SMALL), timeline, None
+    )
+
+
+def numbers(values: Sequence[str]) -> list[float]:
+    return [float(value) for value in values]
+
+
+def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: SimulatorTimeline, tmp_path: Path) -> None:
+    responses = timeline.responses[0]
+    recorded_hz = tuple(responses.read_of(i) for i in range(5))
+    loop = Loop(
+        Wheels(episode_limit=8),
+        Thresholds(9),
+        timeline.conditions,
+        np.asarray(timeline.at(0.0).percentiles),
+        following=recorded_hz,
+        burst_threshold=0.95,
+        lead_in=1,
+        readouts=timeline.readouts,
+    )
+    means = tuple((0.2 * i - 0.4, 0.4 - 0.2 * i) for i in range(5))
+    contenders = [
+        random_control(5),
+        Contender("constant", "", OneCondition(3), calibrates=False),
+        Contender("made by hand", "", HandMadeRule(loop.robot, means)),
+        Contender("silent", "", OneCondition(0), "silent"),
+    ]
+    with FakeCulture(3) as culture:
+        ended = run_session(culture, loop, contenders, tmp_path, episodes=2).ending
+    assert ended.by == "plan", ended
+
+    # The session's own recording, read like any other, says what was read of each half.
+    session = read_session(tmp_path)
+    whole = extract_responses(session.recording(), burst_threshold=0.95, readouts=loop.readouts)
+    stimulated = [tick for tick in session.ticks if tick.patterns]
+    np.testing.assert_array_equal(whole.read_hz, [tick.readout_hz for tick in stimulated])
+    np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
+
+    # The thresholds follow each half on its own: percentiles over its newest responses, computed again here.
+    newest = [list(of) for of in recorded_hz]
+    logged = {w["episode"]: w["percentiles_hz"] for w in session.log.records.words() if w["kind"] == "percentiles"}
+    # Until something was answered they are the recording's.
+    told = [np.asarray(logged.get(0, loop.percentiles), np.float32)]
+    for episode in range(1, len(session.episodes)):
+        told.append(np.asarray(logged.get(episode, told[-1]), np.float32))
+    assert len(logged) >= 6
+    moved = 0
+    for tick in session.ticks:
+        if tick.handled == "used":
+            each = zip(tick.readout_hz, told[tick.episode], strict=True)
+            wanted = [Thresholds(9).command(np.float32(x), p) for x, p in each]
+            assert tick.command == tuple(wanted)
+            moved += len(set(tick.command)) > 1
+        if tick.iteration == 0 and tick.episode in logged:
+            pooled = np.concatenate(newest)
+            expected = [np.percentile(pooled[:, d], range(0, 101, 10)) for d in range(2)]
+            np.testing.assert_allclose(told[tick.episode], expected, rtol=1e-6)
+        counts = tick.contender != "constant" or tick.handled == "lead-in"
+        if counts and tick.patterns and not tick.is_burst:
+            newest[tick.delivered] = [*newest[tick.delivered][1:], np.array(tick.readout_hz)]
+    assert moved > 10
+
+    with (tmp_path / "ticks.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    for row, tick in zip(table, session.ticks, strict=True):
+        assert numbers([row["rate_hz_left"], row["rate_hz_right"]]) == list(tick.readout_hz)
+        if tick.command is not None:
+            assert numbers([row["command_left"], row["command_right"]]) == list(tick.command)
+    assert "command" not in table[0]
+
+    # How often each half passed its own median, as the reasons of a gap ask.
+    read = answered(session, loop, ["random"])
+    used = [tick for tick in session.ticks if tick.handled == "used" and tick.contender == "random"]
+    above = [np.array(t.readout_hz) >= told[t.episode][:, 5] for t in used]
+    np.testing.assert_array_equal(read.passed, above)
+    np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in used])
+    passes = read.passes.summed(0)
+    for i in range(5):
+        of_condition = np.array([t.delivered == i for t in used])
+        assert passes.presented[i] == of_condition.sum()
+        np.testing.assert_array_equal(passes.passed[i], np.sum(np.array(above)[of_condition], axis=0))
+
+
+@pytest.mark.oracle
+def test_policies_run_and_are_predicted(
+    timeline: SimulatorTimeline, policies: dict[str, Policy], tmp_path: Path
+) -> None:
+    calibration = Calibration.of_series(timeline.responses)
+    with FakeCulture(3) as culture:
+        gap = run_policies(policies, culture, calibration, tmp_path, episodes=4)
+    assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].lived))
+    assert "no-limit" in {finding.name for finding in gap.findings}
+    assert {"silent", "shuffled", "made by hand", "constant 5 Hz"} <= {row.name for row in gap.rows}
+
+
+def test_a_policy_carries_its_readouts_through_its_file(
+    policies: dict[str, Policy], timeline: SimulatorTimeline
+) -> None:
+    assert policies["p0"].readouts == timeline.readouts
+    evaluation = evaluate(policies, timeline, episodes=5)
+    assert np.all(np.isfinite(evaluation.rows[0].episodes.returns))
+    assert evaluation.rows[0].episodes.passed.shape[1:] == (5, 2)
+    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1"):
+        replace(policies["p0"], readouts=ALL)
+    other = replace(timeline, readouts=replace(timeline.readouts, names=("a", "b")))
+    with pytest.raises(Mismatch, match=r"readouts: expected left, right, .*, got a, b"):
+        evaluate(policies, other, episodes=5)
+
+
+def test_what_does_not_fit_is_refused_in_a_line(recording: Recording, timeline: SimulatorTimeline) -> None:
+    training = Training(Wheels(), "1-threshold", policies=1, algorithm=SMALL)
+    whole = fit_timeline(extract_series([recording], burst_threshold=0.95))
+    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1; --read"):
+        train(training, whole, None)
+    with pytest.raises(InvalidArgument, match="readouts: expected 1, one for each command of cartpole, got 2"):
+        train(replace(training, robot=Cartpole()), timeline, None)
+    with pytest.raises(InvalidArgument, match="expected one command for a baseline without neurons, got wheels"):
+        train(replace(training, mapping=None), None, None)
+    with pytest.raises(InvalidArgument, match="wheels"):
+        WithoutNeurons(Wheels(), None)
+
+
+def changed(**methods: Any) -> Robot[Any]:
+    return type("Changed", (Wheels,), methods)()  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("robot", "words"),
+    [
+        (changed(n_commands=0), "n_commands: expected a whole number from 1 to 64, got 0"),
+        (changed(n_commands=3), "advance: expected it to run under jax.jit"),
+        (changed(heuristic=lambda self, seen: seen[0]), r"heuristic: expected a command, shape \(2,\), got shape \(\)"),
+        (changed(heuristic=lambda self, seen: 0 * seen[:2] + 2), "heuristic: expected commands from -1 to 1, got 2"),
+    ],
+)
+def test_a_robot_of_two_commands_is_checked(robot: Robot[Any], words: str) -> None:
+    check_robot(Wheels())
+    with pytest.raises(InvalidArgument, match=words):
+        check_robot(robot)
+
+
+def test_the_rule_made_by_hand_takes_the_nearest_in_the_plane() -> None:
+    means = ((-1.0, -1.0), (0.9, -0.2), (1.0, 1.0))
+    for wanted, nearest in (((0.2, -0.9), 1), ((0.3, 0.9), 2), ((-1.0, -0.1), 0)):
+        robot = changed(heuristic=lambda self, seen, wanted=wanted: np.array(wanted))
+        assert HandMadeRule(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
+
+
+def test_thresholds_follow_every_readout_on_its_own() -> None:
+    rng = np.random.default_rng(0)
+    both = Following([rng.gamma(4, 5, (30, 2)) for _ in range(3)])
+    rng = np.random.default_rng(0)
+    alone = [Following([x[:, d] for x in [rng.gamma(4, 5, (30, 2)) for _ in range(3)]]) for d in range(1)]
+    for _ in range(20):
+        x = np.random.default_rng(1).gamma(4, 5, 2)
+        both.add(1, x)
+        alone[0].add(1, x[0])
+    np.testing.assert_array_equal(both.percentiles()[0], alone[0].percentiles())
+
+
+def test_it_is_a_gymnasium_environment(recording: Recording, timeline: SimulatorTimeline) -> None:
+    place = f"{Wheels.__module__}:Wheels"
+    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1"):
+        gymnasium.make("animat:Animat/Robot-v0", robot=place)
+    env = gymnasium.make("animat:Animat/Robot-v0", robot=place, simulator=timeline.at(0.0), mapping="linear")
+    env.reset(seed=1)
+    *_, info = env.step(2)
+    envs = gymnasium.make_vec("animat:Animat/Robot-v0", num_envs=3, robot=place, simulator=timeline.at(0.0))
+    envs.reset(seed=1)
+    *_, infos = envs.step(np.array([0, 1, 2]))
+    assert info["command"].shape == (2,) and infos["command"].shape == (3, 2) and infos["rate_hz"].shape == (3, 2)
+    p = np.asarray(timeline.at(0.0).percentiles)
+    np.testing.assert_array_equal(infos["command"], np.where(infos["rate_hz"] >= p[:, 5], 1.0, -1.0))
+
+
+def test_logs_of_before_have_no_readouts(tmp_path: Path) -> None:
+    with pytest.raises(InvalidFile, match="readouts"):
+        read_header(tmp_path, {**HEADER, "loop": {**HEADER["loop"], "readouts": 5}})
+    assert read_header(tmp_path, HEADER).readouts == ()
+    loop = {**HEADER["loop"], "readouts": Readouts(("a", "b"), ((1,), (2,))).to_dict()}
+    assert read_header(tmp_path, {**HEADER, "loop": loop}).readouts == ("a", "b")
+
+
+HEADER: dict[str, Any] = {
+    "format": "animat closed-loop session 1",
+    "channels": {"label": ["0"], "electrode": [1], "x_um": [0.0], "y_um": [0.0]},
+    "loop": {"pulses": 1, "conditions": ["5 Hz"]},
+    "recorded_at": "2026-01-01T00:00:00+00:00",
+    "sampling_rate_hz": 20000.0,
+    "start_min": 0.0,
+    "contenders": [{"name": "p0"}],
+    "provenance": {},
+    "observed": ["x_m"],
+}
+
+
+def test_the_file_of_the_page_is_short() -> None:
+    assert len(FILE.splitlines()) < 120 and CHANNELS == 16
+
+
+@pytest.mark.oracle
+def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
+    write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    text, n = re.subn(r"iterations=\d[\d_]*", "iterations=1_000", FILE)
+    assert n == 1 and "episode_limit: int = 60" in text
+    (tmp_path / "two_wheels.py").write_text(text.replace("episode_limit: int = 60", "episode_limit: int = 8"))
+    environment = {**os.environ, "PYTHONPATH": ":".join(sys.path)}
+    ran = subprocess.run(
+        [sys.executable, "two_wheels.py"], capture_output=True, text=True, env=environment, cwd=tmp_path
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "wheels, 9-thresholds" in ran.stdout and (tmp_path / "session" / "session.nwb").exists()
+
+
+@pytest.mark.oracle
+def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    (tmp_path / "my_wheels.py").write_text(FILE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    few = [
+        "--recordings",
+        "recordings",
+        "--policies",
+        "1",
+        "--iterations",
+        "256",
+        "--workers",
+        "1",
+        "--parameters",
+        "episode_limit=8",
+    ]
+    assert main(["train", "my_wheels:Wheels", *few]) == 1
+    assert "expected 2, one for each command of wheels, got 1; --readouts halves" in capsys.readouterr().err
+    assert main(["train", "my_wheels:Wheels", *few, "--readouts", "halves"]) == 0
+    assert "5 Hz: left 0." in capsys.readouterr().out
+    asked = ["--recordings", "recordings", "--episodes", "2"]
+    assert main(["evaluate", *asked, "--limit"]) == 0
+    assert "expected one command for a best possible return" in capsys.readouterr().out
+    assert main(["run", *asked, "--culture", "replay"]) == 0
+    assert main(["live", "my_wheels:Wheels"]) == 1
+    assert "a live run reads all channels as one" in capsys.readouterr().err
