@@ -102,10 +102,10 @@ class Arrivals(NamedTuple):
     """Which places of the rings are not empty: a step looks at these alone, as most are.
 
     The first axis is excitation (AMPA and NMDA arrive together) and inhibition; the targets of a row stand in its
-    first `count`, each once.
+    first `filled`, each once.
     """
 
-    count: Int32[np.ndarray, "2 ring"]
+    filled: Int32[np.ndarray, "2 ring"]
     target: Int32[np.ndarray, "2 ring neurons"]
 
 
@@ -202,23 +202,23 @@ def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
 def arrive(constants: Constants, state: State, arrivals: Arrivals, slot: int) -> None:
     """Add what arrives in this step to the conductances, and empty its row of the ring."""
     to_ampa, to_nmda, to_gaba = state.arriving_ampa[slot], state.arriving_nmda[slot], state.arriving_gaba[slot]
-    for place in range(arrivals.count[0, slot]):
+    for place in range(arrivals.filled[0, slot]):
         i = arrivals.target[0, slot, place]
         state.ampa[i] += to_ampa[i]
         state.nmda[i] += to_nmda[i] * (constants.nmda_saturation - state.nmda[i])
         to_ampa[i] = to_nmda[i] = f4(0.0)
-    for place in range(arrivals.count[1, slot]):
+    for place in range(arrivals.filled[1, slot]):
         i = arrivals.target[1, slot, place]
         state.gaba[i] += to_gaba[i]
         to_gaba[i] = f4(0.0)
-    arrivals.count[0, slot] = arrivals.count[1, slot] = 0
+    arrivals.filled[0, slot] = arrivals.filled[1, slot] = 0
 
 
 @inlined
 def note(arrivals: Arrivals, kind: int, row: int, target: int) -> None:
     """Note a place of a ring that is no longer empty."""
-    arrivals.target[kind, row, arrivals.count[kind, row]] = target
-    arrivals.count[kind, row] += 1
+    arrivals.target[kind, row, arrivals.filled[kind, row]] = target
+    arrivals.filled[kind, row] += 1
 
 
 @inlined
