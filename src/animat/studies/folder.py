@@ -50,9 +50,6 @@ def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
     }
     # By way of JSON, in which a tuple and a list are the same.
     told = json.loads(json.dumps(told))
-    # By the name that it had at first: receipts in the folders of then rest on the fingerprint.
-    simulators = told["study"]["simulators"]
-    simulators["despite"] = simulators.pop("allow")
     return told | {"fingerprint": fingerprint_of(told)}
 
 
