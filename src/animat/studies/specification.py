@@ -219,7 +219,7 @@ class StudyCondition:
     @property
     def thresholds(self) -> str:
         """Its mapping and how the percentiles are held, as a folder's name."""
-        return self.mapping.rpartition(":")[2] + ("-held" if self.percentiles == "first" else "")
+        return self.mapping.replace(":", ".") + ("-held" if self.percentiles == "first" else "")
 
     @property
     def has_steps(self) -> bool:
