@@ -164,10 +164,8 @@ class Body:
         if self.name == "culture":
             raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
         if robot.n_commands > 1:
-            raise InvalidArgument(
-                f"{robot.name}: expected one command, as a study reads all channels as one, got {robot.n_commands}: "
-                "train it with animat train --readouts"
-            )
+            told = f"expected one command, as a study reads all channels as one, got {robot.n_commands}"
+            raise InvalidArgument(f"{robot.name}: {told}: train it with animat train --readouts")
         if not is_ours(robot):
             # Workers know it by that.
             object.__setattr__(self, "kind", place_of(type(robot)))
@@ -188,8 +186,8 @@ class StudyCondition:
 
     Attributes:
         name: what it is called in tables and folders.
-        mapping: from responses to commands, or where to import one from, `my_package.mappings:Steep`, which is filled
-            in for mappings that are not ours; `"none"` is the baseline without neurons.
+        mapping: from responses to commands, or where to import one from, `my_package.mappings:Steep` (filled in for
+            mappings that are not ours); `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
         percentiles: of the mapping: `"moving"` with the simulator, or held from the `"first"` recording.
@@ -221,8 +219,7 @@ class StudyCondition:
     @property
     def thresholds(self) -> str:
         """Its mapping and how the percentiles are held, as a folder's name."""
-        name = mapping_named(self.mapping).name if self.through_neurons else self.mapping
-        return name + ("-held" if self.percentiles == "first" else "")
+        return self.mapping.replace(":", ".") + ("-held" if self.percentiles == "first" else "")
 
     @property
     def has_steps(self) -> bool:
