@@ -93,6 +93,6 @@ def test_a_study_is_read_and_its_folder_left_to_the_version_that_began_it(old: P
     folder, study = tmp_path / "old" / "study", read_study(tmp_path / "old" / "study.toml")
     assert [job.name for job in plan_study(study, tmp_path / "old")][:2] == ["record", "fit"]
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(Mismatch, match="got one of another .*; give another folder"):
+    with pytest.raises(Mismatch, match=r"got one of another .*; give another folder"):
         run_study(study, folder, base=tmp_path / "old", executor=Halts())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
