@@ -130,9 +130,9 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
         tmp_path, Compared("alike", "better", "like", episodes=2), Compared("up", "worse", "better", episodes=2)
     )
     assert all("better" not in row.outcome for row in rows if row.comparison == "alike")
-    corrected = holm({f"{row['comparison']}/{row['robot']}": row.p_normal for row in rows})
+    corrected = holm({f"{row.comparison}/{row.robot}": row.p_normal for row in rows})
     assert len(corrected) == 4
-    assert [row.p_holm for row in rows] == [corrected[f"{row['comparison']}/{row['robot']}"] for row in rows]
+    assert [row.p_holm for row in rows] == [corrected[f"{row.comparison}/{row.robot}"] for row in rows]
 
 
 # --- who answers ----------------------------------------------------------------------------------------------------
