@@ -81,6 +81,7 @@ def test_a_robot_without_a_drawing_is_refused() -> None:
     @dataclass(frozen=True)
     class Unicycle:
         name = "unicycle"
+        n_commands = 1
 
     with pytest.raises(InvalidArgument, match="unicycle has no method `draw`"):
         draw_robot(Unicycle(), np.zeros(3))  # type: ignore[arg-type]

@@ -140,6 +140,14 @@ def test_channels_that_cannot_be_cut_are_refused(recording: Recording) -> None:
             readouts_on("halves", replace(channels, **{name: column}))
 
 
+def test_names_of_readouts_are_known_or_refused(recording: Recording) -> None:
+    assert readouts_on("all", recording.channels) == ALL
+    with pytest.raises(InvalidArgument, match="expected all, halves, quadrants or groups of electrodes, got 'thirds'"):
+        readouts_on("thirds", recording.channels)
+    with pytest.raises(InvalidArgument, match=r"^readouts: expected the numbers of some electrodes"):
+        Readouts(("a", "b"), (1, 2))  # type: ignore[arg-type]
+
+
 def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
     file = tmp_path / "groups.json"
     file.write_text('{"wing": [7, 3], "body": [1, 3]}')
@@ -153,7 +161,8 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["[[1], [2]]", "{}", "null", '{"a": []}', '{"a": [1.5]}', '{"": [1]}', "{", '{"a": 1}']
+    "text",
+    ["[[1], [2]]", "{}", "null", '{"a": []}', '{"a": [1.5]}', '{"": [1]}', "{", '{"a": 1}', '{"a": [1], "a": [2]}'],
 )
 def test_a_file_of_no_readouts_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "groups.json").write_text(text)

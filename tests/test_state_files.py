@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from animat.cultures.tissue import Tissue
 from animat.cultures.tissue.fatigue import MARK_S, Fatigue
 from animat.cultures.tissue.parameters import TissueParameters
-from animat.errors import InvalidFile
+from animat.errors import InvalidArgument, InvalidFile
 from cultures import small_culture
 
 
@@ -53,6 +54,17 @@ def test_an_array_that_does_not_belong_is_not_read(tmp_path: Path, monkeypatch: 
     with pytest.raises(InvalidFile, match=r"more\.npz: expected the whole state"):
         small_culture().restore_state(tmp_path / "more.npz")
     assert not read
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("arriving_ampa", -1e-12), ("arriving_gaba", -1.0), ("arriving_nmda", 0.1)]
+)
+def test_arrivals_that_no_spike_brings_are_refused(name: str, value: float) -> None:
+    tissue = Tissue(1, TissueParameters(neurons=300))
+    snapshot = tissue.snapshot()
+    getattr(snapshot.state, name)[3, 7] = value
+    with pytest.raises(InvalidArgument, match=rf"^{name}: expected "):
+        tissue.restore(snapshot)
 
 
 def test_the_slow_drift_is_the_recursion_that_is_said() -> None:

@@ -30,11 +30,11 @@ from animat.studies.evaluating import Evaluate
 from animat.studies.limits import FindLimits, read_limits
 from animat.studies.places import controls_file, episodes_file, limits_file, results_file, table_file
 from animat.studies.recording import Record
-from animat.studies.results import ComparedReturns, Limit, Results, read_typed, write_typed
+from animat.studies.results import ComparedReturns, Limit, Results, Score, read_typed, write_typed
 from animat.studies.shown import limits_shown
 from animat.studies.simulating import Fit
 from animat.studies.specification import Body, Compared, Source, Study, StudyCondition, named_mapping
-from animat.studies.tabulating import References, Tabulate
+from animat.studies.tabulating import References, Tabulate, _known
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
 
@@ -133,6 +133,16 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
     corrected = holm({f"{row.comparison}/{row.robot}": row.p_normal for row in rows})
     assert len(corrected) == 4
     assert [row.p_holm for row in rows] == [corrected[f"{row.comparison}/{row.robot}"] for row in rows]
+
+
+def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_are_json(tmp_path: Path) -> None:
+    assert [_known(end) for end in (-np.inf, 1.5, np.inf)] == [None, 1.5, None]
+    score = Score("rover", "one", "none", 0.0, 1, 2, 3.0, None, 3.0, None, None, *6 * [None], None, None)
+    results = Results((score,), (), (), (), (), ())
+    write_typed(tmp_path / "results.json", results)
+    told = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+    assert told["scores"][0]["low_95"] is None
+    assert read_typed(tmp_path / "results.json", Results) == results
 
 
 # --- who answers ----------------------------------------------------------------------------------------------------

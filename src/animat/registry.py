@@ -113,6 +113,10 @@ class Registry(Generic[Thing]):
         announced = importlib.metadata.entry_points(group=self.entry_points)
         return tuple(dict.fromkeys([*self._ours, *self._registered, *(point.name for point in announced)]))
 
+    def name_of(self, name: str) -> str:
+        """The name of what is named so; errors as those of `named`."""
+        return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]
+
     def class_named(self, name: str) -> type[Thing]:
         """The class of this name; arguments and errors as those of `named`."""
         kind = self._kind(name)

@@ -112,21 +112,21 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
         Mismatch: for policies of another robot or mapping than was named.
     """
     from animat.coding.checking import check_mapping
-    from animat.coding.mapping import mapping_named
+    from animat.coding.mapping import REGISTRY as MAPPINGS
     from animat.registry import is_ours
     from animat.robots.checking import check_robot
     from animat.robots.registry import REGISTRY
     from animat.training.policy import load_policies
 
     expected = None if robot is None else REGISTRY.class_named(robot).name
-    asked = None if mapping is None else mapping_named(mapping)
+    asked = mapping if mapping in (None, "none") else MAPPINGS.name_of(mapping)
     policies = load_policies(path)
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
             raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
-        if asked is not None and asked.name != getattr(policy.mapping, "name", None):
-            got = "none" if policy.mapping is None else policy.mapping.name
-            raise Mismatch(f"{name}: expected a policy with the mapping {asked.name}, got one with {got}")
+        got = "none" if policy.mapping is None else policy.mapping.name
+        if asked not in (None, got):
+            raise Mismatch(f"{name}: expected a policy with the mapping {asked}, got one with {got}")
         if not is_ours(policy.robot):
             check_robot(policy.robot)
         if policy.mapping is not None and not is_ours(policy.mapping):

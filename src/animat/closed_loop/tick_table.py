@@ -51,6 +51,7 @@ class TickTable:
         self._writer = csv.writer(file, lineterminator="\n")
         self._conditions, self._observed, self._readouts = conditions, len(observed), len(readouts)
         names = [name.replace(" ", "_") for name in readouts]
+        names = list(readouts) if len(set(names)) < len(names) else names
         commands = [f"command_{name}" for name in names] if len(names) > 1 else ["command"]
         head = [each for column in HEAD for each in (commands if column == "command" else [column])]
         self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))

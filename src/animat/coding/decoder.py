@@ -67,6 +67,6 @@ def expect_fit(robot: str, n_commands: int, readouts: int) -> None:
     """
     if n_commands != readouts:
         raise InvalidArgument(
-            f"readouts: expected {n_commands}, one for each command of {robot}, got {readouts}; --readouts halves "
-            "makes two, quadrants four, a file of groups of electrodes as many as it has"
+            f"readouts: expected {n_commands}, one for each command of {robot}, got {readouts}; halves make two, "
+            "quadrants four, a file of groups of electrodes as many as it has (animat train --readouts)"
         )

@@ -35,6 +35,6 @@ def from_words(words: Mapping[str, str]) -> dict[str, Any]:
             provenance[key] = sentence
     culture = None
     for kind, begins, seed in (("virtual", "virtual culture", "seed"), ("cl1", "CL1", "pattern_seed")):
-        if words.get("source", "").startswith(begins) and words.get(seed, "").isdecimal():
+        if words.get("source", "").startswith(begins) and words.get(seed, "").isdecimal() and len(words[seed]) <= 20:
             culture = RecordedCulture(kind, int(words[seed]))
     return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}

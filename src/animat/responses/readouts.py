@@ -50,7 +50,7 @@ class Readouts:
             raise InvalidArgument(
                 f"readouts: expected 1 to {MOST_READOUTS} names, each once, of 1 to 40 letters, got {shown(self.names)}"
             )
-        groups = [tuple(group) for group in self.electrodes]
+        groups = [tuple(group) if isinstance(group, list | tuple) else () for group in self.electrodes]
         are_electrodes = all(group and all(type(e) is int and 0 <= e < 2**63 for e in group) for group in groups)
         if len(groups) != len(self.names) or not are_electrodes:
             raise InvalidArgument(
@@ -158,7 +158,7 @@ def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
     except InvalidFile as error:
         raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(NAMED)}") from error
     try:
-        data = json.loads(written)
+        data = json.loads(written, object_pairs_hook=_each_once)
         if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
             raise InvalidArgument(
                 f'readouts: expected electrodes by the names of groups, {{"left": [1, 2], "right": [3, 4]}}, got '
@@ -169,6 +169,13 @@ def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
         raise InvalidFile(f"{text}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise InvalidFile(f"{text}: readouts: expected JSON, got {error}") from error
+
+
+def _each_once(groups: list[tuple[str, object]]) -> dict[str, object]:
+    """JSON's own reading keeps the last of two groups of one name."""
+    if len(named := dict(groups)) < len(groups):
+        raise InvalidArgument(f"readouts: expected each name once, got {shown([name for name, _ in groups])}")
+    return named
 
 
 def count_readouts(readouts: str | Readouts) -> int:
@@ -183,14 +190,20 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
     quadrants, as places are (`animat.stimulation.places`).
 
     Args:
-        readouts: `halves`, `quadrants`, or groups that are known.
+        readouts: `all`, `halves`, `quadrants`, or groups that are known.
         channels: of a recording.
 
     Raises:
         InvalidArgument: for channels of which it is not known which electrode they read and where it is, or too few.
         Mismatch: for channels that do not read all electrodes of the groups.
     """
+    if readouts == "all":
+        return ALL
     if isinstance(readouts, str):
+        if readouts not in NAMED:
+            raise InvalidArgument(
+                f"readouts: expected all, {', '.join(NAMED)} or groups of electrodes, got {shown(readouts)}"
+            )
         electrodes, first = np.unique(channels.electrode, return_index=True)
         if UNKNOWN in electrodes or len(electrodes) < count_places(readouts):
             raise InvalidArgument(

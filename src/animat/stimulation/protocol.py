@@ -120,7 +120,7 @@ class Protocol:
         return count_places(self.places)
 
     def to_json(self) -> str:
-        """As one line of JSON, the way it travels in a recording's provenance under `"protocol"`."""
+        """As one line of JSON, the way a recording's file keeps it under `"protocol"`."""
         data = {each.name: getattr(self, each.name) for each in fields(self)}
         if not self.places:
             # A series knows its own protocol by its text, and those of before have no places.

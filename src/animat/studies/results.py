@@ -67,8 +67,8 @@ class Score:
     mean_return: float
     standard_deviation: float | None
     interquartile_mean: float
-    low_95: float
-    high_95: float
+    low_95: float | None
+    high_95: float | None
     random: float | None
     limit: float | None
     limit_grid_error: float | None

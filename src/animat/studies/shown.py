@@ -261,7 +261,11 @@ def _pair(value: str, error: str) -> Callable[[Any], str | None]:
 
 
 def _interval(value: str, low: str, high: str) -> Callable[[Any], str]:
-    return lambda row: f"{cell(getattr(row, value))}\u00a0{_ends(getattr(row, low), getattr(row, high))}"
+    def shown(row: Any) -> str:
+        ends = getattr(row, low), getattr(row, high)
+        return cell(getattr(row, value)) + ("" if None in ends else f"\u00a0{_ends(*ends)}")
+
+    return shown
 
 
 def _ends(low: float, high: float) -> str:

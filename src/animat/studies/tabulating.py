@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -182,6 +183,11 @@ def performances(
     return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
 
 
+def _known(end: float) -> float | None:
+    """The end of an interval; one policy on a robot whose returns have no bounds leaves none."""
+    return end if math.isfinite(end) else None
+
+
 def _scores(
     study: Study, table: DataFrame, first: float, last: float, references: Mapping[str, References]
 ) -> Iterator[Score]:
@@ -203,8 +209,8 @@ def _scores(
                     mean_return=mean,
                     standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
                     interquartile_mean=middle.value,
-                    low_95=middle.low,
-                    high_95=middle.high,
+                    low_95=_known(middle.low),
+                    high_95=_known(middle.high),
                     random=known.random(condition, at_min),
                     limit=None if limit is None else limit.best_return,
                     limit_grid_error=None if limit is None else limit.grid_error,

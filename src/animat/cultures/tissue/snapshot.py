@@ -58,6 +58,14 @@ def expect_sound(snapshot: Snapshot, like: kernel.State, wiring: kernel.Wiring, 
         if values.dtype.kind == "f":
             # A share is the difference of two: rounding may take it past its end by a last bit.
             expect_within(name, values, low - 1e-9 * (low == 0), high + 1e-9 * (low == 0))
+    for name in ("arriving_ampa", "arriving_nmda", "arriving_gaba"):
+        # The kernel notes once what arrives at a neuron: what cancels out would be noted twice.
+        expect_within(name, getattr(snapshot.state, name), 0.0, LARGEST)
+    alone = (snapshot.state.arriving_nmda > 0) & (snapshot.state.arriving_ampa == 0)
+    if alone.any():
+        raise InvalidArgument(
+            f"arriving_nmda: expected NMDA to arrive with AMPA, got {int(alone.sum())} arrivals without"
+        )
     expect_within("refractory", snapshot.state.refractory, 0, int(wiring.refractory_steps.max(initial=0)))
     expect_within("last_spike", snapshot.state.last_spike, 0, step)
     for name, values in snapshot.kicks._asdict().items():

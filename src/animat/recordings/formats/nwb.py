@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.compilation import user_cache
-from animat.errors import InvalidFile, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.nwb_layout import (
     ELECTRODES_TABLE,
@@ -166,6 +166,10 @@ def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Rec
         raise InvalidFile(
             f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat to read it"
         )
+    try:
+        words = from_words(_words(file))
+    except InvalidArgument as error:
+        raise InvalidFile(f"{path}: {error}") from error
     order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
     times, channels = _spikes(file)
     return Recording(
@@ -178,7 +182,7 @@ def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Rec
         duration_s=_cell(file, "duration_s", float),
         start_min=_cell(file, "start_min", float),
         presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
-        **from_words(_words(file)),
+        **words,
     )
 
 
