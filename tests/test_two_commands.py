@@ -175,7 +175,7 @@ def test_a_policy_carries_its_readouts_through_its_file(
 def test_what_does_not_fit_is_refused_in_a_line(recording: Recording, timeline: SimulatorTimeline) -> None:
     training = Training(Wheels(), "1-threshold", policies=1, algorithm=SMALL)
     whole = fit_timeline(extract_series([recording], burst_threshold=0.95))
-    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1; --read"):
+    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1; halves"):
         train(training, whole, None)
     with pytest.raises(InvalidArgument, match="readouts: expected 1, one for each command of cartpole, got 2"):
         train(replace(training, robot=Cartpole()), timeline, None)
