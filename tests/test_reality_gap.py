@@ -146,7 +146,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
         )
         assert abs(rolled.returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
-    limit = best_return(environment, calibration.simulator, resolution=0.6, episodes=0).value
+    limit = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
     assert gap.limit == pytest.approx(limit)
     won = rows["policies"].lived.mean() - rows["policies"].predicted.mean()
     assert gap.gap_share == pytest.approx(won / (limit - rows["random"].predicted.mean()))

@@ -43,8 +43,8 @@ from animat.training.policy import Policy, first_of_alike
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
-LIMIT_RESOLUTION = 0.6
-"""Of the grid of the best possible return: fast and rough, 0.5 of the cartpole's 200."""
+LIMIT_RESOLUTION = 0.5
+"""Of the grid of the best possible return: fast and rough, 0.8 of the cartpole's 200."""
 
 
 def run_policies(
