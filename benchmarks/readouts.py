@@ -1,8 +1,10 @@
 """How far two commands can be set apart: the readouts' responses to each condition of place and frequency.
 
     python benchmarks/readouts.py [--cultures 1 2 3] [--places halves] [--frequencies 5 80] [--presentations 500]
+    python benchmarks/readouts.py --places corners --frequencies 20
 
-Of each virtual culture one recording is made, with its conditions mixed, one pulse each. Printed, as a table of
+Of each virtual culture one recording is made, with its conditions mixed, one pulse each. With `corners` the stimulated
+places are the left half of the electrodes, the right half, both, and one electrode. Printed, as a table of
 Markdown, is for each condition how often each readout gives a command above 0 (x of P50 or more), how often each corner
 of commands is hit, and Spearman's correlation of the readouts within the condition.
 """
@@ -13,6 +15,7 @@ import argparse
 import itertools
 
 import numpy as np
+from jaxtyping import Int64
 from scipy.stats import spearmanr
 
 from animat.cultures.virtual import VirtualCulture
@@ -20,16 +23,28 @@ from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import readouts_on
 from animat.responses.responses import Responses
+from animat.stimulation.array import MAXONE
+from animat.stimulation.places import NAMED, Places, electrodes_of
 from animat.stimulation.protocol import Protocol
 
 
 def recorded(seed: int, places: str, frequencies_hz: tuple[float, ...], presentations: int) -> Responses:
-    """The responses of a virtual culture, read as its places are."""
-    protocol = Protocol(order="mixed", places=places, frequencies_hz=frequencies_hz, presentations=presentations)
+    """The responses of a virtual culture, read by halves or quadrants."""
     with VirtualCulture(seed) as culture:
+        electrodes = np.array(culture.stimulation_electrodes)
+        groups: Places = places if places in NAMED else corners_of(electrodes)
+        protocol = Protocol(order="mixed", places=groups, frequencies_hz=frequencies_hz, presentations=presentations)
         recording = culture.record(protocol, seed=1)
     by = conditions_named("frequency x electrode")
-    return extract_responses(recording, by, readouts=readouts_on(places, recording.channels))
+    readouts = readouts_on(places if places in NAMED else "halves", recording.channels)
+    return extract_responses(recording, by, readouts=readouts)
+
+
+def corners_of(electrodes: Int64[np.ndarray, " electrodes"]) -> tuple[tuple[int, ...], ...]:
+    """The left half of them, the right half, both, and the first of the left."""
+    x_um, y_um = MAXONE.position_um(electrodes)
+    left, right = electrodes_of("halves", electrodes, x_um, y_um)
+    return left, right, (*left, *right), left[:1]
 
 
 def table(responses: Responses) -> list[str]:
@@ -45,7 +60,9 @@ def table(responses: Responses) -> list[str]:
         hit = [float(np.mean(np.all(above == corner, axis=1))) for corner in corners]
         together = np.atleast_2d(spearmanr(x_hz).statistic)
         rho = float(together[0, 0] if together.size == 1 else together[0, 1])
-        cells = [condition.label, str(len(x_hz)), *(f"{p:.2f}" for p in (*above.mean(axis=0), *hit, rho))]
+        (electrodes,), (hz,) = condition.electrodes or ((),), condition.frequencies_hz
+        place = f"{hz:g} Hz, {len(electrodes)} electrodes from {min(electrodes)}"
+        cells = [place, str(len(x_hz)), *(f"{p:.2f}" for p in (*above.mean(axis=0), *hit, rho))]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 
@@ -54,7 +71,7 @@ def main() -> None:
     """Record and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cultures", type=int, nargs="+", default=[1, 2, 3], help="seeds")
-    parser.add_argument("--places", default="halves", choices=["halves", "quadrants"])
+    parser.add_argument("--places", default="halves", choices=[*NAMED, "corners"])
     parser.add_argument("--frequencies", type=float, nargs="+", default=[5.0, 80.0], help="Hz")
     parser.add_argument("--presentations", type=int, default=500, help="of each condition")
     given = parser.parse_args()
