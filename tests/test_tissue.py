@@ -219,7 +219,8 @@ def test_the_noise_is_an_ornstein_uhlenbeck_process() -> None:
     assert drive_mv.mean() == pytest.approx(0.0, abs=0.02)
     assert drive_mv.std() == pytest.approx(2.0, rel=0.01)
     standard = drive_mv / drive_mv.std()
-    assert np.mean(standard**4) == pytest.approx(3.0, abs=0.06)
+    # A sum of four uniform numbers has an excess of -0.3; of independent moves 1 ms apart this is left.
+    assert np.mean(standard**4) == pytest.approx(3.0 - 0.3 * np.tanh(1 / 5.0), abs=0.03)
     assert np.mean(standard**3) == pytest.approx(0.0, abs=0.03)
     for lag_ms in (1, 5, 10):
         correlation = np.mean(standard[lag_ms:] * standard[:-lag_ms])

@@ -21,6 +21,8 @@ FAINT = f4(1e-20)
 """Added at every decay, so that silence ends at about 1e-17 and never at subnormal numbers, which are slow."""
 AXONAL_KICK_MV = f4(1000.0)
 """A spike that arrives along the axon brings the soma over any threshold."""
+NOISE_STEPS = 5
+"""How often a neuron's noise moves: 1 ms, well below its time constant."""
 SHARED_STEPS = 25
 """How often the noise that a community shares moves: it is slow."""
 STRETCH = 128
@@ -45,7 +47,7 @@ class Constants(NamedTuple):
     lose_gaba: np.float32
     lose_potassium: np.float32
     lose_adaptation: np.float32
-    keep_noise: np.float32
+    keep_noise: np.float32  # over `NOISE_STEPS`, as the next
     noise_scale_mv: np.float32
     keep_shared: np.float32  # over `SHARED_STEPS`, as the next
     shared_scale_mv: np.float32
@@ -118,6 +120,24 @@ class State(NamedTuple):
     last_driven: Int64[np.ndarray, " neurons"]
 
 
+class Arrivals(NamedTuple):
+    """Which places of the rings are not empty: a step looks at these alone, as most are.
+
+    The first axis is excitation (AMPA and NMDA arrive together) and inhibition; the targets of a row stand in its
+    first `count`, each once.
+    """
+
+    count: Int32[np.ndarray, "2 ring"]
+    target: Int32[np.ndarray, "2 ring neurons"]
+
+
+def arrivals_of(state: State) -> Arrivals:
+    """What a state's rings hold."""
+    is_arriving = np.stack([state.arriving_ampa, state.arriving_gaba]) != 0
+    targets_first = np.argsort(~is_arriving, axis=2, kind="stable")
+    return Arrivals(is_arriving.sum(2, dtype=np.int32), targets_first.astype(np.int32))
+
+
 def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
     """The constants as one record with the same names: a call takes a tuple of 28 numbers apart one by one, 3 us."""
     values = {name: np.asarray(value) for name, value in constants._asdict().items()}
@@ -168,8 +188,12 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
     for i in range(v_mv.size):
         v = v_mv[i]
         y = min(max((v - middle_mv) * per_mv, -ONE), ONE)
-        unblocked = b4 + y * (b5 + y * (b6 + y * (b7 + y * (b8 + y * b9))))
-        unblocked = b0 + y * (b1 + y * (b2 + y * (b3 + y * unblocked)))
+        # Estrin's scheme: its products do not wait for each other as Horner's do.
+        y2 = y * y
+        y4 = y2 * y2
+        low = (b0 + b1 * y) + (b2 + b3 * y) * y2
+        high = (b4 + b5 * y) + (b6 + b7 * y) * y2
+        unblocked = low + y4 * (high + y4 * (b8 + b9 * y))
         total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
         current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
         z = total * step_over_membrane[i]
@@ -185,7 +209,7 @@ def move_noise(
     key: UInt64[np.ndarray, " neurons"],
     step: int,
 ) -> None:
-    """One step of the Ornstein-Uhlenbeck drive, its noise a function of the neuron and the step alone."""
+    """`NOISE_STEPS` of the Ornstein-Uhlenbeck drive, its noise a function of the neuron and the step alone."""
     keep, scale = constants.keep_noise, constants.noise_scale_mv
     for i in range(drive_mv.size):
         noise_mv = scale * sum_of_four(mixed(key[i], step))
@@ -223,20 +247,26 @@ def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
 
 
 @inlined
-def arrive(constants: Constants, state: State, slot: int) -> None:
+def arrive(constants: Constants, state: State, arrivals: Arrivals, slot: int) -> None:
     """Add what arrives in this step to the conductances, and empty its row of the ring."""
-    ampa, nmda, gaba = state.ampa, state.nmda, state.gaba
     to_ampa, to_nmda, to_gaba = state.arriving_ampa[slot], state.arriving_nmda[slot], state.arriving_gaba[slot]
-    saturation = constants.nmda_saturation
-    for i in range(ampa.size):
-        ampa[i] += to_ampa[i]
-        to_ampa[i] = f4(0.0)
-    for i in range(nmda.size):
-        nmda[i] += to_nmda[i] * (saturation - nmda[i])
-        to_nmda[i] = f4(0.0)
-    for i in range(gaba.size):
-        gaba[i] += to_gaba[i]
+    for place in range(arrivals.count[0, slot]):
+        i = arrivals.target[0, slot, place]
+        state.ampa[i] += to_ampa[i]
+        state.nmda[i] += to_nmda[i] * (constants.nmda_saturation - state.nmda[i])
+        to_ampa[i] = to_nmda[i] = f4(0.0)
+    for place in range(arrivals.count[1, slot]):
+        i = arrivals.target[1, slot, place]
+        state.gaba[i] += to_gaba[i]
         to_gaba[i] = f4(0.0)
+    arrivals.count[0, slot] = arrivals.count[1, slot] = 0
+
+
+@inlined
+def note(arrivals: Arrivals, kind: int, row: int, target: int) -> None:
+    """Note a place of a ring that is no longer empty."""
+    arrivals.target[kind, row, arrivals.count[kind, row]] = target
+    arrivals.count[kind, row] += 1
 
 
 @inlined
@@ -271,7 +301,9 @@ def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: i
 
 
 @inlined
-def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, gain: float) -> None:
+def fire(
+    constants: Constants, wiring: Wiring, state: State, arrivals: Arrivals, i: int, step: int, gain: float
+) -> None:
     """Let neuron i spike: release, depress, tire, send along every synapse, reset."""
     kind = 0 if i < constants.n_excitatory else 1
     elapsed_s = (step - state.last_spike[i]) * constants.step_s
@@ -296,7 +328,10 @@ def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, 
         for synapse in range(first, last):
             target = wiring.target[synapse]
             arriving = wiring.weight[synapse] * (to_e if target < n_e else to_i)
-            place = ((step + wiring.delay_steps[synapse]) & last_row) * n + target
+            row = (step + wiring.delay_steps[synapse]) & last_row
+            place = row * n + target
+            if to_ampa[place] == 0 and arriving != 0:
+                note(arrivals, 0, row, target)
             to_ampa[place] += arriving
             # Two arrivals in one step fill a share each of what the other leaves: as if one came after the other.
             to_nmda[place] += min(constants.nmda_fill * arriving, ONE) * (ONE - to_nmda[place])
@@ -304,8 +339,12 @@ def fire(constants: Constants, wiring: Wiring, state: State, i: int, step: int, 
         to_gaba = state.arriving_gaba.ravel()
         for synapse in range(first, last):
             target = wiring.target[synapse]
-            place = ((step + wiring.delay_steps[synapse]) & last_row) * n + target
-            to_gaba[place] += wiring.weight[synapse] * (to_e if target < n_e else to_i)
+            arriving = wiring.weight[synapse] * (to_e if target < n_e else to_i)
+            row = (step + wiring.delay_steps[synapse]) & last_row
+            place = row * n + target
+            if to_gaba[place] == 0 and arriving != 0:
+                note(arrivals, 1, row, target)
+            to_gaba[place] += arriving
 
     state.v_mv[i] = constants.reset_mv
     state.potassium[i] += constants.hyperpolarisation
@@ -332,6 +371,7 @@ def advance(
     record: Shaped[np.ndarray, " 1"],
     wires: tuple[np.ndarray, ...],
     values: tuple[np.ndarray, ...],
+    arriving: tuple[np.ndarray, ...],
     first_step: int,
     n_steps: int,
     gain: float,
@@ -346,8 +386,8 @@ def advance(
     A call takes a named tuple apart twice as slowly as a plain one, which shows where a call is 60 steps of 2 us.
 
     Args:
-        record, wires, values: the tissue, as `packed` constants and plain tuples of `Wiring` and `State`; the state is
-            changed in place.
+        record, wires, values, arriving: the tissue, as `packed` constants and plain tuples of `Wiring`, `State` and
+            `Arrivals`; the last two are changed in place.
         first_step, n_steps: the tissue's clock, in steps, and how far to go.
         gain: factor on excitatory weights over this call.
         kick_step, kick_neuron, kick_mv: kicks in the order of their steps, none before `first_step`.
@@ -356,7 +396,7 @@ def advance(
     Returns:
         The steps taken, the kicks passed, and the spikes written.
     """
-    constants, wiring, state = record[0], Wiring(*wires), State(*values)
+    constants, wiring, state, arrivals = record[0], Wiring(*wires), State(*values), Arrivals(*arriving)
     n = state.v_mv.size
     last_row = state.arriving_ampa.shape[0] - 1
     mean_mv = np.empty(n, np.float32)
@@ -379,7 +419,8 @@ def advance(
         if step % SHARED_STEPS == 0:
             move_shared(constants, wiring, state, step)
             fill_mean(wiring, state, mean_mv)
-        move_noise(constants, state.drive_mv, mean_mv, wiring.noise_key, step)
+        if step % NOISE_STEPS == 0:
+            move_noise(constants, state.drive_mv, mean_mv, wiring.noise_key, step)
         decay(state.ampa, constants.lose_ampa)
         decay(state.nmda, constants.lose_nmda)
         decay(state.gaba, constants.lose_gaba)
@@ -394,8 +435,8 @@ def advance(
                         spike_step[spikes] = step
                         spike_neuron[spikes] = i
                         spikes += 1
-                        fire(constants, wiring, state, i, step, gain)
-        arrive(constants, state, step & last_row)
+                        fire(constants, wiring, state, arrivals, i, step, gain)
+        arrive(constants, state, arrivals, step & last_row)
     return n_steps, kicks, spikes
 
 

@@ -27,7 +27,7 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
         )
         return np.array([[getattr(kind, of) for kind in row] for row in kinds])
 
-    noise_keep = np.exp(-step_ms / parameters.noise_ms)
+    noise_keep = np.exp(-kernel.NOISE_STEPS * step_ms / parameters.noise_ms)
     return kernel.Constants(
         block=block_polynomial(),
         block_middle_mv=f4(BLOCK_MIDDLE_MV),

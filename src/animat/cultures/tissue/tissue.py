@@ -62,8 +62,7 @@ class Tissue:
         self._drift = Drift(seed, self.parameters)
         self._constants = kernel.packed(prepare_constants(self.parameters))
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
-        self._state = fresh_state(seed, self.parameters, self._network, self._wiring)
-        self._run = self._constants, tuple(self._wiring), tuple(self._state)
+        self._have(fresh_state(seed, self.parameters, self._network, self._wiring))
         self._step_ns = round(self.parameters.step_ms * 1e6)
         self._step_s = self._step_ns / NS
         self._now_ns = 0
@@ -163,9 +162,12 @@ class Tissue:
                 "other parameters: make a tissue with those"
             )
         expect_sound(snapshot, self._state, self._wiring, self._step_ns)
-        self._state = kernel.State(*(values.copy() for values in snapshot.state))
-        self._run = self._constants, tuple(self._wiring), tuple(self._state)
+        self._have(kernel.State(*(values.copy() for values in snapshot.state)))
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
+
+    def _have(self, state: kernel.State) -> None:
+        self._state = state
+        self._run = self._constants, tuple(self._wiring), tuple(state), tuple(kernel.arrivals_of(state))
 
     def _kicks_of(self, pulse: Pulse, end_ns: int) -> Kicks:
         pulse_ns = round(pulse.time_s * NS) if isfinite(pulse.time_s) else -1
