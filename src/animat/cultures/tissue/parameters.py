@@ -68,9 +68,9 @@ class TissueParameters:
     """[L] Absolute refractory periods."""
     hyperpolarisation: float = 0.0055
     """[C] Added to the potassium conductance by each spike."""
-    hyperpolarisation_ms: float = 4000.0
+    hyperpolarisation_ms: float = 4450.0
     """[L] Its time constant."""
-    adaptation_mv: float = 1.035
+    adaptation_mv: float = 1.24
     """[C] Added to the threshold by each spike."""
     adaptation_ms: float = 100.0
     """[C] Its time constant."""
@@ -80,18 +80,18 @@ class TissueParameters:
     nmda_ms: float = 110.0
     gaba_ms: float = 10.0
     """[L] Decay of the synaptic conductances."""
-    nmda_ratio: float = 0.804
+    nmda_ratio: float = 0.794
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
     nmda_saturation: float = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
-    e_to_e: ShortTerm = ShortTerm(0.12, 750.0, 220.0)
+    e_to_e: ShortTerm = ShortTerm(0.12, 780.0, 220.0)
     e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
-    i_to_any: ShortTerm = ShortTerm(0.137, 580.0)
+    i_to_any: ShortTerm = ShortTerm(0.137, 740.0)
     """[C] within [L]: short-term plasticity."""
-    weight_ee: float = 0.573
-    weight_ei: float = 1.073
-    weight_ie: float = 0.3985
-    weight_ii: float = 0.8425
+    weight_ee: float = 0.5715
+    weight_ei: float = 1.0565
+    weight_ie: float = 0.39925
+    weight_ii: float = 0.86375
     """[C] Mean weights, from the first letter to the second."""
     weight_sigma: float = 0.5
     """[C] Sigma of the log-normal weights."""
@@ -114,7 +114,7 @@ class TissueParameters:
     """[L] Speed of axons."""
 
     # Drive.
-    drive_mv: float = 9.425
+    drive_mv: float = 9.4
     drive_spread_mv: float = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
     community_drive_mv: float = 0.1
@@ -123,9 +123,9 @@ class TissueParameters:
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
     """[C] Its time constant."""
-    shared_noise_mv: float = 0.5
+    shared_noise_mv: float = 0.56
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
-    shared_noise_ms: float = 650.0
+    shared_noise_ms: float = 575.0
     """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
     doi 10.1016/j.neuron.2004.08.011)."""
 
