@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from animat.errors import InvalidFile
+from animat.recordings import apart
 from damaging import KINDS
 
 
@@ -45,3 +47,13 @@ def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: P
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_thousand_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 2, 2000, tmp_path)
+
+
+def test_a_reader_that_is_not_ready_in_time_does_not_blame_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "START_S", 0.0)
+    reader = apart._Reader()
+    try:
+        with pytest.raises(InvalidFile, match=r"not ready after 0 s, is the machine busy\?"):
+            reader._start()
+    finally:
+        reader.end()

@@ -131,8 +131,11 @@ class _Reader:
             env=os.environ | single | {"PYTHONPATH": os.pathsep.join(paths)},
         )
         self._owner = os.getpid()
-        if _received(self._process.stdout, len(_READY), time.monotonic() + START_S) != _READY:
-            raise InvalidFile("the process that reads HDF5 files could not be started: is animat installed whole?")
+        until = time.monotonic() + START_S
+        if _received(self._process.stdout, len(_READY), until) != _READY:
+            is_late = time.monotonic() >= until
+            why = f"not ready after {START_S:g} s, is the machine busy?" if is_late else "is animat installed whole?"
+            raise InvalidFile(f"the process that reads HDF5 files could not be started: {why}")
 
 
 def _received(pipe: Any, size: int, until: float) -> bytes | None:
