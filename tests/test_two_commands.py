@@ -296,7 +296,7 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
         "episode_limit=8",
     ]
     assert main(["train", "my_wheels:Wheels", *few]) == 1
-    assert "expected 2, one for each command of wheels, got 1; --readouts halves" in capsys.readouterr().err
+    assert "expected 2, one for each command of wheels, got 1; halves make two" in capsys.readouterr().err
     assert main(["train", "my_wheels:Wheels", *few, "--readouts", "halves"]) == 0
     assert "5 Hz: left 0." in capsys.readouterr().out
     asked = ["--recordings", "recordings", "--episodes", "2"]
