@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium
@@ -12,8 +13,20 @@ import pytest
 
 from animat.neurons.made_up import made_up_simulator
 from animat.recordings.made_up import write_made_up_series
+from animat.robots.registry import REGISTRY
 
 DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.fixture(autouse=True)
+def as_in_a_new_process() -> Iterator[None]:
+    """Other tests of this process have robots of the pages' names too."""
+    known = dict(REGISTRY._registered)
+    for name in [name for name, kind in known.items() if not kind.__module__.startswith("animat.")]:
+        del REGISTRY._registered[name]
+    yield
+    REGISTRY._registered.clear()
+    REGISTRY._registered.update(known)
 
 
 @pytest.mark.parametrize("page", ["robots.md", "gymnasium.md"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.cli.record import Record
+from animat.cli.responses import Fitting
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recording
 from animat.responses.conditions import conditions_named
 from animat.stimulation.places import check_places, electrodes_of, read_places
@@ -146,3 +149,11 @@ def test_the_command_says_how_to_train_on_places(
     assert "train --conditions 'frequency x electrode';" in capsys.readouterr().out
     assert main(["record"]) == 0
     assert "--conditions" not in capsys.readouterr().out
+
+
+def test_recordings_of_places_that_are_mixed_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    write_nwb(replace(read_recording(file), protocol=Protocol(places="halves")), tmp_path / "places.nwb")
+    for path, is_told in ((file, False), (tmp_path / "places.nwb", True)):
+        Fitting().timeline([path])
+        assert ("the recordings have places, which are mixed" in capsys.readouterr().err) == is_told

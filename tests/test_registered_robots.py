@@ -244,7 +244,7 @@ def test_robots_are_listed_with_what_each_can_do(
     quantities = property(lambda self: ("x",))
     monkeypatch.setattr(type(robot_named("rover")), "quantities", quantities)
     assert main(["robots"]) == 1
-    assert "rover cannot be used: rover: expected a robot, got AttributeError" in capsys.readouterr().out
+    assert "rover cannot be used: Rover.quantities: expected a tuple of Quantity" in capsys.readouterr().out
     assert main(["robots", "my_nowhere:Tank"]) == 1
     assert capsys.readouterr().err.startswith("animat: robot: expected my_nowhere:Tank to be importable")
 
@@ -321,3 +321,15 @@ def test_ours_can_do_everything_and_are_pickled_as_ever() -> None:
         assert lacking(robot) == {} and "import" not in robot_to_dict(robot)
         assert pickle.loads(pickle.dumps(robot)) == robot
     assert set(WITHOUT) == {"heuristic", "value_grid", "draw", "draw_paths"}
+
+
+def test_what_a_robot_has_wrong_is_named_where_it_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    (tmp_path / "my_wrong.py").write_text(
+        "from dataclasses import dataclass\nfrom animat.robots import Cartpole\n\n"
+        "@dataclass(frozen=True)\nclass Wrong(Cartpole):\n    name = 'wrong'\n    n_commands = 'two'\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["robots", "my_wrong:Wrong"]) == 1
+    assert "Wrong.n_commands: expected a whole number from 1 to 64, got 'two'" in capsys.readouterr().err

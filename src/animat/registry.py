@@ -106,7 +106,8 @@ class Registry(Generic[Thing]):
         except InvalidArgument as error:
             raise InvalidArgument(f"{name}: {error}") from error
         except Exception as error:
-            raise InvalidArgument(f"{name}: expected it to be made of {parameters}, got {first_line(error)}") from error
+            of = f"of {parameters}" if parameters else "without parameters"
+            raise InvalidArgument(f"{name}: expected it to be made {of}, got {first_line(error)}") from error
 
     def names(self) -> tuple[str, ...]:
         """The names that are known here: ours, of what is registered, then of what packages announce."""

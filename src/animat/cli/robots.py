@@ -51,10 +51,14 @@ def _short(value: Any) -> str:
 
 
 def _told(name: str) -> dict[str, Any]:
+    from animat.registry import is_ours
     from animat.robots import robot_named, robot_to_dict
     from animat.robots.capabilities import WITHOUT, lacking
+    from animat.robots.checking import check_robot
 
     robot = robot_named(name)
+    if not is_ours(robot):
+        check_robot(robot)
     lacks = lacking(robot)
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],

@@ -65,7 +65,8 @@ def expect_fit(robot: str, n_commands: int, readouts: int) -> None:
     Raises:
         InvalidArgument: where they differ.
     """
-    if n_commands != readouts:
+    # What is no number of commands is named where a robot is checked.
+    if type(n_commands) is int and n_commands > 0 and n_commands != readouts:
         raise InvalidArgument(
             f"readouts: expected {n_commands}, one for each command of {robot}, got {readouts}; halves make two, "
             "quadrants four, a file of groups of electrodes as many as it has (animat train --readouts)"
