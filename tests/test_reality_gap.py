@@ -398,7 +398,7 @@ def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
     )
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mapping", "held"),
     [(Thresholds(1), False), (Thresholds(9), False), (Thresholds(1), True), (Linear(), True)],
@@ -438,7 +438,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     assert 106 <= covered <= 119
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
     rng, widths = np.random.default_rng(3), []
     environment = Animat(Cartpole(), Thresholds(1), 5)
