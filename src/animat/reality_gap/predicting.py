@@ -101,7 +101,7 @@ def predict(
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:
         progress.update(0, len(groups), "predicting")
         # One of each kind first: two that were compiled at once would be compiled twice.
-        kinds = {type(actor): number for number, (actor, _) in enumerate(acting)}
+        kinds = {(type(acting[i][0]), group[0].delivery == "silent"): i for i, group in enumerate(groups)}
         list(side_by_side.map(rolled, kinds.values(), repeat(0)))
         for number, group in enumerate(groups):
             episodes = list(side_by_side.map(rolled, repeat(number), range(len(simulators))))
