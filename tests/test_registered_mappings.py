@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -173,7 +174,9 @@ def test_what_is_no_mapping_is_named_in_a_line_before_anything_is_read(
 ) -> None:
     at = written(package, before, after)
     (package / "my_changed.py").write_text("from dataclasses import field\n" + (package / "my_changed.py").read_text())
-    with np.errstate(all="ignore"):
+    with warnings.catch_warnings():
+        # No words of NumPy's before our line.
+        warnings.simplefilter("error", RuntimeWarning)
         assert main(["train", "cartpole", "--recordings", "no-such-folder", "--mapping", at]) == 1
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1 and re.search(words, said[0].removeprefix("animat: ")), said

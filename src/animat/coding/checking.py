@@ -51,7 +51,9 @@ def check_mapping(mapping: Mapping) -> None:
 
 def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
     try:
-        return np.asarray(mapping.command(x, percentiles))
+        # What comes of a division by zero is seen below, and told in one line.
+        with np.errstate(all="ignore"):
+            return np.asarray(mapping.command(x, percentiles))
     except Exception as error:
         # Anything may go wrong in somebody else's mapping.
         raise InvalidArgument(
