@@ -22,7 +22,8 @@ from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.recordings.made_up import write_made_up_series
 from animat.studies.run import run_study
-from animat.studies.specification import Body, Source, Study, StudyCondition
+from animat.studies.source import Source
+from animat.studies.specification import Body, Study, StudyCondition
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training

@@ -36,7 +36,8 @@ from animat.robots import (
 )
 from animat.robots.capabilities import WITHOUT, lacking
 from animat.studies.run import run_study
-from animat.studies.specification import Body, Source, Study
+from animat.studies.source import Source
+from animat.studies.specification import Body, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training

@@ -25,7 +25,8 @@ from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper
 from animat.studies.results import ComparedReturns, Limit, Score, write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
-from animat.studies.specification import Body, Simulators, Source, Study, StudyCondition
+from animat.studies.source import Source
+from animat.studies.specification import Body, Simulators, Study, StudyCondition
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of

@@ -54,7 +54,8 @@ from animat.studies.plan import plan_study
 from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
 from animat.studies.simulating import Fit, load_timeline
-from animat.studies.specification import Body, Compared, Simulators, Source, Study, StudyCondition
+from animat.studies.source import Source
+from animat.studies.specification import Body, Compared, Simulators, Study, StudyCondition
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.policy import Policy

@@ -33,7 +33,8 @@ from animat.studies.recording import Record
 from animat.studies.results import ComparedReturns, Limit, Results, Score, read_typed, write_typed
 from animat.studies.shown import limits_shown
 from animat.studies.simulating import Fit
-from animat.studies.specification import Body, Compared, Source, Study, StudyCondition, named_mapping
+from animat.studies.source import Source
+from animat.studies.specification import Body, Compared, Study, StudyCondition, named_mapping
 from animat.studies.tabulating import References, Tabulate, _known
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies

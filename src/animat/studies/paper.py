@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from animat.studies.specification import Body, Compared, Source, Study, StudyCondition
+from animat.studies.source import Source
+from animat.studies.specification import Body, Compared, Study, StudyCondition
 
 
 @dataclass(frozen=True)

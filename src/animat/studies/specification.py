@@ -6,30 +6,24 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, AliasChoices, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
 from animat.coding.mapping import Thresholds, mapping_named
-from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
-from animat.recordings.made_up import MadeUpCulture
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.registry import is_ours, place_of
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import robot_named
-from animat.stimulation.protocol import Protocol
+from animat.studies.source import LISTED, Source
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
-MOST_SESSIONS, MOST_PRESENTATIONS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
-"""Recordings, presentations in each, and entries of a list; `docs/studies.md` states them."""
 MOST_TRAINED = 20_000
 """Policies of all conditions on all robots: each is a file, and five are a job."""
 FINEST_RESOLUTION = 2.0
 """Of the best possible return's grid: the cartpole's tables are of 2 GiB there, and grow with its fourth power."""
-
-_LISTED = Field(max_length=MOST_ENTRIES)
 
 
 def _name(given: str) -> str:
@@ -55,55 +49,6 @@ Resolution = Annotated[Number, Field(ge=0.1, le=FINEST_RESOLUTION)]
 
 
 @record
-class Source:
-    """Where the recordings come from: files, or a culture that is recorded for the study.
-
-    Attributes:
-        kind: `"virtual"`, simulated neurons; `"made-up"`, responses of known distributions, for trials; `"files"`.
-        files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
-        seed: which virtual or made-up culture.
-        sessions, interval_min: how many recordings, and the minutes from one to the next.
-        order, pulses, presentations: how stimuli are presented (`animat.stimulation.protocol`).
-        channels: of a made-up culture.
-    """
-
-    kind: Literal["virtual", "made-up", "files"] = "virtual"
-    files: Annotated[tuple[str, ...], _LISTED] = ()
-    seed: Seed = 1
-    sessions: Annotated[Whole, Field(ge=1, le=MOST_SESSIONS)] = 15
-    interval_min: Positive = 10.0
-    order: Literal["blocked", "mixed"] = "blocked"
-    pulses: Annotated[Whole, Field(ge=1, le=MOST_PRESENTATIONS)] = 1
-    presentations: Annotated[Whole, Field(ge=2, le=MOST_PRESENTATIONS)] = 100
-    channels: Annotated[Whole, Field(ge=1, le=1024)] = 256
-
-    def __post_init__(self) -> None:
-        if (self.kind == "files") != bool(self.files):
-            raise InvalidArgument(f"files: expected some for kind = 'files' only, got {len(self.files)}")
-        if self.sessions * self.interval_min > LONGEST_MIN:
-            raise InvalidArgument(
-                f"sessions, interval_min: expected recordings within a year, got {self.sessions} every "
-                f"{self.interval_min:g} min"
-            )
-        for file in self.files:
-            if not file or not file.isprintable():
-                raise InvalidArgument(f"files: expected names of files, got {shown(file)}")
-        if self.kind == "files":
-            for each in fields(self):
-                if each.name not in ("kind", "files") and getattr(self, each.name) != each.default:
-                    raise InvalidArgument(
-                        f"{each.name}: expected only for a culture that is recorded, got one of files"
-                    )
-        if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
-            raise InvalidArgument("order: a made-up culture is recorded blocked with one pulse, got otherwise")
-        # What the recordings themselves refuse is refused before there is a folder.
-        if self.kind == "virtual":
-            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations)
-        elif self.kind == "made-up":
-            MadeUpCulture(self.seed, patterns=self.presentations, channels=self.channels)
-
-
-@record
 class Simulators:
     """How responses are read and neuron simulators made of them; as the options of `animat train`.
 
@@ -123,7 +68,7 @@ class Simulators:
     window_ms: tuple[Number, Number] = (2.0, 10.0)
     burst_threshold: Share | None = None
     # What it was called in files that are still read.
-    allow: Annotated[tuple[str, ...], _LISTED, Field(validation_alias=AliasChoices("allow", "despite"))] = ()
+    allow: Annotated[tuple[str, ...], LISTED, Field(validation_alias=AliasChoices("allow", "despite"))] = ()
 
     def __post_init__(self) -> None:
         from animat.neurons.simulator import check_binning
@@ -289,9 +234,9 @@ class Study:
     title: str = "Study"
     culture: Source = Field(default_factory=Source)
     simulators: Simulators = Field(default_factory=Simulators)
-    robots: Annotated[tuple[Body, ...], _LISTED] = (Body("cartpole"), Body("navigation"))
-    conditions: Annotated[tuple[StudyCondition, ...], _LISTED] = (StudyCondition("1 threshold"),)
-    comparisons: Annotated[tuple[Compared, ...], _LISTED] = ()
+    robots: Annotated[tuple[Body, ...], LISTED] = (Body("cartpole"), Body("navigation"))
+    conditions: Annotated[tuple[StudyCondition, ...], LISTED] = (StudyCondition("1 threshold"),)
+    comparisons: Annotated[tuple[Compared, ...], LISTED] = ()
     policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
     seed: Seed = 1
     training_min: Positive = 60.0
