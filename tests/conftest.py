@@ -37,8 +37,8 @@ settings.load_profile("the same")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile soon, in this process and all that it starts; the oracles train for minutes, compiled as users are."""
-    if config.getoption("markexpr").startswith("not oracle"):
+    """Compile soon, in this process and all that it starts; long oracles train for minutes, compiled as users are."""
+    if config.getoption("markexpr") != "long":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SOON_COMPILED}"
 
 

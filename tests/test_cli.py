@@ -99,7 +99,6 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
     assert {file: file.read_bytes() for file in policies.iterdir()} == files
 
 
-@pytest.mark.oracle
 def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
     record = ["record", "--culture", "made-up", "--sessions", "2", "--out", str(series)]
@@ -122,6 +121,7 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
 
 
+@pytest.mark.oracle
 def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,6 +491,7 @@ def test_usage_errors_come_in_one_line(
     assert all(word in lines[0] for word in words)
 
 
+@pytest.mark.oracle
 def test_a_dead_window_is_refused_unless_told_otherwise(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -528,6 +529,7 @@ sys.exit(main())
 """
 
 
+@pytest.mark.oracle
 def test_a_full_disk_while_training_leaves_what_was_there_whole(recordings: Path, tmp_path: Path) -> None:
     """For real: the process may write files of 8 kB and no more."""
 

@@ -665,6 +665,7 @@ with FakeCulture(fault=hang, at=8) as culture:
 """
 
 
+@pytest.mark.oracle
 def test_killed_during_a_long_presentation_the_log_has_what_was_asked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -56,6 +56,7 @@ def test_the_code_for_gymnasium_runs(capsys: pytest.CaptureFixture[str]) -> None
     assert -1 <= command <= 1
 
 
+@pytest.mark.oracle
 def test_the_examples_in_python_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,6 +85,7 @@ def test_truncated_episodes_count_to_the_limit_and_are_not_terminated() -> None:
     assert episodes.returns.shape == (3, 7)
 
 
+@pytest.mark.oracle
 def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
     """In distribution: the mean return of a thousand episodes, stepped one by one with other random numbers."""
     timeline = timeline_of()
@@ -255,6 +256,7 @@ def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> No
     )
 
 
+@pytest.mark.oracle
 def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
     """The limit is `best_return` of the very simulator; scores are worked out again from the means."""
     timeline = timeline_of()
@@ -295,6 +297,7 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
     assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
 
 
+@pytest.mark.oracle
 def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rows act on these conditions too; the limit is at the thresholds of all responses, as the rows are."""
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", lambda optima, *_, **__: tuple(optima))
@@ -310,6 +313,7 @@ def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch:
     assert "no score, as the best possible return is without conditions" in found.to_text()
 
 
+@pytest.mark.oracle
 def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
     """In closed form: a reward of 1 an iteration, and no fall, as two forces are enough to hold the pole."""
     evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, limit_resolution=0.6)

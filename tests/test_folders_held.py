@@ -90,6 +90,7 @@ def test_a_made_up_series_is_written_alone(tmp_path: Path, monkeypatch: pytest.M
     assert [file.name for file in (tmp_path / "in" / "out").iterdir()] == ["recording_0000_min.nwb"]
 
 
+@pytest.mark.oracle
 def test_a_live_run_takes_a_folder_in_which_only_a_file_to_be_locked_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

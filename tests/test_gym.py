@@ -48,6 +48,7 @@ def test_gymnasiums_checker_passes_without_a_warning(id_: str, options: dict) ->
     check_env(gymnasium.make(id_, render_mode="rgb_array", **options).unwrapped)
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "imports",
     [

@@ -128,6 +128,7 @@ def test_the_loop_runs_with_what_was_trained_on_last(lived: tuple[Lived, Path, i
     assert gap.account.pulses == delivered == 3 * PULSES + sum(e.pulses for e in gap.session.episodes)
 
 
+@pytest.mark.oracle
 def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     after = []
     save_state = VirtualCulture.save_state
@@ -154,6 +155,7 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
     assert goes_on.now_s == lived_s
 
 
+@pytest.mark.oracle
 def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Path) -> None:
     account = Account(Budget(pulses=2 * PULSES + 100))
     with FakeCulture() as culture:
@@ -214,6 +216,7 @@ def test_what_others_deliver_meanwhile_is_not_spent(fails: bool) -> None:
         assert culture.delivered == blocks * (80 + 7)
 
 
+@pytest.mark.oracle
 def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         refused = iter([False, True, False])
@@ -239,6 +242,7 @@ class Pressing:
             raise KeyboardInterrupt
 
 
+@pytest.mark.oracle
 def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         with pytest.raises(KeyboardInterrupt):
@@ -280,6 +284,7 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
     assert all(len(policy.learning_curve) for policy in policies.values())
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     ("error", "told"),
     [(KeyboardInterrupt(), "stopped by a person"), (RuntimeError("no dynamic program"), "RuntimeError: no dynamic")],
@@ -301,6 +306,7 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
     assert f"ended before its time ({told}" in (what_stands(tmp_path / "live") or "")
 
 
+@pytest.mark.oracle
 def test_a_session_of_a_live_run_that_still_runs_is_not_recovered(tmp_path: Path) -> None:
     refused = []
 
@@ -319,6 +325,7 @@ def test_a_session_of_a_live_run_that_still_runs_is_not_recovered(tmp_path: Path
     assert recover_session(tmp_path / "live" / "session").ticks == found.gap.session.ticks
 
 
+@pytest.mark.oracle
 def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")

@@ -581,6 +581,7 @@ def test_gymnasium_environments_remember(tmp_path: Path) -> None:
     assert len(set(rates_hz)) > 1
 
 
+@pytest.mark.oracle
 def test_training_through_a_memory_begins_each_episode_alike(tmp_path: Path) -> None:
     """The culture answers low, middle, high in turn, whatever is chosen, and each episode begins in the middle."""
     x = np.tile([10.0, 50.0, 90.0], 80)

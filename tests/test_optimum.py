@@ -137,6 +137,7 @@ def expectimax(environment: Animat[Any], simulator: Any) -> float:
     return float(worth[0])
 
 
+@pytest.mark.oracle
 def test_navigation_tried_to_the_end() -> None:
     """Nine iterations by two commands, from a start near the goal, which some ways reach."""
     robot = Navigation(episode_limit=9, goal_x_m=0.2, goal_y_m=0.12, goal_radius_m=0.06)
@@ -176,12 +177,14 @@ def test_where_nothing_can_be_chosen_the_limit_is_the_mean_return(robot: Robot[A
     assert abs(found.value - returns.mean()) < 4 * error + found.grid_error
 
 
+@pytest.mark.oracle
 def test_a_pole_is_balanced_without_neurons() -> None:
     found = best_return(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, resolution=0.6, episodes=100)
     assert found.value == pytest.approx(120, abs=0.01)
     assert found.monte_carlo == 120
 
 
+@pytest.mark.oracle
 def test_more_separated_conditions_allow_more() -> None:
     robot = Navigation()
     means = [[42.0 + spread * (i - 2) for i in range(5)] for spread in (0.0, 3.0, 6.0, 9.0)]

@@ -44,6 +44,7 @@ def test_a_steady_fall_is_told_exactly() -> None:
     assert median_drift([series[0], responses(10.0, np.zeros(40))]) is None
 
 
+@pytest.mark.oracle
 def test_the_error_of_a_drift_is_that_of_medians() -> None:
     """A median of n normal responses has an error of sqrt(pi / 2 n) standard deviations."""
     rng = np.random.default_rng(1)

@@ -45,6 +45,7 @@ def test_it_keeps_to_the_contract_of_an_executor(make: Callable[[], Executor]) -
             executor.submit(rest, 0.0)
 
 
+@pytest.mark.oracle
 def test_a_process_stays_until_it_has_grown_large(one: Executor) -> None:
     first, second, third = (one.submit(tell_process, mib).result() for mib in (0, 900, 0))
     assert first == second

@@ -35,6 +35,7 @@ from animat.robots.grid import grid_for
 ROBOT = Cartpole(episode_limit=60)
 
 
+@pytest.mark.oracle
 def test_it_is_the_limit_of_the_default_simulator_above_random_and_constant_stimuli() -> None:
     responses = extract_responses(make_up_recording(1, patterns=40, channels=64))
     (found,) = prospects(responses, ROBOT, [Thresholds(9)], resolution=0.25, resamples=0)
@@ -51,6 +52,7 @@ def test_it_is_the_limit_of_the_default_simulator_above_random_and_constant_stim
     json.dumps(found.to_dict())
 
 
+@pytest.mark.oracle
 def test_inspect_tells_the_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,6 +114,7 @@ def test_three_responses_promise_nothing() -> None:
         prospects(answers([3] * 5, 1), SHORT)
 
 
+@pytest.mark.oracle
 def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     responses = answers([60, 60, 60, 60, 3], 2)
     # The three responses to 80 Hz are lucky: believed, they would make the best condition there is.

@@ -204,6 +204,7 @@ def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     assert "no best possible return: MemoryError: no room" in gap.to_text()
 
 
+@pytest.mark.oracle
 def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may_come_from(
     tmp_path: Path, series: list[Responses]
 ) -> None:
@@ -277,6 +278,7 @@ def test_controls_have_no_more_episodes_than_the_policies_but_five_each() -> Non
         assert planned_episodes(policies, controls, episodes) == [episodes] * policies + [of_each] * controls
 
 
+@pytest.mark.oracle
 def test_a_policy_may_have_the_name_of_a_control_that_is_not_run(tmp_path: Path, series: list[Responses]) -> None:
     named = {"silent": policy_of(0, series)}
     with FakeCulture() as culture:
@@ -296,6 +298,7 @@ def test_what_was_not_lived_is_named(tmp_path: Path, series: list[Responses]) ->
     assert no_policy.verdict().startswith("no episode of a policy was lived to its end")
 
 
+@pytest.mark.oracle
 def test_a_prediction_with_memory_is_told_to_lack_a_lead_in(tmp_path: Path, series: list[Responses]) -> None:
     remembering = Calibration.of_series(series, kind="memory")
     policies = {"p0": policy_of(0, series)}
@@ -349,6 +352,7 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
     np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[0].predicted)
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_redrawn")
 def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
     tmp_path: Path, series: list[Responses]
@@ -468,6 +472,7 @@ def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Re
         np.testing.assert_array_equal(np.asarray(predicted), lived)
 
 
+@pytest.mark.oracle
 def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: list[Responses]) -> None:
     first, last = series[0].start_min, series[1].start_min
     training = {"shadowing": True, "duration_min": 60.0, "chunks": 60, "percentiles": "moving"}

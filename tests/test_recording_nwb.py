@@ -79,6 +79,7 @@ def test_a_saved_recording_reads_back_equal(recording: Recording, tmp_path: Path
     assert read_recording(tmp_path / "a.nwb").equals(recording)
 
 
+@pytest.mark.oracle
 @settings(FEW, max_examples=4)
 @given(recording=recordings())
 def test_pynwb_finds_every_saved_recording_valid(recording: Recording, tmp_path: Path) -> None:

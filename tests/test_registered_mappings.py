@@ -62,6 +62,7 @@ def written(folder: Path, before: str, after: str) -> str:
     return "my_changed:Steep"
 
 
+@pytest.mark.oracle
 def test_a_mapping_is_trained_in_workers_saved_loaded_and_evaluated(package: Path) -> None:
     steep = mapping_named(STEEP, slope=3.0)
     training = Training("cartpole", steep, policies=6, iterations=480, algorithm=SMALL)

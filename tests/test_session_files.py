@@ -148,6 +148,7 @@ def test_memory_does_not_grow_with_the_session(tmp_path: Path, monkeypatch: pyte
     assert (peaks[3_000] - peaks[500]) / 2_500 < 600
 
 
+@pytest.mark.oracle
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_spikes_in_blocks_are_written_as_they_are_in_one_piece(tmp_path: Path, data: st.DataObject) -> None:

@@ -66,6 +66,7 @@ def test_a_histogram_draws_a_bin_then_uniformly_inside_it() -> None:
         assert stats.kstest(draw(simulator, i), known.cdf).pvalue > 1e-4
 
 
+@pytest.mark.oracle
 @settings(max_examples=40, deadline=None)
 @given(
     # In eighths of a Hz and few, so that many are equal and percentiles fall upon them.
@@ -99,6 +100,7 @@ def test_percentiles_pool_the_non_burst_responses_of_all_conditions() -> None:
     np.testing.assert_allclose(simulator.percentiles, np.arange(0.0, 101.0, 10.0), atol=1e-5)
 
 
+@pytest.mark.oracle
 @settings(max_examples=50, deadline=None)
 @given(
     # Without numbers below 1e-38, which no rate is and which JAX takes for 0.

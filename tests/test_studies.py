@@ -304,6 +304,7 @@ def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Pa
     assert files(folder) == files(finished)
 
 
+@pytest.mark.oracle
 def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

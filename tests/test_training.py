@@ -290,7 +290,7 @@ def test_held_percentiles_train_another_policy(tmp_path: Path) -> None:
     assert weights_after(replace(SHORT, percentiles="first"), timeline_of(), tmp_path / "checkpoint") != moving
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("robot", "commands", "better_than"), [(Cartpole(), (-1.0, 1.0), 100.0), (Navigation(), None, 20.0)]
 )

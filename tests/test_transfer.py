@@ -59,6 +59,7 @@ def series(folder: Path, *recordings: Recording) -> str:
     return str(folder)
 
 
+@pytest.mark.oracle
 def test_policies_of_blocks_are_reported_by_training_and_evaluation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -94,6 +95,7 @@ def test_an_unknown_presentation_is_not_told_as_another(tmp_path: Path, capsys: 
     assert "(training.robot.name: 'cartpole' there, 'navigation' now)" in capsys.readouterr().err
 
 
+@pytest.mark.oracle
 def test_the_age_of_the_recording_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = series(tmp_path / "r", *(a_recording(minute) for minute in (0, 10, 90)))
     out = str(tmp_path / "p")
@@ -109,6 +111,7 @@ def test_the_age_of_the_recording_is_reported(tmp_path: Path, capsys: pytest.Cap
     assert (evaluated["recorded_at_min"], evaluated["not_met_in_a_closed_loop"]) == (90.0, [])
 
 
+@pytest.mark.oracle
 def test_a_memory_that_the_simulator_lacks_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = series(tmp_path / "r", a_recording(0, memory=True))
     for simulator, found in (([], set()), (["--simulator", "histogram"], {"no-memory"})):
@@ -117,6 +120,7 @@ def test_a_memory_that_the_simulator_lacks_is_reported(tmp_path: Path, capsys: p
         assert warned(ran(capsys, *train)) == found
 
 
+@pytest.mark.oracle
 def test_recordings_are_read_as_in_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = series(tmp_path / "r", a_recording(0))
     out = str(tmp_path / "p")
@@ -148,6 +152,7 @@ def test_recordings_are_read_as_in_training(tmp_path: Path, capsys: pytest.Captu
         assert finding["sentence"].endswith(says) or says in finding["sentence"]
 
 
+@pytest.mark.oracle
 def test_the_papers_setting_is_one_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = series(tmp_path / "r", a_recording(0), a_recording(10))
     folders = {word: tmp_path / f"p{len(word)}" for word in ("", "--paper")}
