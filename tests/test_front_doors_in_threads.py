@@ -213,6 +213,6 @@ def test_from_several_threads_nothing_outside_the_limits_is_delivered(kind: str,
 def test_of_100000_requests_from_threads_none_outside_the_limits_is_delivered(
     kind: str, threads: int, patch: pytest.MonkeyPatch
 ) -> None:
-    # Seven times as many on every backend.
+    # Seven times as many on every backend, under both marks.
     crowd = crowd_at(kind, 14_300, threads, 10 + threads, patch)
     assert crowd.counted["done"] > 1_500

@@ -31,11 +31,12 @@ from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
+from animat.neurons.kinds import Kind
 from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
-from animat.reality_gap.predicting import EPISODES, ROLL_OUTS
+from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
@@ -121,7 +122,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     both = networks_of(list(policies.values()), greedy=True)
     simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.redrawn]
     rolled = [
-        roll_out(environment, simulator, both, 2, episodes=EPISODES, seed=1 + i)
+        roll_out(environment, simulator, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, i))
         for i, simulator in enumerate(simulators)
     ]
     predicted = np.concatenate([each.returns for each in rolled[:ROLL_OUTS]], axis=1)
@@ -398,6 +399,22 @@ def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
         threshold=0.9,
         separability=0.7,
     )
+
+
+@pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])
+def test_simulators_of_redrawn_responses_have_the_shape_of_the_recordings(kind: Kind, few_redrawn: None) -> None:
+    rng = np.random.default_rng(1)
+    series = [drawn_responses(rng, 40), replace(drawn_responses(rng, 90), start_min=10.0)]
+    calibration = Calibration.of_series(series, at_min=0.0, kind=kind)
+    shapes = {
+        tuple(leaf.shape for leaf in jax.tree.leaves(each)) for each in (calibration.simulator, *calibration.redrawn)
+    }
+    assert len(shapes) == 1
+
+
+def test_no_two_roll_outs_have_the_same_draws() -> None:
+    seeds = [roll_out_seed(seed, group, on) for seed in (1, 2, 2**32 - 1) for group in range(10) for on in range(105)]
+    assert len(set(seeds)) == len(seeds) and 0 <= min(seeds) <= max(seeds) < 2**32
 
 
 @pytest.mark.long

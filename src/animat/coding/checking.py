@@ -51,7 +51,7 @@ def check_mapping(mapping: Mapping) -> None:
 
 def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
     try:
-        # What comes of a division by zero is seen below, and told in one line.
+        # The result of a division by zero is checked below, and reported in one line.
         with np.errstate(all="ignore"):
             return np.asarray(mapping.command(x, percentiles))
     except Exception as error:

@@ -109,7 +109,10 @@ class SimulatorTimeline:
 
 
 def room_for(series: Sequence[Responses]) -> int:
-    """The non-burst responses of the condition that has most of them in any recording, for simulators of one shape."""
+    """How many non-burst responses the condition with the most of them has in any of the recordings.
+
+    With room for so many, simulators of all of them have one shape.
+    """
     return max(int(np.bincount(each.condition[~each.is_burst], minlength=1).max()) for each in series)
 
 

@@ -21,9 +21,9 @@ from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.passes import Passes
 
 EPISODES = 200
-"""Of each policy and control in a roll-out, on each simulator of redrawn responses."""
+"""Of each policy and control in one roll-out."""
 ROLL_OUTS = 5
-"""On the simulator of the recording."""
+"""On the recording's simulator; one on each simulator of redrawn responses."""
 
 
 class Predicted(NamedTuple):
@@ -93,17 +93,15 @@ def predict(
     def rolled(group: int, on: int) -> Episodes:
         actor, many = acting[group]
         simulator = silenced(simulators[on]) if groups[group][0].delivery == "silent" else simulators[on]
-        # Seeds of their own: the spread is then also that of the episodes, and no interval is surer than they are.
-        of_its_own = (seed + group * len(simulators) + on) % 2**32
-        return roll_out(environment, simulator, actor, many, episodes=EPISODES, seed=of_its_own)
+        return roll_out(environment, simulator, actor, many, episodes=EPISODES, seed=roll_out_seed(seed, group, on))
 
     found: dict[str, Predicted] = {}
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:
-        progress.update(0, len(groups), "predicting")
-        # One of each kind first: two that were compiled at once would be compiled twice.
+        # First one of each kind: two of a kind that start together would both be compiled.
         kinds = {(type(acting[i][0]), group[0].delivery == "silent"): i for i, group in enumerate(groups)}
         list(side_by_side.map(rolled, kinds.values(), repeat(0)))
         for number, group in enumerate(groups):
+            progress.update(number, len(groups), f"predicting {group[0].name}")
             episodes = list(side_by_side.map(rolled, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
             passes = _stacked([Passes(each.presented, each.passed) for each in episodes])
@@ -116,8 +114,12 @@ def predict(
                     Passes(*(counts[:ROLL_OUTS] for counts in each)).summed(0),
                     Passes(*(counts[ROLL_OUTS:] for counts in each)),
                 )
-            progress.update(number + 1, len(groups), f"predicted {group[0].name}")
     return found
+
+
+def roll_out_seed(seed: int, group: int, on: int) -> int:
+    """One of its own for each roll-out, and others for every `seed`: no interval is surer than its episodes are."""
+    return int(np.random.SeedSequence((seed, group, on)).generate_state(1)[0])
 
 
 def _actor(group: Sequence[Contender], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:

@@ -127,8 +127,8 @@ def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
 
 
 compiled = kept_njit(error_model="numpy", fastmath=False)
-# Without inlining, every call copies the description of every array of its arguments; and each would be compiled for
-# itself, too.
+# Without inlining, every call copies the description of every array of its arguments; and each helper would also be
+# compiled separately.
 inlined = numba.njit(error_model="numpy", inline="always")
 
 
