@@ -57,6 +57,7 @@ def last_json(printed: str) -> dict[str, object]:
     return json.loads(printed.splitlines()[-1], parse_constant=pytest.fail)  # type: ignore[no-any-return]
 
 
+@pytest.mark.oracle
 def test_what_training_reports_is_what_the_deployed_policies_get(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,6 +99,7 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
     assert {file: file.read_bytes() for file in policies.iterdir()} == files
 
 
+@pytest.mark.oracle
 def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
     record = ["record", "--culture", "made-up", "--sessions", "2", "--out", str(series)]
@@ -504,6 +506,7 @@ def test_a_dead_window_is_refused_unless_told_otherwise(
     assert main([*train, "--allow", "dead-window", "one-condition"]) == 0
 
 
+@pytest.mark.oracle
 def test_a_real_culture_trains_a_controller_of_two_conditions(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -259,7 +259,7 @@ def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.nwb"))
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_killed_at_any_moment_it_goes_on_to_the_same_bits(undisturbed: list[Path], tmp_path: Path, seed: int) -> None:
     folder, rng, kills = tmp_path / "series", random.Random(seed), 0

@@ -43,7 +43,7 @@ def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: P
     damage(kind, 1, 100, tmp_path)
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_thousand_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 2, 2000, tmp_path)

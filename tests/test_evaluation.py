@@ -216,6 +216,7 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
         evaluate({"a": moving, "b": held}, timeline)
 
 
+@pytest.mark.oracle
 def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
     """Whatever it chooses, what is delivered is drawn: as good as random actions, and no limit is its own."""
     timeline = timeline_of()

@@ -270,7 +270,7 @@ def test_nothing_outside_the_limits_is_delivered(kind: str, patch: pytest.Monkey
     assert min(done, refused) > 800
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize("kind", BACKENDS)
 def test_of_a_million_requests_none_outside_the_limits_is_delivered(kind: str, patch: pytest.MonkeyPatch) -> None:
     done, refused, found = go_through(kind, 1_000_000, 1, patch)

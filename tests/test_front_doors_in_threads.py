@@ -202,8 +202,13 @@ def test_from_several_threads_nothing_outside_the_limits_is_delivered(kind: str,
     assert sum(crowd.counted[limit] for limit in ("overlap", "gap_us", "interval_us", "stimuli_per_electrode_s")) > 50
 
 
-@pytest.mark.oracle
-@pytest.mark.parametrize("threads", range(2, 9))
+@pytest.mark.parametrize(
+    "threads",
+    [
+        *(pytest.param(n, marks=pytest.mark.oracle) for n in (2, 8)),
+        *(pytest.param(n, marks=pytest.mark.long) for n in range(3, 8)),
+    ],
+)
 @pytest.mark.parametrize("kind", BACKENDS)
 def test_of_100000_requests_from_threads_none_outside_the_limits_is_delivered(
     kind: str, threads: int, patch: pytest.MonkeyPatch

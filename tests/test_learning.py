@@ -29,7 +29,7 @@ from animat.robots import Cartpole, Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.specification import Training
 
-pytestmark = pytest.mark.oracle
+pytestmark = pytest.mark.long
 
 
 def made_up_timeline() -> SimulatorTimeline:

@@ -457,7 +457,7 @@ def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory
         assert limits[0] == pytest.approx(limits[1], abs=0.1)
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 def test_the_controller_that_remembers_gets_what_was_promised(robot: Any, mapping: Any) -> None:
@@ -470,7 +470,7 @@ def test_the_controller_that_remembers_gets_what_was_promised(robot: Any, mappin
     )
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     """A culture that is a known chain, and 500 responses of it in each recording."""
     chances = {"after_low": (0.05, 0.2, 0.35, 0.5, 0.6), "after_high": (0.25, 0.5, 0.75, 0.85, 0.95)}

@@ -242,7 +242,7 @@ def test_the_grid_error_looks_at_headings_too() -> None:
     assert grid.scaled(0.75, periodic=True).rows[1].nodes == 75
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_the_cartpoles_grid_is_fine_enough() -> None:
     """Three refinements of 9 thresholds, the hardest: the default is within 1 of the finest."""
     case = (Animat(Cartpole(), Thresholds(9), 5), SIMULATOR)

@@ -169,7 +169,7 @@ def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_redrawn
     assert known.interval.high == pytest.approx(best.value + high + best.grid_error)
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 @pytest.mark.parametrize("spread", [SPREAD, (1.0,) * 5, (0.7, 1.4)])
 @pytest.mark.parametrize("n", [30, 100])

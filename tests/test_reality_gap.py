@@ -33,9 +33,9 @@ from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
 from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
-from animat.reality_gap import PREDICTED_EPISODES, Calibration, RealityGap, check_policies, run_policies
+from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
-from animat.reality_gap.predicting import ANEW_EPISODES
+from animat.reality_gap.predicting import EPISODES, ROLL_OUTS
 from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
@@ -119,19 +119,19 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     calibration = Calibration.of_series(series)
     environment = Animat(policies["p0"].robot, Thresholds(1), 5)
     both = networks_of(list(policies.values()), greedy=True)
-    rolled = roll_out(environment, calibration.simulator, both, 2, episodes=PREDICTED_EPISODES, seed=1)
-    anew = np.array(
-        [
-            roll_out(environment, simulator, both, 2, episodes=ANEW_EPISODES, seed=2 + i).returns.mean(axis=1)
-            for i, simulator in enumerate(calibration.redrawn)
-        ]
-    )
+    simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.redrawn]
+    rolled = [
+        roll_out(environment, simulator, both, 2, episodes=EPISODES, seed=1 + i)
+        for i, simulator in enumerate(simulators)
+    ]
+    predicted = np.concatenate([each.returns for each in rolled[:ROLL_OUTS]], axis=1)
+    anew = np.array([each.returns.mean(axis=1) for each in rolled[ROLL_OUTS:]])
     for i, name in enumerate(policies):
-        np.testing.assert_array_equal(rows[name].predicted, rolled.returns[i])
+        np.testing.assert_array_equal(rows[name].predicted, predicted[i])
         np.testing.assert_allclose(rows[name].predicted_anew, anew[:, i])
-    np.testing.assert_array_equal(rows["policies"].predicted, rolled.returns.ravel())
+    np.testing.assert_array_equal(rows["policies"].predicted, predicted.ravel())
     np.testing.assert_allclose(rows["policies"].predicted_anew, anew.mean(axis=1))
-    np.testing.assert_array_equal(rolled.presented.sum(axis=1), rolled.lengths.sum(axis=1))
+    np.testing.assert_array_equal(rolled[0].presented.sum(axis=1), rolled[0].lengths.sum(axis=1))
     low, high = rows["policies"].prediction.low, rows["policies"].prediction.high
     assert np.sum((anew.mean(axis=1) < low) | (anew.mean(axis=1) > high)) in (4, 5)
     # Under the controls of the policies all of them act in turn, and no choice of theirs is delivered.
@@ -139,12 +139,9 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
         ("silent", environment, silenced(calibration.simulator)),
         ("shuffled", replace(environment, delivery="shuffled"), calibration.simulator),
     ):
-        rolled = roll_out(in_, on, both, 2, episodes=PREDICTED_EPISODES, seed=1)
-        error = np.hypot(
-            rolled.returns.std() / np.sqrt(2 * PREDICTED_EPISODES),
-            rows[name].predicted.std() / np.sqrt(PREDICTED_EPISODES),
-        )
-        assert abs(rolled.returns.mean() - rows[name].predicted.mean()) <= 4 * error
+        returns = roll_out(in_, on, both, 2, episodes=EPISODES, seed=1).returns.ravel()
+        error = np.hypot(*(each.std() / np.sqrt(each.size) for each in (returns, rows[name].predicted)))
+        assert abs(returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
     limit = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
     assert gap.limit == pytest.approx(limit)
@@ -328,6 +325,7 @@ def test_of_one_episode_nothing_is_said_about_the_gap(tmp_path: Path, series: li
     assert "unknown" in alone.to_text()
 
 
+@pytest.mark.oracle
 def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.redrawn}
@@ -398,7 +396,7 @@ def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
     )
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mapping", "held"),
     [(Thresholds(1), False), (Thresholds(9), False), (Thresholds(1), True), (Linear(), True)],
@@ -427,9 +425,9 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
             calibration, living = calibration.holding(percentiles), replace(culture, percentiles=percentiles)
         row = replace(
             gap.rows[0],
-            predicted=returns(calibration.simulator, PREDICTED_EPISODES, seed),
+            predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),
             predicted_anew=np.array(
-                [returns(each, ANEW_EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.redrawn)]
+                [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.redrawn)]
             ),
             lived=returns(living, 40, 1000 + seed),
         )
@@ -438,7 +436,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     assert 106 <= covered <= 119
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
     rng, widths = np.random.default_rng(3), []
     environment = Animat(Cartpole(), Thresholds(1), 5)

@@ -11,7 +11,7 @@ import pytest
 
 from recorded_figures import Recorded, measure
 
-pytestmark = pytest.mark.oracle
+pytestmark = pytest.mark.long
 
 SEEDS = (1, 2, 3, 4, 5)
 OVER_HOURS = {"P(x > 18 Hz) left at most 0.4", "burst share falls"}

@@ -200,6 +200,7 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     assert mistake.mean() < 0.15
 
 
+@pytest.mark.oracle
 def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
     """Where gradients are all but 0, steps of their noise put units out: two of three with Adam's usual epsilon."""
     simulator = made_up_simulator()

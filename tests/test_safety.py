@@ -239,9 +239,11 @@ def test_its_arithmetic_holds_after_long_sessions(limits: Limits, start_s: int) 
     assert min(safe, unsafe.total()) > 200
 
 
-@pytest.mark.oracle
 @pytest.mark.parametrize("limits", [LIMITS, DEVICE], ids=["simulated", "device"])
-@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(1, marks=pytest.mark.oracle), *(pytest.param(n, marks=pytest.mark.long) for n in range(2, 11))],
+)
 def test_among_100000_requests_none_unsafe_passes_and_none_safe_is_refused(limits: Limits, seed: int) -> None:
     safe, unsafe = try_requests(limits, seed, 10_000)
     assert safe + unsafe.total() == 10_000

@@ -131,6 +131,7 @@ def long_log(folder: Path, ticks: int) -> None:
     log.close()
 
 
+@pytest.mark.oracle
 def test_memory_does_not_grow_with_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("animat.closed_loop.log._BLOCK_BYTES", 2**18)
     peaks = {}

@@ -88,7 +88,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 # --- the folder -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     # Between the recordings, after the simulators, with a policy that no receipt tells of yet, among the figures.
@@ -104,7 +104,7 @@ def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finish
     assert files(folder) == files(finished)
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_killed_at_any_moment_it_ends_in_the_same_files(finished: Path, tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)

@@ -217,6 +217,7 @@ def limits_of(folder: Path, name: str = "limits") -> tuple[Limit, ...]:
     return read_limits(folder, "navigation", name)
 
 
+@pytest.mark.oracle
 def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,6 +104,7 @@ train(SHORT, timeline_of(), Path(sys.argv[1]), checkpoint_s=0.0)
 """
 
 
+@pytest.mark.oracle
 def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_path: Path) -> None:
     train(SHORT, timeline_of(), tmp_path / "undisturbed")
     folder = tmp_path / "killed"

@@ -10,7 +10,7 @@ import pytest
 
 from culture_figures import Figures, measure, missed
 
-pytestmark = pytest.mark.oracle
+pytestmark = pytest.mark.long
 
 SEEDS = (1, 2, 3, 4, 5)
 MISSED = {2: ["80 Hz right of 5 Hz at every bin edge"]}

@@ -108,6 +108,11 @@ class SimulatorTimeline:
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
 
 
+def room_for(series: Sequence[Responses]) -> int:
+    """The non-burst responses of the condition that has most of them in any recording, for simulators of one shape."""
+    return max(int(np.bincount(each.condition[~each.is_burst], minlength=1).max()) for each in series)
+
+
 def fit_timeline(
     series: Sequence[Responses], *, kind: Kind | None = None, bins: int = 20, range_hz: float | None = None
 ) -> SimulatorTimeline:
@@ -148,7 +153,7 @@ def fit_timeline(
         twice = start_min[:-1][np.diff(start_min) == 0][0]
         raise Mismatch(f"start_min: expected one recording a minute mark, got two at {twice:g} min")
 
-    room = max(int(np.bincount(r.condition[~r.is_burst], minlength=1).max()) for r in ordered)
+    room = room_for(ordered)
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(

@@ -1,12 +1,10 @@
 """Predicted return against lived return: policies and controls on a simulator, then in closed loop on the culture."""
 
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.predicting import PREDICTED_EPISODES
 from animat.reality_gap.running import check_conditions, check_policies, run_policies
 from animat.reality_gap.table import RealityGap, Row
 
 __all__ = [
-    "PREDICTED_EPISODES",
     "Calibration",
     "RealityGap",
     "Row",

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import fit_timeline, room_for
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
@@ -98,9 +98,11 @@ class Calibration:
         simulator = timeline.at(start_min)
         # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
         memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
+        # All of one shape: what runs on them is compiled once.
+        fit |= {"memory": memory, "room": room_for(series)}
         calibration = cls(
             simulator=simulator,
-            redrawn=tuple(fit_simulator(responses.redrawn(rng), memory=memory, **fit) for _ in range(REDRAWN)),
+            redrawn=tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN)),
             responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),

@@ -15,15 +15,15 @@ from jaxtyping import Float64
 from animat.animat import Animat
 from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, OneCondition
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
-from animat.neurons.simulator import NeuronSimulator, silenced
+from animat.neurons.simulator import silenced
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.passes import Passes
 
-PREDICTED_EPISODES = 1000
-"""Of each policy and control on the simulator."""
-ANEW_EPISODES = 200
-"""Of each on every simulator of redrawn responses."""
+EPISODES = 200
+"""Of each policy and control in a roll-out, on each simulator of redrawn responses."""
+ROLL_OUTS = 5
+"""On the simulator of the recording."""
 
 
 class Predicted(NamedTuple):
@@ -87,32 +87,36 @@ def predict(
         By the contender's name.
     """
     progress = progress or Silent()
-    found: dict[str, Predicted] = {}
-    for number, group in enumerate(groups):
-        progress.update(number, len(groups), f"predicting {group[0].name}")
-        actor, many = _actor(group, rule, greedy=greedy)
+    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.redrawn)
+    acting = [_actor(group, rule, greedy=greedy) for group in groups]
 
-        def rolled(simulator: NeuronSimulator, episodes: int, seed: int) -> Episodes:
-            on = silenced(simulator) if group[0].delivery == "silent" else simulator  # noqa: B023
-            return roll_out(environment, on, actor, many, episodes=episodes, seed=seed)  # noqa: B023
-
+    def rolled(group: int, on: int) -> Episodes:
+        actor, many = acting[group]
+        simulator = silenced(simulators[on]) if groups[group][0].delivery == "silent" else simulators[on]
         # Seeds of their own: the spread is then also that of the episodes, and no interval is surer than they are.
-        first = seed + number * (len(calibration.redrawn) + 1)
-        predicted = rolled(calibration.simulator, PREDICTED_EPISODES, first % 2**32)
-        seeds = [(first + 1 + i) % 2**32 for i in range(len(calibration.redrawn))]
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:
-            redrawn = list(side_by_side.map(rolled, calibration.redrawn, repeat(ANEW_EPISODES), seeds))
-        anew = np.array([each.returns.mean(axis=1) for each in redrawn])
-        passes = Passes(predicted.presented, predicted.passed)
-        passes_anew = _stacked([Passes(each.presented, each.passed) for each in redrawn])
-        for row, contender in enumerate(group):
-            of = [row] if len(group) > 1 else list(range(many))
-            found[contender.name] = Predicted(
-                predicted.returns[of].ravel(),
-                anew[:, of].mean(axis=1),
-                Passes(*(counts[of] for counts in passes)).summed(0),
-                Passes(*(counts[:, of] for counts in passes_anew)).summed(1),
-            )
+        of_its_own = (seed + group * len(simulators) + on) % 2**32
+        return roll_out(environment, simulator, actor, many, episodes=EPISODES, seed=of_its_own)
+
+    found: dict[str, Predicted] = {}
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:
+        progress.update(0, len(groups), "predicting")
+        # One of each kind first: two that were compiled at once would be compiled twice.
+        kinds = {(type(acting[i][0]), group[0].delivery == "silent"): i for i, group in enumerate(groups)}
+        list(side_by_side.map(rolled, kinds.values(), repeat(0)))
+        for number, group in enumerate(groups):
+            episodes = list(side_by_side.map(rolled, repeat(number), range(len(simulators))))
+            returns = np.array([each.returns for each in episodes])
+            passes = _stacked([Passes(each.presented, each.passed) for each in episodes])
+            for row, contender in enumerate(group):
+                of = [row] if len(group) > 1 else list(range(acting[number][1]))
+                each = Passes(*(counts[:, of] for counts in passes)).summed(1)
+                found[contender.name] = Predicted(
+                    returns[:ROLL_OUTS, of].ravel(),
+                    returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
+                    Passes(*(counts[:ROLL_OUTS] for counts in each)).summed(0),
+                    Passes(*(counts[ROLL_OUTS:] for counts in each)),
+                )
+            progress.update(number + 1, len(groups), f"predicted {group[0].name}")
     return found
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
 
@@ -148,8 +149,9 @@ def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
 
 
 compiled = kept_njit(error_model="numpy", fastmath=False)
-# Without inlining, every call copies the description of every array of its arguments.
-inlined = kept_njit(error_model="numpy", fastmath=False, forceinline=True)
+# Without inlining, every call copies the description of every array of its arguments; and each would be compiled for
+# itself, too.
+inlined = numba.njit(error_model="numpy", inline="always")
 
 
 @inlined
@@ -197,8 +199,9 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
         total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
         current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
         z = total * step_over_membrane[i]
-        moved = v + current * step_over_membrane[i] / (ONE + z * (HALF + z * TWELFTH))
-        v_mv[i] = moved if refractory[i] == 0 else v
+        # Chosen before it is added: a choice of what is stored would be stored through a mask, which is slow.
+        change = current * step_over_membrane[i] / (ONE + z * (HALF + z * TWELFTH))
+        v_mv[i] = v + (change if refractory[i] == 0 else f4(0.0))
 
 
 @inlined
