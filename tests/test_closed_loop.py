@@ -67,7 +67,7 @@ class TestFake(CultureContract):
         return FakeCulture()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     pulses=st.integers(1, 6),

@@ -132,7 +132,8 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
         np.testing.assert_allclose(rows[name].predicted_anew, anew[:, i])
     np.testing.assert_array_equal(rows["policies"].predicted, predicted.ravel())
     np.testing.assert_allclose(rows["policies"].predicted_anew, anew.mean(axis=1))
-    np.testing.assert_array_equal(rolled[0].presented.sum(axis=1), rolled[0].lengths.sum(axis=1))
+    for each in rolled[:ROLL_OUTS]:
+        np.testing.assert_array_equal(each.presented.sum(axis=1), each.lengths.sum(axis=1))
     low, high = rows["policies"].prediction.low, rows["policies"].prediction.high
     assert np.sum((anew.mean(axis=1) < low) | (anew.mean(axis=1) > high)) in (4, 5)
     # Under the controls of the policies all of them act in turn, and no choice of theirs is delivered.
@@ -140,7 +141,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
         ("silent", environment, silenced(calibration.simulator)),
         ("shuffled", replace(environment, delivery="shuffled"), calibration.simulator),
     ):
-        returns = roll_out(in_, on, both, 2, episodes=EPISODES, seed=1).returns.ravel()
+        returns = roll_out(in_, on, both, 2, episodes=ROLL_OUTS * EPISODES, seed=1).returns.ravel()
         error = np.hypot(*(each.std() / np.sqrt(each.size) for each in (returns, rows[name].predicted)))
         assert abs(returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
