@@ -12,9 +12,12 @@ from scipy import stats
 from animat.training.sac import Batch, Network, Trained, initial_networks
 
 
-def drawn_networks(seed: int, n: int, hidden: int, n_actions: int | None) -> tuple[Trained, Network]:
+def drawn_networks(
+    seed: int, n: int, hidden: int, n_actions: int | None, n_commands: int = 1
+) -> tuple[Trained, Network]:
     """Actor, critics, log alpha and target critics with weights of ordinary size everywhere, biases included."""
-    inputs, values, outputs = (n + 2, 1, 2) if n_actions is None else (n + 1, n_actions, n_actions)
+    continuous = (n + 1 + n_commands, 1, 2 * n_commands)
+    inputs, values, outputs = continuous if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics, targets = initial_networks(
         jax.random.key(seed),
         ((n, hidden, hidden, outputs), ()),
@@ -29,10 +32,10 @@ def drawn_networks(seed: int, n: int, hidden: int, n_actions: int | None) -> tup
     return Trained(drawn(actor), drawn(critics), jnp.float32(rng.uniform(-3, 1))), drawn(targets)
 
 
-def drawn_batch(seed: int, size: int, n: int, n_actions: int | None) -> Batch:
+def drawn_batch(seed: int, size: int, n: int, n_actions: int | None, n_commands: int = 1) -> Batch:
     """Transitions of a task that does not exist, a third of them the last of their episode."""
     rng = np.random.default_rng(seed)
-    action = rng.uniform(-1, 1, size) if n_actions is None else rng.integers(0, n_actions, size)
+    action = rng.uniform(-1, 1, (size, n_commands)) if n_actions is None else rng.integers(0, n_actions, size)
     columns = (
         rng.normal(size=(size, n + 1)),
         rng.normal(size=(size, n + 1)),
@@ -97,16 +100,20 @@ def discrete_losses(
 def continuous_losses(
     trained: Trained, targets: Network, batch: Batch, uniforms: np.ndarray, *, discount: float, entropy_wanted: float
 ) -> tuple[float, float, float]:
-    """The same for one continuous action (Haarnoja et al. 2018, equations 5, 7 and 18)."""
+    """The same for continuous actions (Haarnoja et al. 2018, equations 5, 7 and 18), their entropies added up."""
     alpha = np.exp(trained.log_alpha)
 
-    def drawn(s: np.ndarray, uniform: float) -> tuple[float, float]:
-        mean, log_std = outputs(trained.actor, s[:-1])
-        log_std = min(max(log_std, -5.0), 2.0)
-        z = stats.norm.ppf(uniform, mean, np.exp(log_std))
-        return np.tanh(z), log_density(z, mean, log_std)
+    def drawn(s: np.ndarray, uniforms: np.ndarray) -> tuple[list[float], float]:
+        of_actor, n = outputs(trained.actor, s[:-1]), len(uniforms)
+        action, log_p = [], 0.0
+        for mean, log_std, uniform in zip(of_actor[:n], of_actor[n:], uniforms, strict=True):
+            kept = min(max(log_std, -5.0), 2.0)
+            z = stats.norm.ppf(uniform, mean, np.exp(kept))
+            action.append(float(np.tanh(z)))
+            log_p += log_density(z, mean, kept)
+        return action, log_p
 
-    def value(critics: Network, s: np.ndarray, a: float, which: int) -> float:
+    def value(critics: Network, s: np.ndarray, a: Any, which: int) -> float:
         return float(outputs(critics, np.append(s, a), which)[0])
 
     critic_losses, actor_losses, alpha_losses = [], [], []

@@ -78,3 +78,36 @@ class Follower(Robot[Counted]):
 
     def observe(self, state: Counted) -> Float[Array, " observations"]:
         return jnp.stack([state.iteration])
+
+
+class TwoCounted(NamedTuple):
+    """Two numbers."""
+
+    wanted: Float[Array, "2"]
+
+
+@dataclass(frozen=True)
+class FollowerOfTwo(Robot[TwoCounted]):
+    """Shows two numbers in [-1, 1] and pays more, the nearer each of two commands is to its own."""
+
+    episode_limit: int = 5
+
+    name: ClassVar[str] = "follower of two"
+    n_commands: ClassVar[int] = 2
+    noise_size: ClassVar[int] = 2
+    paper_iterations: ClassVar[int] = 1
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        return (Quantity("wanted", "1", 1.0), Quantity("wanted too", "1", 1.0))
+
+    def reset(self, key: Array) -> TwoCounted:
+        return TwoCounted(jnp.array([0.5, -0.5], jnp.float32))
+
+    def advance(
+        self, uniforms: Float[Array, " noise_size"], state: TwoCounted, u: Float[Array, " commands"]
+    ) -> tuple[TwoCounted, Float[Array, ""], Bool[Array, ""]]:
+        return TwoCounted(2 * uniforms - 1), 1 - jnp.mean(jnp.abs(state.wanted - u)), jnp.bool_(False)
+
+    def observe(self, state: TwoCounted) -> Float[Array, " observations"]:
+        return state.wanted

@@ -149,7 +149,7 @@ def test_greedy_takes_the_most_probable_action() -> None:
     observations = np.random.default_rng(0).normal(0, 0.3, (64, 4)).astype(np.float32)
     environment = Animat(policy.robot, policy.mapping, 3)
     single = jax.tree.map(lambda leaf: leaf[0], network)
-    actions = single.act(environment, jnp.asarray(observations / environment.scales), jnp.zeros(64))
+    actions = single.act(environment, jnp.asarray(observations / environment.scales), jnp.zeros((64, 1)))
     assert actions.tolist() == [policy.act_greedily(o) for o in observations]
 
 
@@ -161,7 +161,7 @@ def test_on_a_changed_robot_a_policy_sees_what_it_would_when_deployed() -> None:
     longer = Animat(Cartpole(track_length_m=4.0, angle_limit_rad=0.5), policy.mapping, 3)
     assert not np.array_equal(longer.scales, policy.scales)
     observations = np.random.default_rng(0).normal(0, 0.3, (64, 4)).astype(np.float32)
-    actions = single.act(longer, jnp.asarray(observations / longer.scales), jnp.zeros(64))
+    actions = single.act(longer, jnp.asarray(observations / longer.scales), jnp.zeros((64, 1)))
     assert actions.tolist() == [policy.act_greedily(o) for o in observations]
 
 

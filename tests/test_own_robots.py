@@ -237,7 +237,7 @@ def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: 
     assert HandMadeRule(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
     environment = Animat(robot, Thresholds(1), 3)
     rule = HandMade(jnp.arange(3), jnp.asarray(means, jnp.float32))
-    assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros(1)).tolist() == [nearest]
+    assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros((1, 1))).tolist() == [nearest]
 
 
 def test_a_grid_that_fails_is_none_with_a_reason() -> None:

@@ -485,7 +485,7 @@ def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Re
         assert int(np.argmax(rule.means)) == 4
         observed = rng.uniform(low, high, (500, len(low)))
         rule = jax.tree.map(lambda x: x[0], rule)
-        predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros(500))
+        predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
         lived = [HandMadeRule(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
         np.testing.assert_array_equal(np.asarray(predicted), lived)
 

@@ -30,6 +30,7 @@ from animat.training.sac import (
     squashed_normal,
 )
 from animat.training.settings import SAC
+from two_wheels import Wheels
 
 SETTINGS = SAC(discount=0.9, entropy_share=0.3, entropy_nats=-0.5)
 N, HIDDEN, ACTIONS, SIZE = 3, 5, 4, 12
@@ -60,38 +61,41 @@ def reference_losses(trained: Trained, targets: Network, batch: Batch, uniforms:
             batch,
             np.asarray(uniforms, np.float64),
             discount=SETTINGS.discount,
-            entropy_wanted=SETTINGS.entropy_nats,
+            entropy_wanted=SETTINGS.entropy_nats * uniforms.shape[-1],
         )
     )
 
 
-def problem(seed: int, *, continuous: bool) -> tuple[Trained, Network, Batch, jax.Array | None]:
-    n_actions = None if continuous else ACTIONS
-    trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions)
-    uniforms = jax.random.uniform(jax.random.key(seed), (2, SIZE), minval=0.01, maxval=0.99) if continuous else None
-    return trained, targets, reference.drawn_batch(seed, SIZE, N, n_actions), uniforms
+def problem(seed: int, *, commands: int) -> tuple[Trained, Network, Batch, jax.Array | None]:
+    """Of so many continuous commands; 0: of discrete actions."""
+    n_actions = None if commands else ACTIONS
+    trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions, commands)
+    uniforms = None
+    if commands:
+        uniforms = jax.random.uniform(jax.random.key(seed), (2, SIZE, commands), minval=0.01, maxval=0.99)
+    return trained, targets, reference.drawn_batch(seed, SIZE, N, n_actions, commands), uniforms
 
 
-@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("commands", [0, 1, 2])
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6))
-def test_losses_equal_a_float64_reference(continuous: bool, seed: int) -> None:
-    given_ = problem(seed, continuous=continuous)
+def test_losses_equal_a_float64_reference(commands: int, seed: int) -> None:
+    given_ = problem(seed, commands=commands)
     np.testing.assert_allclose(compiled_losses(*given_), reference_losses(*given_), rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize("continuous", [False, True])
-def test_each_loss_moves_its_own_parameters_only(continuous: bool) -> None:
-    gradients: Trained = compiled_gradients(*problem(1, continuous=continuous))
+@pytest.mark.parametrize("commands", [0, 1, 2])
+def test_each_loss_moves_its_own_parameters_only(commands: int) -> None:
+    gradients: Trained = compiled_gradients(*problem(1, commands=commands))
     for i, loss in enumerate(LOSSES):
         for name, of_part in zip(("actor", "critics", "alpha"), gradients, strict=True):
             moved = any(np.any(np.asarray(leaf)[i] != 0) for leaf in jax.tree.leaves(of_part))
             assert moved == (name == loss), f"{loss} loss, parameters of {name}"
 
 
-@pytest.mark.parametrize("continuous", [False, True])
-def test_gradients_equal_finite_differences_of_the_reference(continuous: bool) -> None:
-    trained, targets, batch, uniforms = problem(2, continuous=continuous)
+@pytest.mark.parametrize("commands", [0, 1, 2])
+def test_gradients_equal_finite_differences_of_the_reference(commands: int) -> None:
+    trained, targets, batch, uniforms = problem(2, commands=commands)
     gradients: Trained = compiled_gradients(trained, targets, batch, uniforms)
     parts = {"critics": ("critics", 0), "actor": ("actor", 1), "log_alpha": ("alpha", 2)}
     rng = np.random.default_rng(0)
@@ -114,7 +118,7 @@ def test_gradients_equal_finite_differences_of_the_reference(continuous: bool) -
 
 
 def test_the_last_transitions_of_episodes_do_not_look_ahead() -> None:
-    trained, targets, batch, _ = problem(3, continuous=False)
+    trained, targets, batch, _ = problem(3, commands=0)
     elsewhere = batch._replace(next_state=batch.next_state + 100.0)
     for ended, changes in ((1.0, False), (0.0, True)):
         losses = [
@@ -126,7 +130,7 @@ def test_the_last_transitions_of_episodes_do_not_look_ahead() -> None:
 
 @pytest.mark.parametrize("size", [1e2, 1e4, 1e30])
 def test_losses_and_gradients_stay_finite_for_huge_logits(size: float) -> None:
-    trained, targets, batch, _ = problem(4, continuous=False)
+    trained, targets, batch, _ = problem(4, commands=0)
     last = trained.actor[-1]
     decided = Layer(last.weight, last.bias + jnp.array([size, -size, 0.0, -size]))
     trained = trained._replace(actor=(*trained.actor[:-1], decided))
@@ -137,11 +141,11 @@ def test_losses_and_gradients_stay_finite_for_huge_logits(size: float) -> None:
 
 @pytest.mark.parametrize("outputs", [(-40.0, 3.0), (40.0, -9.0), (0.0, 50.0), (1e4, 0.0)])
 def test_continuous_losses_stay_finite_at_the_ends(outputs: tuple[float, float]) -> None:
-    trained, targets, batch, _ = problem(5, continuous=True)
+    trained, targets, batch, _ = problem(5, commands=1)
     last = trained.actor[-1]
     extreme = Layer(jnp.zeros_like(last.weight), jnp.array([outputs]))
     trained = trained._replace(actor=(*trained.actor[:-1], extreme))
-    uniforms = jnp.stack([jnp.zeros(SIZE), jnp.full(SIZE, 1.0 - 2.0**-24)])
+    uniforms = jnp.stack([jnp.zeros((SIZE, 1)), jnp.full((SIZE, 1), 1.0 - 2.0**-24)])
     assert np.all(np.isfinite(compiled_losses(trained, targets, batch, uniforms)))
     for leaf in jax.tree.leaves(compiled_gradients(trained, targets, batch, uniforms)):
         assert np.all(np.isfinite(leaf))
@@ -153,8 +157,8 @@ def test_continuous_losses_stay_finite_at_the_ends(outputs: tuple[float, float])
 @pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (0.7, -1.5), (-1.2, -0.3), (0.3, -3.0)])
 def test_the_squashed_normals_density_integrates_to_one(mean: float, log_std: float) -> None:
     uniforms = jnp.linspace(1e-5, 1 - 1e-5, 200_001)
-    action, log_p = squashed_normal(jnp.tile(jnp.array([[mean, log_std]]), (len(uniforms), 1)), uniforms)
-    area = integrate.trapezoid(np.exp(np.asarray(log_p, np.float64)), np.asarray(action, np.float64))
+    action, log_p = squashed_normal(jnp.tile(jnp.array([[mean, log_std]]), (len(uniforms), 1)), uniforms[:, None])
+    area = integrate.trapezoid(np.exp(np.asarray(log_p, np.float64)), np.asarray(action[:, 0], np.float64))
     assert area == pytest.approx(1.0, abs=2e-3)
 
 
@@ -165,10 +169,10 @@ def test_the_squashed_normals_density_integrates_to_one(mean: float, log_std: fl
 )
 @settings(max_examples=100, deadline=None)
 def test_the_squashed_normal_is_scipys_change_of_variables(mean: float, log_std: float, uniform: float) -> None:
-    action, log_p = jax.jit(squashed_normal)(jnp.array([[mean, log_std]]), jnp.array([uniform]))
+    action, log_p = jax.jit(squashed_normal)(jnp.array([[mean, log_std]]), jnp.array([[uniform]]))
     kept = min(max(log_std, -5.0), 2.0)
     z = stats.norm.ppf(uniform, mean, math.exp(kept))
-    assert float(action[0]) == pytest.approx(math.tanh(z), abs=2e-4)
+    assert float(action[0, 0]) == pytest.approx(math.tanh(z), abs=2e-4)
     assert float(log_p[0]) == pytest.approx(reference.log_density(z, mean, kept), rel=1e-3, abs=1e-3)
 
 
@@ -181,7 +185,7 @@ def test_actions_are_drawn_as_often_as_softmax_says() -> None:
     logits = [0.3, -1.0, 2.0, 0.0, -3.0]
     environment = WithoutNeurons(Cartpole(), (-1.0, -0.5, 0.0, 0.5, 1.0))
     n = 200_000
-    uniforms = jax.random.uniform(jax.random.key(11), (n,))
+    uniforms = jax.random.uniform(jax.random.key(11), (n, 1))
     drawn = np.asarray(draw_action(environment, constant_actor(logits), jnp.zeros((n, 4)), uniforms))
     expected = n * np.exp(logits) / np.exp(logits).sum()
     assert stats.chisquare(np.bincount(drawn, minlength=5), expected).pvalue > 1e-3
@@ -190,7 +194,7 @@ def test_actions_are_drawn_as_often_as_softmax_says() -> None:
 @pytest.mark.parametrize("logits", [[-200.0, 0.0, -200.0], [0.0, -200.0, 0.0], [0.0, 1e-3, -1e-3], [1e30, 0.0, -1e30]])
 def test_actions_are_valid_and_possible_at_both_ends_of_the_uniforms(logits: list[float]) -> None:
     environment = WithoutNeurons(Cartpole(), (-1.0, 0.0, 1.0))
-    uniforms = jnp.array([0.0, 2.0**-24, 0.5, 1.0 - 2.0**-24])
+    uniforms = jnp.array([[0.0], [2.0**-24], [0.5], [1.0 - 2.0**-24]])
     drawn = np.asarray(draw_action(environment, constant_actor(logits), jnp.zeros((4, 4)), uniforms))
     possible = np.flatnonzero(np.array(logits) >= max(logits) - 100)
     assert set(drawn) <= set(possible)
@@ -200,10 +204,24 @@ def test_continuous_actions_follow_the_squashed_normal() -> None:
     environment = WithoutNeurons(Navigation(), None)
     n = environment.n_observations
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 2)), jnp.array([[0.4, -0.7]])))
-    uniforms = jax.random.uniform(jax.random.key(12), (20_000,))
+    uniforms = jax.random.uniform(jax.random.key(12), (20_000, 1))
     drawn = np.asarray(draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
     assert np.all(np.abs(drawn) <= 1)
     assert stats.kstest(np.arctanh(drawn), "norm", (0.4, math.exp(-0.7))).pvalue > 1e-3
+
+
+def test_each_of_several_commands_follows_its_own_squashed_normal() -> None:
+    environment = WithoutNeurons(Wheels(), None)
+    n = environment.n_observations
+    outputs = jnp.array([[0.4, -1.0, -0.7, 0.2]])  # two means, then two log deviations
+    actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 4)), outputs))
+    uniforms = jax.random.uniform(jax.random.key(13), (20_000, 2))
+    drawn = np.asarray(draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
+    assert drawn.shape == (20_000, 2)
+    z = np.arctanh(drawn)
+    assert stats.kstest(z[:, 0], "norm", (0.4, math.exp(-0.7))).pvalue > 1e-3
+    assert stats.kstest(z[:, 1], "norm", (-1.0, math.exp(0.2))).pvalue > 1e-3
+    assert abs(stats.pearsonr(*z.T).statistic) < 0.03
 
 
 def test_a_stack_of_networks_is_each_of_them() -> None:

@@ -71,7 +71,8 @@ class MeanAndDeviation(Outputs):
 
     def forward(self, obs: Any, state: Any = None, info: Any = None) -> Any:
         outputs, state = super().forward(obs, state)
-        return (outputs[:, :1], outputs[:, 1:].clamp(-5.0, 2.0).exp()), state
+        means, deviations = outputs.chunk(2, dim=1)
+        return (means, deviations.clamp(-5.0, 2.0).exp()), state
 
 
 class OfAction(torch.nn.Module):  # type: ignore[misc]
@@ -83,7 +84,7 @@ class OfAction(torch.nn.Module):  # type: ignore[misc]
 
     def forward(self, obs: Any, act: Any) -> Any:
         both = (torch.as_tensor(np.asarray(obs), dtype=torch.float64), torch.as_tensor(act, dtype=torch.float64))
-        return self.network(torch.cat([both[0], both[1].reshape(len(both[0]), 1)], dim=1))
+        return self.network(torch.cat([both[0], both[1].reshape(len(both[0]), -1)], dim=1))
 
 
 def in_buffer(batch: Batch, *, continuous: bool) -> Any:
@@ -97,7 +98,7 @@ def in_buffer(batch: Batch, *, continuous: bool) -> Any:
             tianshou_data.Batch(
                 obs=s[i],
                 obs_next=s_next[i],
-                act=np.array([a[i]]) if continuous else int(a[i]),
+                act=a[i] if continuous else int(a[i]),
                 rew=r[i],
                 terminated=ends,
                 truncated=not ends and i % 5 == 0,
@@ -122,9 +123,9 @@ def updated(algorithm: Any, buffer: Any) -> tuple[Any, np.ndarray]:
     return statistics, kept["targets"]
 
 
-def problem(seed: int, n_actions: int | None) -> tuple[Trained, Network, Batch]:
-    trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions)
-    batch = reference.drawn_batch(seed, SIZE, N, n_actions)
+def problem(seed: int, n_actions: int | None, n_commands: int = 1) -> tuple[Trained, Network, Batch]:
+    trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions, n_commands)
+    batch = reference.drawn_batch(seed, SIZE, N, n_actions, n_commands)
     return trained, targets, batch._replace(ended=jnp.arange(SIZE) % 3 == 0)
 
 
@@ -183,31 +184,32 @@ def test_discrete_losses_targets_and_gradients(seed: int) -> None:
         np.testing.assert_allclose(targets_of(trained, targets, batch, None), their_targets, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("commands", [1, 2])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_continuous_losses_targets_and_gradients(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_continuous_losses_targets_and_gradients(seed: int, commands: int, monkeypatch: pytest.MonkeyPatch) -> None:
     import gymnasium
     from scipy.special import ndtri
 
-    trained, targets, batch = problem(seed, None)
+    trained, targets, batch = problem(seed, None, commands)
     # tianshou keeps its logarithm from overflowing by adding 1e-7 inside, which shows where tanh is near 1: so
     # means near 0, and deviations near exp(-1), that do not lead there.
     last = trained.actor[-1]
-    narrow = Layer(0.05 * last.weight, 0.05 * last.bias - jnp.array([0.0, 1.0]))
+    narrow = Layer(0.05 * last.weight, 0.05 * last.bias - jnp.repeat(jnp.array([0.0, 1.0]), commands))
     trained = trained._replace(actor=(*trained.actor[:-1], narrow))
-    uniforms = np.random.default_rng(seed).uniform(0.01, 0.99, (2, SIZE))
+    uniforms = np.random.default_rng(seed).uniform(0.01, 0.99, (2, SIZE, commands))
     actor, critics = as_modules(trained.actor), [as_modules(trained.critics, i) for i in (0, 1)]
     policy = tianshou_sac.SACPolicy(
         actor=MeanAndDeviation(actor, with_state=True, without_time=True),
-        action_space=gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64),
+        action_space=gymnasium.spaces.Box(-1.0, 1.0, (commands,), np.float64),
     )
     wrapped = [OfAction(critic) for critic in critics]
-    algorithm = tianshou_sac.SAC(policy=policy, **shared_arguments(trained, wrapped, SETTINGS.entropy_nats))
+    algorithm = tianshou_sac.SAC(policy=policy, **shared_arguments(trained, wrapped, SETTINGS.entropy_nats * commands))
     give_targets(algorithm, targets, OfAction)
 
     noise = iter(ndtri(uniforms))
 
     def drawn(self: Any, sample_shape: Any = ()) -> Any:
-        return self.loc + self.scale * torch.tensor(next(noise)[:, None])
+        return self.loc + self.scale * torch.tensor(next(noise))
 
     # The same noise in both: first the targets' actions, then the new ones, in the order of tianshou's update.
     monkeypatch.setattr(torch.distributions.Normal, "rsample", drawn)

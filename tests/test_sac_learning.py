@@ -32,7 +32,7 @@ from animat.training.sac import (
     train_chunk,
 )
 from animat.training.settings import SAC
-from sac_toys import Follower, Payer
+from sac_toys import Follower, FollowerOfTwo, Payer
 
 SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)
 DISCRETE = (-1.0, 1.0)
@@ -118,13 +118,16 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
     after, _ = trained_for(environment, settings, 1, learner=before)
     n = environment.n_observations + 1
     rows = jnp.tile(after.replay[:1], (4, 1))
-    batch = Batch(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1], rows[:, 2 * n + 2])
+    action = rows[:, 2 * n] if commands is not None else rows[:, 2 * n : 2 * n + 1]
+    batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, 2 * n + 1], rows[:, 2 * n + 2])
 
     def loss(trained: Trained) -> jax.Array:
         if commands is not None:
             return sum(discrete_losses(trained, before.targets, batch, settings), jnp.float32(0))
         # The noise of the update is drawn inside; the critics' output at the start hardly depends on it.
-        return sum(continuous_losses(trained, before.targets, batch, jnp.full((2, 4), 0.5), settings), jnp.float32(0))
+        return sum(
+            continuous_losses(trained, before.targets, batch, jnp.full((2, 4, 1), 0.5), settings), jnp.float32(0)
+        )
 
     gradient = jax.jit(jax.grad(loss))(before.trained)
     parts = ("actor", "critics", "log_alpha") if commands is not None else ("log_alpha",)
@@ -192,12 +195,26 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     environment = WithoutNeurons(Follower(), commands)
     learner, _ = trained_for(environment, settings, 1500)
     wanted = jnp.array([[-0.75], [0.0], [0.75]]).repeat(400, axis=0)
-    uniforms = jax.random.uniform(jax.random.key(9), (len(wanted),))
+    uniforms = jax.random.uniform(jax.random.key(9), (len(wanted), 1))
     action = draw_action(environment, learner.trained.actor, wanted, uniforms)
     command = np.asarray(action if commands is None else jnp.array(commands)[action])
     mistake = np.abs(command - np.asarray(wanted)[:, 0])
     # Acting at random misses by 0.7 on average; what is left is the entropy that the policy is told to keep.
     assert mistake.mean() < 0.15
+
+
+def test_two_commands_each_follow_their_own() -> None:
+    settings = SAC(
+        environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=2.0,
+        entropy_nats=-2.0,
+    )  # fmt: skip
+    environment = WithoutNeurons(FollowerOfTwo(), None)
+    learner, _ = trained_for(environment, settings, 1500)
+    wanted = jnp.array([[-0.75, 0.75], [0.0, -0.5], [0.75, 0.25]]).repeat(400, axis=0)
+    uniforms = jax.random.uniform(jax.random.key(9), wanted.shape)
+    mistake = np.abs(np.asarray(draw_action(environment, learner.trained.actor, wanted, uniforms) - wanted))
+    # As for one command; acting at random misses by 0.7 on average.
+    assert mistake.mean(axis=0).max() < 0.15
 
 
 @pytest.mark.oracle

@@ -981,4 +981,4 @@ def test_the_rule_made_by_hand_goes_where_it_should(mapping: str) -> None:
             seen[1, 1] = 0.95  # below the goal
         actor = jax.tree.map(lambda leaf: leaf[0], rule)
         # The made-up means rise with the frequency.
-        assert actor.act(environment, seen, np.zeros(2)).tolist() == [4, 0]
+        assert actor.act(environment, seen, np.zeros((2, 1))).tolist() == [4, 0]

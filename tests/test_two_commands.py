@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -26,6 +28,7 @@ from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.evaluation.hand_made import Heuristic
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -38,6 +41,7 @@ from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Robot
 from animat.robots.checking import check_robot
+from animat.robots.registry import REGISTRY
 from animat.stimulation.protocol import Protocol
 from animat.training.policy import Policy
 from animat.training.specification import Training
@@ -179,10 +183,71 @@ def test_what_does_not_fit_is_refused_in_a_line(recording: Recording, timeline: 
         train(training, whole, None)
     with pytest.raises(InvalidArgument, match="readouts: expected 1, one for each command of cartpole, got 2"):
         train(replace(training, robot=Cartpole()), timeline, None)
-    with pytest.raises(InvalidArgument, match="expected one command for a baseline without neurons, got wheels"):
-        train(replace(training, mapping=None), None, None)
-    with pytest.raises(InvalidArgument, match="wheels"):
-        WithoutNeurons(Wheels(), None)
+    with pytest.raises(InvalidArgument, match="commands: expected none to pick from for wheels, which takes 2 at once"):
+        replace(training, mapping=None, commands=(-1.0, 1.0))
+    with pytest.raises(InvalidArgument, match="commands: expected none to pick from for wheels"):
+        WithoutNeurons(Wheels(), (-1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def baseline() -> dict[str, Policy]:
+    """Trained for no time at all."""
+    return train(Training(Wheels(episode_limit=8), None, policies=2, iterations=480, algorithm=SMALL), None, None)
+
+
+def test_without_neurons_both_commands_are_continuous(
+    baseline: dict[str, Policy], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(REGISTRY, "_registered", {**REGISTRY._registered, "wheels": Wheels})
+    baseline["p0"].save(tmp_path / "p0.safetensors")
+    policy = Policy.load(tmp_path / "p0.safetensors")
+    assert policy.n_actions is None and policy.commands is None
+    # What is drawn is the squashed normal of each command; what is most probable, its middle.
+    seen = np.array([0.3, -0.4, 1.0])
+    means, log_deviations = np.split(policy.outputs(seen), 2)
+    np.testing.assert_allclose(policy.act_greedily(seen), np.tanh(means), rtol=1e-6)
+    rng = np.random.default_rng(0)
+    z = np.arctanh(np.array([policy.act(seen, rng) for _ in range(4000)]))
+    np.testing.assert_allclose(z.mean(axis=0), means, atol=4 * np.exp(log_deviations).max() / np.sqrt(4000))
+    np.testing.assert_allclose(z.std(axis=0), np.exp(log_deviations), rtol=0.06)
+
+
+def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
+    table = evaluate(baseline, None, episodes=40, limit_resolution=0.5)
+    assert [row.name for row in table.rows] == ["policies", "random", "made by hand"]
+    assert table.no_limit is not None and "expected one command for a best possible return, got 2" in table.no_limit
+    # The rule by hand is the robot's own, for any commands can be given.
+    wheels = Wheels(episode_limit=8)
+    state = wheels.reset(jax.random.key(4))
+    seen = wheels.observe(state)
+    environment = WithoutNeurons(wheels, None)
+    rule = Heuristic().act(environment, (seen / environment.scales)[None], jnp.zeros((1, 2)))
+    np.testing.assert_allclose(rule[0], wheels.heuristic(seen), rtol=1e-6)
+
+
+@pytest.mark.oracle
+def test_the_baseline_of_two_commands_learns_to_drive() -> None:
+    trained = train(Training(Wheels(), None, policies=1, iterations=60_000), None, None)
+    returns = {row.name: float(row.episodes.returns.mean()) for row in evaluate(trained, None, episodes=40).rows}
+    # At random it stays where it is, a field away from the middle; by hand it drives there.
+    assert returns["random"] < -40
+    assert returns["made by hand"] > -12
+    assert returns["policies"] > -15
+
+
+@pytest.mark.oracle
+def test_the_command_line_trains_it_without_neurons(tmp_path: Path) -> None:
+    (tmp_path / "two_wheels.py").write_text(FILE)
+    given = ["train", "two_wheels:Wheels", "--mapping", "none", "--policies", "1", "--iterations", "200"]
+    ran = subprocess.run(
+        [sys.executable, "-m", "animat", *given, "--out", "policies"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stderr
+    # The mean of each wheel, then its log deviation.
+    (described,) = re.findall(
+        rb"layer2.bias[^}]*?shape\":\[(\d+)\]", (tmp_path / "policies/p0.safetensors").read_bytes()
+    )
+    assert int(described) == 4
 
 
 def changed(**methods: Any) -> Robot[Any]:

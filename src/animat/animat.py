@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from animat.coding.decoder import decoded, expect_fit
+from animat.coding.decoder import decoded, expect_fit, expect_one_command
 from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import AT_FIRST, Answer, NeuronSimulator
@@ -74,7 +74,7 @@ class Environment(abc.ABC, Generic[RobotState]):
     @property
     @abc.abstractmethod
     def n_actions(self) -> int | None:
-        """How many discrete actions there are; None: one continuous action in [-1, 1]."""
+        """How many discrete actions there are; None: continuous ones in [-1, 1], one a command."""
 
     @property
     @abc.abstractmethod
@@ -84,6 +84,11 @@ class Environment(abc.ABC, Generic[RobotState]):
     @abc.abstractmethod
     def actuate(self, uniforms: Uniforms, past: Number, action: Array, simulator: NeuronSimulator | None) -> Actuated:
         """Turn an action into (what was delivered, the answer after a past, the command in [-1, 1])."""
+
+    @property
+    def n_drawn(self) -> int:
+        """How many uniforms drawing an action takes: one, or one for each continuous command."""
+        return 1 if self.n_actions is not None else self.robot.n_commands
 
     @property
     def n_observations(self) -> int:
@@ -165,25 +170,23 @@ class Animat(Environment[RobotState]):
 
 @dataclass(frozen=True)
 class WithoutNeurons(Environment[RobotState]):
-    """The baseline: the agent moves the robot directly, by one of a few commands or by a continuous one.
+    """The baseline: the agent moves the robot directly, by one of a few commands or by continuous ones.
 
     Attributes:
         robot: the body and its task.
-        commands: the commands to pick from, such as (-1, 1) for the cartpole; None: any command in [-1, 1].
+        commands: the commands to pick from, such as (-1, 1) for the cartpole; None: any in [-1, 1], of as many
+            dimensions as the robot takes commands.
 
     Raises:
-        InvalidArgument: for a robot of several commands.
+        InvalidArgument: for commands to pick from, and a robot that takes several at once.
     """
 
     robot: Robot[RobotState]
     commands: tuple[float, ...] | None
 
     def __post_init__(self) -> None:
-        if self.robot.n_commands > 1:
-            raise InvalidArgument(
-                f"robot: expected one command for a baseline without neurons, got {self.robot.name}, which takes "
-                f"{self.robot.n_commands}; train it with a mapping"
-            )
+        if self.commands is not None:
+            expect_one_command(self.robot.name, self.robot.n_commands)
 
     @property
     def n_actions(self) -> int | None:

@@ -38,7 +38,7 @@ class Robots:
             parameters = " ".join(f"{key}={_short(value)}" for key, value in robot["parameters"].items())
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
-                print(f"  takes {robot['commands']} commands: train it with as many --readouts")
+                print(f"  takes {robot['commands']} commands: train it with as many --readouts, or --mapping none")
             for sentence in (*robot["lacks"].values(), *robot["caveats"]):
                 print(f"  {sentence}")
         for name, why in unusable.items():

@@ -19,7 +19,7 @@ LoopDelivery = Literal["chosen", "shuffled", "silent"]
 class Controller(Protocol):
     """Whoever chooses conditions: a `Policy`, or anything else that acts like one."""
 
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int | float:
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
         """The index of the condition to present, given the robot's observation in its own units."""
 
 
@@ -51,9 +51,9 @@ class Greedy:
 
     policy: Any
 
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int | float:
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
         """The most probable one."""
-        return self.policy.act_greedily(observation)  # type: ignore[no-any-return]
+        return self.policy.act_greedily(observation)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class InTurn:
 
     by_name: Mapping[str, Controller]
 
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int | float:
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
         """The first one's choice; the loop takes each at its turn (`Contender.acting`)."""
         return self.acting(0).act(observation, rng)
 

@@ -71,3 +71,16 @@ def expect_fit(robot: str, n_commands: int, readouts: int) -> None:
             f"readouts: expected {n_commands}, one for each command of {robot}, got {readouts}; halves make two, "
             "quadrants four, a file of groups of electrodes as many as it has (animat train --readouts)"
         )
+
+
+def expect_one_command(robot: str, n_commands: int) -> None:
+    """Refuse commands to pick from, each a number, for a robot that takes several at once.
+
+    Raises:
+        InvalidArgument: for such a robot.
+    """
+    if type(n_commands) is int and n_commands > 1:
+        raise InvalidArgument(
+            f"commands: expected none to pick from for {robot}, which takes {n_commands} at once: without neurons its "
+            "commands are continuous (baseline_commands = None)"
+        )

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from animat.animat import Animat, Environment
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.hand_made import Heuristic, hand_made
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, silenced
 
@@ -58,16 +58,12 @@ def controls_of(
         constant = Constant(jnp.array([i]))
         controls.append(Control(f"constant {label}", "this one always", environment, simulator, constant))
     if hasattr(environment.robot, "heuristic"):
-        rule = hand_made(environment, simulator)
-        controls.append(
-            Control(
-                "made by hand",
-                "no learning: the stimulus nearest to the command of the robot's heuristic",
-                environment,
-                simulator,
-                rule,
-            )
-        )
+        rule: Actor = Heuristic()
+        meaning = "no learning: the command of the robot's heuristic"
+        if environment.n_actions is not None:
+            rule = hand_made(environment, simulator)
+            meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
+        controls.append(Control("made by hand", meaning, environment, simulator, rule))
     if policies is not None and isinstance(environment, Animat) and simulator is not None:
         silent, shuffled = silenced(simulator), replace(environment, delivery="shuffled")
         controls += [

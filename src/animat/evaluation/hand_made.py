@@ -35,12 +35,28 @@ class HandMade(Actor):
         self,
         environment: Environment[Any],
         observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, " episodes"],
+        uniforms: Float[Array, "episodes drawn"],
     ) -> Array:
         wanted = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
         apart = self.means - wanted[:, None]
         distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
         return self.actions[jnp.argmin(distance, axis=1)]
+
+
+@final
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Heuristic(Actor):
+    """The very commands of the robot's `heuristic`, where any can be given: without neurons, continuous ones."""
+
+    def act(
+        self,
+        environment: Environment[Any],
+        observation: Float[Array, "episodes observations"],
+        uniforms: Float[Array, "episodes drawn"],
+    ) -> Array:
+        commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
+        return commands
 
 
 def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) -> HandMade:

@@ -21,10 +21,10 @@ from animat.errors import InvalidArgument, shown
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.training.policy import Policy
-from animat.training.sac import Layer, Network, draw_action, forward
+from animat.training.sac import Layer, Network, as_commands, draw_action, forward
 
 Seen = Float[Array, "episodes observations"]
-Uniforms = Float[Array, " episodes"]
+Uniforms = Float[Array, "episodes drawn"]
 
 
 class Actor(abc.ABC):
@@ -32,7 +32,7 @@ class Actor(abc.ABC):
 
     @abc.abstractmethod
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        """An action for each observation (scaled), from uniforms in [0, 1); shape (episodes,)."""
+        """An action for each observation (scaled), from uniforms in [0, 1), as `draw_action` does."""
 
 
 @final
@@ -57,7 +57,9 @@ class Networks(Actor):
         if not self.greedy:
             return draw_action(environment, self.network, observation, uniforms)
         outputs = forward(self.network, observation)
-        return jnp.tanh(outputs[:, 0]) if environment.n_actions is None else jnp.argmax(outputs, axis=-1)
+        if environment.n_actions is not None:
+            return jnp.argmax(outputs, axis=-1)
+        return as_commands(environment, jnp.tanh(outputs[:, : environment.n_drawn]))
 
 
 @final
@@ -68,8 +70,8 @@ class Uniform(Actor):
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         if environment.n_actions is None:
-            return 2.0 * uniforms - 1.0
-        return jnp.minimum((uniforms * environment.n_actions).astype(jnp.int32), environment.n_actions - 1)
+            return as_commands(environment, 2.0 * uniforms - 1.0)
+        return jnp.minimum((uniforms[:, 0] * environment.n_actions).astype(jnp.int32), environment.n_actions - 1)
 
 
 @final
@@ -81,7 +83,7 @@ class Constant(Actor):
     action: Int[Array, "*actors"]
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        return jnp.broadcast_to(self.action, uniforms.shape)
+        return jnp.broadcast_to(self.action, uniforms.shape[:1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +187,7 @@ def _roll_out(
 ) -> tuple[Array, Array, Array, Array, Array]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     readouts = () if simulator is None else simulator.percentiles.shape[:-1]
+    n_drawn = environment.n_drawn
 
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
         start, key = jax.random.split(key)
@@ -201,10 +204,10 @@ def _roll_out(
 
     def iteration(carry: tuple[Any, ...], actor: Actor, key: PRNGKeyArray) -> tuple[Any, ...]:
         state, going, returns, lengths, presented, passed, terminated = carry
-        uniforms = jax.random.uniform(key, (episodes, environment.noise_size + 1))
+        uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales
-        action = actor.act(environment, observation, uniforms[:, 0])
-        outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], state, action, simulator)
+        action = actor.act(environment, observation, uniforms[:, :n_drawn])
+        outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
         # An ended episode is carried along, and counts no further.
         returns = returns + jnp.where(going, outcome.reward, 0.0)
         terminated = terminated | (going & outcome.terminated)

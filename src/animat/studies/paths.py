@@ -60,13 +60,15 @@ def record_paths(
 
 @partial(jax.jit, static_argnums=0)
 def _record(environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, keys: Any) -> Any:
+    n_drawn = environment.n_drawn
+
     def one_actor(actor: Actor, key: Any) -> Any:
         def iteration(carry: Any, key: Any) -> Any:
             state, going = carry
-            uniforms = jax.random.uniform(key, (environment.noise_size + 1,))
+            uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,))
             observation = environment.observe(state)
-            action = actor.act(environment, (observation / environment.scales)[None], uniforms[:1])[0]
-            outcome = environment.advance(uniforms[1:], state, action, simulator)
+            action = actor.act(environment, (observation / environment.scales)[None], uniforms[None, :n_drawn])[0]
+            outcome = environment.advance(uniforms[n_drawn:], state, action, simulator)
             still = going & ~(outcome.terminated | outcome.truncated)
             return (outcome.state, still), (environment.observe(outcome.state), outcome.command, going)
 

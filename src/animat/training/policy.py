@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
 from animat.brief import briefly
-from animat.coding.decoder import expect_fit
+from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
@@ -53,8 +53,8 @@ FITTED = ("kind", "bins", "range_hz", "by", "burst_threshold")
 class Policy:
     """A trained controller, run in numpy: nothing of JAX is imported to load it or to act.
 
-    The network has two hidden layers of rectified units; its outputs are the logits of the actions, or mean and log
-    deviation of a continuous one, which tanh takes into [-1, 1].
+    The network has two hidden layers of rectified units; its outputs are the logits of the actions, or the means and
+    then the log deviations of continuous commands, which tanh takes into [-1, 1].
 
     Attributes:
         weights, biases: of the three layers, shapes (inputs, outputs) and (outputs,).
@@ -62,7 +62,7 @@ class Policy:
         robot: the robot it was trained on.
         mapping: from a response to a command; None for a policy without neurons.
         conditions: what the actions are, for a policy that acts through neurons.
-        commands: what the actions are, for one without neurons; None there means a continuous command.
+        commands: what the actions are, for one without neurons; None there means continuous commands.
         window_ms: the response window, for a policy that acts through neurons.
         presentation: how stimuli were presented when the neurons were recorded; None where it is not known.
         provenance: what it was trained on and how, as plain data.
@@ -91,6 +91,7 @@ class Policy:
             check_window(read_record(tuple[Number, Number], self.window_ms, "window_ms"))
         if self.commands is not None:
             read_record(tuple[Command, ...], self.commands, "commands")
+            expect_one_command(self.robot.name, self.robot.n_commands)
         if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
             raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
         expect_provenance(self.provenance)
@@ -99,7 +100,7 @@ class Policy:
 
     def _expect_network(self) -> None:
         """Refuse weights of which no action can be made, or one that means nothing."""
-        n_outputs = 2 if self.n_actions is None else self.n_actions
+        n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         widths = [len(self.robot.quantities), *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
@@ -128,7 +129,7 @@ class Policy:
 
     @property
     def n_actions(self) -> int | None:
-        """How many discrete actions there are; None: one continuous command in [-1, 1]."""
+        """How many discrete actions there are; None: continuous commands in [-1, 1], as many as the robot takes."""
         if self.mapping is not None:
             return len(self.conditions)
         return None if self.commands is None else len(self.commands)
@@ -188,23 +189,29 @@ class Policy:
         exponentials = np.exp(logits - logits.max())
         return exponentials / exponentials.sum()  # type: ignore[no-any-return]
 
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int | float:
-        """Draw an action from the policy: the index of a condition (or command), or a continuous command.
+    def act(
+        self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator
+    ) -> int | float | Float[np.ndarray, " commands"]:
+        """Draw an action from the policy: the index of a condition (or command), or what is commanded.
 
         Args:
             observation: in the robot's own units, shape (observations,).
             rng: source of the draw.
         """
         if self.n_actions is None:
-            mean, log_std = self.outputs(observation)
-            return math.tanh(mean + math.exp(min(max(log_std, -5.0), 2.0)) * rng.standard_normal())
+            mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)
+            return _commanded(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
         below = np.cumsum(self.probabilities(observation))
         return min(int(np.searchsorted(below, rng.random() * below[-1], side="right")), len(below) - 1)
 
-    def act_greedily(self, observation: Float[np.ndarray, " observations"]) -> int | float:
-        """The most probable action (the middle of the distribution, for a continuous one)."""
+    def act_greedily(
+        self, observation: Float[np.ndarray, " observations"]
+    ) -> int | float | Float[np.ndarray, " commands"]:
+        """The most probable action (the middle of the distribution, for continuous commands)."""
         outputs = self.outputs(observation)
-        return math.tanh(outputs[0]) if self.n_actions is None else int(outputs.argmax())
+        if self.n_actions is not None:
+            return int(outputs.argmax())
+        return _commanded(outputs[: len(outputs) // 2].astype(np.float64))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy as safetensors, with everything that is not an array as JSON in its metadata.
@@ -269,6 +276,11 @@ class Policy:
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             said = f"nothing called {error}" if isinstance(error, KeyError) else error
             raise InvalidFile(f"{path}: expected a whole policy, got one that does not fit together: {said}") from error
+
+
+def _commanded(z: Float64[np.ndarray, " commands"]) -> float | Float64[np.ndarray, " commands"]:
+    """Continuous commands; a single one as a number."""
+    return math.tanh(z[0]) if len(z) == 1 else np.tanh(z)
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:

@@ -71,7 +71,7 @@ class Batch(NamedTuple):
 
     state: Float[Array, "batch state"]
     next_state: Float[Array, "batch state"]
-    action: Float[Array, " batch"]
+    action: Float[Array, "batch *commands"]
     reward: Float[Array, " batch"]
     ended: Float[Array, " batch"]
 
@@ -125,16 +125,20 @@ def forward(network: Network, inputs: Float[Array, "*_ batch inputs"]) -> Float[
 
 
 def squashed_normal(
-    outputs: Float[Array, "batch 2"], uniforms: Float[Array, " batch"]
-) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    """A continuous action a = tanh(z), z normal with the actor's mean and log deviation, and log p(a)."""
-    mean, log_std = outputs[:, 0], jnp.clip(outputs[:, 1], -5.0, 2.0)
+    outputs: Float[Array, "batch means_and_deviations"], uniforms: Float[Array, "batch commands"]
+) -> tuple[Float[Array, "batch commands"], Float[Array, " batch"]]:
+    """A continuous action a = tanh(z) and log p(a), the z of its commands independent normal numbers.
+
+    Their means stand in the first half of the actor's outputs, their log deviations in the second.
+    """
+    mean, log_std = jnp.split(outputs, 2, axis=-1)
+    log_std = jnp.clip(log_std, -5.0, 2.0)
     standard = ndtri(jnp.clip(uniforms, 1e-6, 1.0 - 1e-6))
     z = mean + jnp.exp(log_std) * standard
     log_normal = -0.5 * standard**2 - log_std - 0.5 * math.log(2.0 * math.pi)
     # log(1 - tanh(z)^2), in the form that does not lose its digits for large |z|
     log_slope = 2.0 * (math.log(2.0) - z - jax.nn.softplus(-2.0 * z))
-    return jnp.tanh(z), log_normal - log_slope
+    return jnp.tanh(z), jnp.sum(log_normal - log_slope, axis=-1)
 
 
 # --- losses ---------------------------------------------------------------------------------------------------------
@@ -173,9 +177,9 @@ def discrete_losses(
 
 
 def continuous_losses(
-    trained: Trained, targets: Network, batch: Batch, uniforms: Float[Array, "2 batch"], settings: SAC
+    trained: Trained, targets: Network, batch: Batch, uniforms: Float[Array, "2 batch commands"], settings: SAC
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The same for one continuous action, with a' and a_new drawn from the policy (reparameterised).
+    """The same for continuous actions, with a' and a_new drawn from the policy (reparameterised).
 
     critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - alpha log pi(a'|o')))^2 / 2
     actor:   mean alpha log pi(a_new|o) - Q(s, a_new)
@@ -185,7 +189,7 @@ def continuous_losses(
     alpha = jnp.exp(fixed(trained.log_alpha))
 
     def critic(critics: Network, state: Array, action: Array) -> Float[Array, "2 batch"]:
-        return forward(critics, jnp.concatenate([state, action[:, None]], axis=1))[..., 0]
+        return forward(critics, jnp.concatenate([state, action], axis=1))[..., 0]
 
     next_action, log_next = squashed_normal(forward(fixed(trained.actor), batch.next_observation), uniforms[0])
     next_q = jnp.min(critic(targets, batch.next_state, next_action), axis=0)
@@ -197,7 +201,7 @@ def continuous_losses(
     new_q = jnp.min(critic(fixed(trained.critics), batch.state, action), axis=0)
     actor_loss = jnp.mean(alpha * log_pi - new_q)
 
-    alpha_loss = trained.log_alpha * jnp.mean(fixed(-log_pi) - settings.entropy_nats)
+    alpha_loss = trained.log_alpha * jnp.mean(fixed(-log_pi) - settings.entropy_nats * action.shape[-1])
     return critic_loss, actor_loss, alpha_loss
 
 
@@ -208,7 +212,8 @@ def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Le
     """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
     n, n_actions, hidden = environment.n_observations, environment.n_actions, settings.hidden
-    inputs, values, outputs = (n + 2, 1, 2) if n_actions is None else (n + 1, n_actions, n_actions)
+    n_drawn = environment.n_drawn
+    inputs, values, outputs = (n + 1 + n_drawn, 1, 2 * n_drawn) if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics = initial_networks(
         weight_key, ((n, hidden, hidden, outputs), ()), ((inputs, hidden, hidden, values), (2,))
     )
@@ -218,7 +223,7 @@ def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Le
         deployed=actor,
         targets=critics,
         optimiser=_adam(settings).init(trained),
-        replay=jnp.zeros((settings.replay, 2 * n + 5)),
+        replay=jnp.zeros((settings.replay, 2 * (n + 1) + n_drawn + 2)),
         episodes=jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments)),
         returns=jnp.zeros(settings.environments),
         key=key,
@@ -247,8 +252,9 @@ def train_chunk(
         The learner after the chunk, and the episodes that ended in it.
     """
     # The uniforms that a round acts with and learns with: one block, drawn at once.
-    acting = (settings.environments, environment.noise_size + 1)
-    learning = (settings.updates, 1 if environment.n_actions is not None else 3, settings.batch)
+    acting = (settings.environments, environment.n_drawn + environment.noise_size)
+    blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
+    learning = (settings.updates, blocks, settings.batch)
     n_acting = math.prod(acting)
 
     def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
@@ -279,24 +285,26 @@ def _act(
     reset_key: PRNGKeyArray,
 ) -> tuple[Learner, Finished]:
     """One step of every environment, remembered in the replay; ended episodes start anew."""
-    scales = environment.scales
+    scales, n_drawn = environment.scales, environment.n_drawn
 
     def state_of(episodes: EpisodeState) -> Float[Array, "environments state"]:
         left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
         return jnp.concatenate([jax.vmap(environment.observe)(episodes) / scales, left], axis=1)
 
     state = state_of(learner.episodes)
-    action = draw_action(environment, learner.trained.actor, state[:, :-1], uniforms[:, 0])
-    outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, 1:], learner.episodes, action, simulator)
+    action = draw_action(environment, learner.trained.actor, state[:, :-1], uniforms[:, :n_drawn])
+    noise = uniforms[:, n_drawn:]
+    outcome = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = outcome.terminated | outcome.truncated
-    row = jnp.stack([action, settings.reward_scale * outcome.reward, ended], axis=1, dtype=jnp.float32)
-    rows = jnp.concatenate([state, state_of(outcome.state), row], axis=1)
+    of_action = action.reshape(len(state), n_drawn).astype(jnp.float32)
+    row = jnp.stack([settings.reward_scale * outcome.reward, ended], axis=1, dtype=jnp.float32)
+    rows = jnp.concatenate([state, state_of(outcome.state), of_action, row], axis=1)
 
     returns = learner.returns + outcome.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
     learner = learner._replace(
         replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
-        episodes=jax.tree.map(lambda new, old: jnp.where(ended, new, old), started, outcome.state),
+        episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started, outcome.state),
         returns=jnp.where(ended, 0.0, returns),
     )
     return learner, Finished(jnp.sum(ended, dtype=jnp.float32), jnp.sum(jnp.where(ended, returns, 0.0)))
@@ -306,14 +314,24 @@ def draw_action(
     environment: Environment[Any],
     actor: Network,
     observation: Float[Array, "batch observations"],
-    uniforms: Float[Array, " batch"],
+    uniforms: Float[Array, "batch drawn"],
 ) -> Array:
-    """Draw an action from the policy for each scaled observation, by the inverse of its cumulative distribution."""
+    """Draw an action from the policy for each scaled observation, by the inverse of its cumulative distribution.
+
+    Of shape (batch,); of several continuous commands (batch, commands).
+    """
     outputs = forward(actor, observation)
     if environment.n_actions is None:
-        return squashed_normal(outputs, uniforms)[0]
+        return as_commands(environment, squashed_normal(outputs, uniforms)[0])
     below = jnp.cumsum(jax.nn.softmax(outputs), axis=-1)[:, :-1]
-    return jnp.sum(uniforms[:, None] >= below, axis=-1)
+    return jnp.sum(uniforms >= below, axis=-1)
+
+
+def as_commands(
+    environment: Environment[Any], actions: Float[Array, "batch commands"]
+) -> Float[Array, "batch *commands"]:
+    """Continuous actions as the robot takes them: one command is a number."""
+    return actions[:, 0] if environment.robot.n_commands == 1 else actions
 
 
 def _learn(
@@ -325,18 +343,21 @@ def _learn(
 ) -> Learner:
     """`settings.updates` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
-    n = environment.n_observations + 1
+    n, n_drawn = environment.n_observations + 1, environment.n_drawn
+    is_continuous = environment.n_actions is None
 
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
-        if environment.n_actions is None:
+        if is_continuous:
             return sum(continuous_losses(trained, targets, batch, noise, settings), jnp.float32(0.0))
         return sum(discrete_losses(trained, targets, batch, settings), jnp.float32(0.0))
 
     def update(carry: tuple[Trained, Network, Any], uniforms: Float[Array, "blocks batch"]) -> tuple[Any, None]:
         trained, targets, optimiser = carry
         rows = learner.replay[(uniforms[0] * available).astype(jnp.int32)]
-        batch = Batch(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1], rows[:, 2 * n + 2])
-        gradient = jax.grad(losses)(trained, targets, batch, uniforms[1:])
+        action = rows[:, 2 * n : 2 * n + n_drawn] if is_continuous else rows[:, 2 * n]
+        batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, -2], rows[:, -1])
+        noise = uniforms[1:].reshape(-1, n_drawn, settings.batch).swapaxes(1, 2)
+        gradient = jax.grad(losses)(trained, targets, batch, noise)
         steps, optimiser = adam.update(gradient, optimiser)
         trained = optax.apply_updates(trained, steps)
         targets = jax.tree.map(lambda t, c: t + settings.follow * (c - t), targets, trained.critics)

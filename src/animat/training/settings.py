@@ -31,7 +31,7 @@ class SAC:
         averaging: the deployed actor is an average over about the last 1 / (averaging + 1) of its training so far.
         first_alpha: weight of the entropy bonus at the start.
         entropy_share: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
-        entropy_nats: the entropy that a continuous action keeps.
+        entropy_nats: the entropy that a continuous action keeps, for each of its commands.
 
     Raises:
         InvalidArgument: for a count below 1 or beyond what fits, a rate or a share outside what it may be, or a replay

@@ -10,6 +10,7 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 import numpy as np
 
 from animat.animat import Animat, Delivery, Environment, WithoutNeurons
+from animat.coding.decoder import expect_one_command
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.errors import InvalidArgument, shown
 from animat.neurons.timeline import SimulatorTimeline
@@ -63,7 +64,7 @@ class Training:
             as the recordings that it is trained on (`SimulatorTimeline.span_min`).
         percentiles: `"moving"` with the simulator in use, or those of the `"first"` recording held.
         delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random whatever it chose.
-        commands: without neurons, the commands to pick from; None: any in [-1, 1].
+        commands: without neurons, the commands to pick from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
 
     Raises:
@@ -96,6 +97,7 @@ class Training:
             object.__setattr__(self, "commands", tuple(map(float, self.commands)))
             if not self.commands or not all(abs(u) <= 1 for u in self.commands):
                 raise InvalidArgument(f"commands: expected numbers from -1 to 1, got {shown(self.commands)}")
+            expect_one_command(self.robot.name, self.robot.n_commands)
         if self.duration_min is not None and not (math.isfinite(self.duration_min) and self.duration_min > 0):
             raise InvalidArgument(f"duration_min: expected positive minutes, got {self.duration_min:g}")
         for name, allowed in (("percentiles", get_args(Percentiles)), ("delivery", get_args(Delivery))):
