@@ -162,7 +162,7 @@ class TissueParameters:
     """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
     scaling_at_hz: float = 0.7
     """[C] The mean rate that scaling holds: loss and recovery then balance at the full weights."""
-    load_gain: float = 0.05
+    load_gain: float = 0.08
     """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
     load_min: float = 30.0
     """[C] Time constant with which the load leaves."""
