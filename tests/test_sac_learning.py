@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -186,14 +187,16 @@ def test_critics_converge_to_the_closed_form(limit: int, ends: bool) -> None:
 # --- what it learns -------------------------------------------------------------------------------------------------
 
 
+TRIVIAL = SAC(
+    environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=1.0,
+    entropy_nats=-2.0,
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("commands", [(-0.8, 0.0, 0.8), None])
 def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
-    settings = SAC(
-        environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=1.0,
-        entropy_nats=-2.0,
-    )  # fmt: skip
     environment = WithoutNeurons(Follower(), commands)
-    learner, _ = trained_for(environment, settings, 1500)
+    learner, _ = trained_for(environment, TRIVIAL, 1500)
     wanted = jnp.array([[-0.75], [0.0], [0.75]]).repeat(400, axis=0)
     uniforms = jax.random.uniform(jax.random.key(9), (len(wanted), 1))
     action = draw_action(environment, learner.trained.actor, wanted, uniforms)
@@ -204,12 +207,8 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
 
 
 def test_two_commands_each_follow_their_own() -> None:
-    settings = SAC(
-        environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=2.0,
-        entropy_nats=-2.0,
-    )  # fmt: skip
     environment = WithoutNeurons(FollowerOfTwo(), None)
-    learner, _ = trained_for(environment, settings, 1500)
+    learner, _ = trained_for(environment, replace(TRIVIAL, reward_scale=2.0), 1500)
     wanted = jnp.array([[-0.75, 0.75], [0.0, -0.5], [0.75, 0.25]]).repeat(400, axis=0)
     uniforms = jax.random.uniform(jax.random.key(9), wanted.shape)
     mistake = np.abs(np.asarray(draw_action(environment, learner.trained.actor, wanted, uniforms) - wanted))

@@ -52,6 +52,11 @@ from two_wheels import FILE, Wheels
 PROTOCOL = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
 
 
+@pytest.fixture(autouse=True)
+def _registered_for_one_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(REGISTRY, "_registered", dict(REGISTRY._registered))
+
+
 @pytest.fixture(scope="module")
 def recording() -> Recording:
     with FakeCulture() as culture:
@@ -195,10 +200,8 @@ def baseline() -> dict[str, Policy]:
     return train(Training(Wheels(episode_limit=8), None, policies=2, iterations=480, algorithm=SMALL), None, None)
 
 
-def test_without_neurons_both_commands_are_continuous(
-    baseline: dict[str, Policy], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(REGISTRY, "_registered", {**REGISTRY._registered, "wheels": Wheels})
+def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy], tmp_path: Path) -> None:
+    REGISTRY._registered["wheels"] = Wheels
     baseline["p0"].save(tmp_path / "p0.safetensors")
     policy = Policy.load(tmp_path / "p0.safetensors")
     assert policy.n_actions is None and policy.commands is None

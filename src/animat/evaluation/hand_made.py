@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from animat.animat import Environment
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.rollouts import Actor
+from animat.evaluation.rollouts import Actor, Seen, Uniforms
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.capabilities import capability
 
@@ -31,12 +31,7 @@ class HandMade(Actor):
     actions: Array
     means: Float[Array, "..."]
 
-    def act(
-        self,
-        environment: Environment[Any],
-        observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, "episodes drawn"],
-    ) -> Array:
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         wanted = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
         apart = self.means - wanted[:, None]
         distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
@@ -49,12 +44,7 @@ class HandMade(Actor):
 class Heuristic(Actor):
     """The very commands of the robot's `heuristic`, where any can be given: without neurons, continuous ones."""
 
-    def act(
-        self,
-        environment: Environment[Any],
-        observation: Float[Array, "episodes observations"],
-        uniforms: Float[Array, "episodes drawn"],
-    ) -> Array:
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
         return commands
 
