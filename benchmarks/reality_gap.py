@@ -8,7 +8,7 @@
 For each virtual culture and way - the commands without options, as in the README; the paper's blocks with one pulse,
 mixed with one, mixed with five, and mixed with one, recorded five times as long and simulated with its memory, through
 one threshold and through nine - the culture is
-recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same culture from where the last
+recorded at 0 and 10 min (without options at 0 and 5), policies are trained on that, and run in closed loop on the same culture from where the last
 recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
 
 With `--backends` each culture is opened once, recorded once as in `memory9`, and run: the virtual culture with so many
@@ -75,7 +75,7 @@ def recording_options(way: Way | None) -> list[str]:
     if way is None:
         return []
     presented = ["--order", way.order, "--pulses", str(way.pulses), "--presentations", str(way.presentations)]
-    return ["--sessions", "2", *presented]
+    return ["--sessions", "2", "--interval-min", "10", *presented]
 
 
 def training_options(way: Way | None, robot: str, policies: int, iterations: int | None) -> list[str]:
@@ -122,7 +122,7 @@ def main() -> None:
         return
     for seed, (name, way) in itertools.product(options.seeds, ((name, WAYS[name]) for name in options.ways)):
         of_recording = recording_options(way)
-        recordings = str(options.out / f"culture{seed}" / ("-".join(of_recording[3::2]) or name))
+        recordings = str(options.out / f"culture{seed}" / ("-".join(of_recording[5::2]) or name))
         expect(["record", "--seed", str(seed), *of_recording, "--out", recordings])
         for robot in options.robots:
             folder = options.out / f"culture{seed}" / name / robot

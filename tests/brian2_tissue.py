@@ -24,6 +24,7 @@ dtheta/dt = -theta / tau_theta : 1
 relE : 1
 relI : 1
 B = 1 / (1 + exp(-0.062 * v) / 3.57) : 1 (constant over dt)
+scale : 1 (linked)
 drive : 1
 drive_mean : 1 (constant)
 needed : 1 (constant)
@@ -45,7 +46,6 @@ dxI/dt = (1 - xI) / tau_recI : 1
 duE/dt = (U_E - uE) / tau_facE : 1
 duI/dt = (U_I - uI) / tau_facI : 1
 dh/dt = (1 - h) / tau_h : 1
-dR/dt = (1 - R) / tau_R : 1
 """
 AT_SPIKES = """
 xE : 1
@@ -53,7 +53,6 @@ xI : 1
 uE : 1
 uI : 1
 h : 1
-R : 1
 last : second
 """
 RECOVER = """
@@ -62,7 +61,6 @@ xI = 1 - (1 - xI) * exp((last - t) / tau_recI)
 uE = U_E + (uE - U_E) * exp((last - t) / tau_facE)
 uI = U_I + (uI - U_I) * exp((last - t) / tau_facI)
 h = 1 - (1 - h) * exp((last - t) / tau_h)
-R = 1 - (1 - R) * exp((last - t) / tau_R)
 last = t
 """
 
@@ -70,13 +68,12 @@ RESET = """
 v = v_reset
 gK += dK
 theta += dtheta_spike
-relE = uE * xE * (is_e * R + 1 - is_e)
-relI = uI * xI * (is_e * R + 1 - is_e)
+relE = uE * xE * (is_e * scale + 1 - is_e)
+relI = uI * xI * (is_e * scale + 1 - is_e)
 xE *= 1 - uE
 xI *= 1 - uI
 uE += facilitates * U_E * (1 - uE)
 uI += facilitates * U_I * (1 - uI)
-R *= 1 - loss_R
 h *= 1 - loss_h
 """
 
@@ -126,8 +123,9 @@ class Brian2Tissue:
             "tau_K": p.hyperpolarisation_ms * ms,
             "tau_theta": p.adaptation_ms * ms,
             "tau_h": p.availability_s * second,
-            "tau_R": p.release_recovery_min * 60 * second,
-            "loss_R": p.release_loss,
+            "tau_scale": p.scaling_min * 60 * second,
+            "scale_rest": 1 + p.scaling_loss * p.scaling_at_hz * p.scaling_min * 60,
+            "loss_scale": p.scaling_loss / p.n_excitatory,
             "loss_h": p.availability_loss,
             "ratio": p.nmda_ratio,
             "fill": 1 / p.nmda_saturation,
@@ -149,15 +147,25 @@ class Brian2Tissue:
         group.is_e, group.facilitates = is_e, is_e
         group.tau_m = np.where(is_e, p.membrane_e_ms, p.membrane_i_ms) * ms
         group.refractory_time = np.where(is_e, p.refractory_e_ms, p.refractory_i_ms) * ms
-        group.xE = group.xI = group.h = group.R = 1
+        group.xE = group.xI = group.h = 1
         for towards, kind in (("E", p.e_to_e), ("I", p.e_to_i)):
             setattr(group, f"U_{towards}", np.where(is_e, kind.use, p.i_to_any.use))
             setattr(group, f"u{towards}", np.where(is_e, kind.use, p.i_to_any.use))
             setattr(group, f"tau_rec{towards}", np.where(is_e, kind.recovery_ms, p.i_to_any.recovery_ms) * ms)
             setattr(group, f"tau_fac{towards}", np.where(is_e, kind.facilitation_ms, 1.0) * ms)
 
+        scaling: Any = b2.NeuronGroup(
+            1, "dscale/dt = (scale_rest - scale) / tau_scale : 1", method="exact", clock=clock, namespace=constants
+        )
+        scaling.scale = 1
+        group.scale = b2.linked_var(scaling, "scale")
+        scaled: Any = b2.Synapses(
+            group, scaling, on_pre="scale_post *= 1 - loss_scale", clock=clock, namespace=constants
+        )
+        scaled.connect(i=np.flatnonzero(is_e), j=0)
+
         source = np.repeat(np.arange(len(network)), np.diff(network.start))
-        parts = [group]
+        parts = [group, scaling, scaled]
         for from_e in (True, False):
             for to_e in (True, False):
                 rows = np.flatnonzero((is_e[source] == from_e) & (is_e[network.target] == to_e))

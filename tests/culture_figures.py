@@ -62,9 +62,8 @@ class Rig:
         return Pulse(time_s, place[:, 0], place[:, 1])
 
     def set_up(self) -> float:
-        """The pause before a block, most of it in closed form; returns when the block may begin."""
-        self.tissue.rest(SET_UP_S - 2.0)
-        self.tissue.advance(2.0)
+        """The pause before a block; returns when the block may begin."""
+        self.tissue.rest(SET_UP_S)
         return self.tissue.now_s + 0.001
 
     def read(self, times_s: np.ndarray, spikes: Spikes) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The spontaneous activity of a bare tissue over hours.
+"""The spontaneous activity of a bare tissue over hours, by the detector that real cultures are read with.
 
 A network burst: the spikes of all neurons, in bins of 25 ms, pass four times their mean over ten minutes; stretches
 less than 100 ms apart are one; at least 20 % of the active channels (above 0.02 Hz) take part. Written in plain NumPy,
@@ -18,7 +18,7 @@ from culture_figures import Rig
 BIN_S, TIMES_MEAN, JOIN_S = 0.025, 4.0, 0.1
 ACTIVE_HZ, LEAST_PARTICIPATION = 0.02, 0.2
 WINDOW_MIN = 10
-FIRST_MIN = (0, 10, 60, 140)
+FIRST_MIN = (0, 10, 60, 140, 170)
 LEADERS = 10
 
 
@@ -35,6 +35,17 @@ class Spontaneous(NamedTuple):
     participation_p90: float
     led_share: float
     """Share of bursts that one of the ten most frequent leaders, of all channels, begins."""
+
+    def missed(self) -> list[str]:
+        """What is outside its bounds, in words."""
+        bounds = {
+            "1-10 bursts a minute": 1 <= self.bursts_per_min <= 10,
+            "variation of intervals 0.3-1.5": 0.3 <= self.interval_cv <= 1.5,
+            "150-800 ms": 150 <= self.burst_ms <= 800,
+            "mean participation 0.5-0.9": 0.5 <= self.participation <= 0.9,
+            "0.5-2 Hz a neuron": 0.5 <= self.rate_hz <= 2,
+        }
+        return [f"{name} at {self.first_min} min" for name, held in bounds.items() if not held]
 
 
 def bursts_of(
@@ -68,9 +79,7 @@ def window(time_s: np.ndarray, neuron: np.ndarray, first_min: int, seen: np.ndar
     start_s, end_s, share, leader = bursts_of(time_s, neuron, from_s, to_s, seen)
     if len(start_s) < 3:
         nan = float("nan")
-        return Spontaneous(
-            first_min, len(neuron) / (to_s - from_s) / seen.shape[1], len(start_s) / WINDOW_MIN, *6 * [nan]
-        )
+        return Spontaneous(first_min, len(neuron) / 600 / seen.shape[1], len(start_s) / 10, *6 * [nan])
     between_s = np.diff(start_s)
     leads = np.sort(np.unique(leader[leader >= 0], return_counts=True)[1])[::-1]
     return Spontaneous(
@@ -85,12 +94,17 @@ def window(time_s: np.ndarray, neuron: np.ndarray, first_min: int, seen: np.ndar
     )
 
 
-def over_hours(seed: int) -> list[Spontaneous]:
-    """The figures of a tissue that nothing stimulates."""
-    seen, tissue, rows = Rig(seed).seen, Tissue(seed), []
-    for minute in FIRST_MIN:
-        while tissue.now_s < 60.0 * minute:
-            tissue.advance(60.0)
+def over_hours(seed: int, first_min: tuple[int, ...] = FIRST_MIN, rest: bool = False) -> list[Spontaneous]:
+    """The figures of a tissue that nothing stimulates; with `rest`, what lies between the windows is rested."""
+    rig = Rig(seed, spontaneous_s=120.0)
+    seen = rig.seen
+    tissue, rows = Tissue(seed), []
+    for minute in first_min:
+        between_s = 60.0 * minute - tissue.now_s
+        if rest:
+            tissue.rest(between_s)
+        while not rest and tissue.now_s < 60.0 * minute:
+            tissue.advance(min(60.0, 60.0 * minute - tissue.now_s))
         spikes = [tissue.advance(60.0) for _ in range(WINDOW_MIN)]
         rows.append(window(*(np.concatenate(column) for column in zip(*spikes, strict=True)), minute, seen))
     return rows
@@ -101,15 +115,16 @@ def main(seeds: list[int]) -> None:
     names = (
         "seed, from min, Hz a neuron, bursts a minute, variation of intervals, ms, participation (10th-90th percentile)"
     )
-    columns = [*names.split(", "), "begun by ten channels"]
+    columns = [*names.split(", "), "begun by ten channels", "missed"]
     print(f"| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
     for seed in seeds:
         for row in over_hours(seed):
             spread = f"{row.participation:.2f} ({row.participation_p10:.2f}-{row.participation_p90:.2f})"
             bursts = f"{row.bursts_per_min:.1f} | {row.interval_cv:.2f} | {row.burst_ms:.0f} | {spread}"
+            missed = "; ".join(row.missed()) or "none"
             print(
-                f"| {seed} | {row.first_min} | {row.rate_hz:.2f} | {bursts} | {row.led_share:.2f} |",
+                f"| {seed} | {row.first_min} | {row.rate_hz:.2f} | {bursts} | {row.led_share:.2f} | {missed} |",
                 flush=True,
             )
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from animat.cultures.tissue import Tissue
-from animat.cultures.tissue.fatigue import MARK_S, Fatigue
+from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument, InvalidFile
 from cultures import small_culture
@@ -74,9 +74,8 @@ def test_the_slow_drift_is_the_recursion_that_is_said() -> None:
     for mark in range(500):
         if mark:
             drift = drift * kept + parameters.drift_share * np.sqrt(1 - kept**2) * draws.standard_normal()
-        tired = parameters.fatigue_share * (1 - np.exp(-mark * MARK_S / 60 / parameters.fatigue_min))
-        expected.append(1 - tired + drift)
-    fatigue = Fatigue(7, parameters)
+        expected.append(1 + drift)
+    slow = Drift(7, parameters)
     # In any order, as a tissue that is put back asks for earlier ones again.
     for mark in (0, 3, 2, 499, 250, 0):
-        assert fatigue.gain(mark) == pytest.approx(expected[mark], rel=1e-12)
+        assert slow.gain(mark) == pytest.approx(expected[mark], rel=1e-12)

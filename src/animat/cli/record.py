@@ -33,8 +33,8 @@ class Record:
     loop needs, frequencies mixed, 500 presentations of each, 2 recordings"""
     sessions: int | None = None
     """How many recordings; default: 2, with --paper 15"""
-    interval_min: float = 10.0
-    """Minutes from one recording to the next"""
+    interval_min: float | None = None
+    """Minutes from one recording to the next; default: 5, with --paper 10"""
     order: Literal["blocked", "mixed"] | None = None
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
@@ -100,7 +100,7 @@ class Record:
             )
         with alone_in(self.out):
             return write_made_up_series(
-                self.seed, self.out, sessions=self._sessions, interval_min=self.interval_min, progress=progress
+                self.seed, self.out, sessions=self._sessions, interval_min=self._interval_min, progress=progress
             )
 
     def _virtual(self, progress: Progress) -> list[Path]:
@@ -112,7 +112,7 @@ class Record:
             self._protocol(),
             self.out,
             sessions=self._sessions,
-            interval_min=self.interval_min,
+            interval_min=self._interval_min,
             progress=progress,
         )
 
@@ -125,7 +125,7 @@ class Record:
 
         assert self.culture != "made-up"
         # What can be refused is refused before a culture is opened, whose patterns are not known until then.
-        check_interval(self._protocol(), self._sessions, self.interval_min)
+        check_interval(self._protocol(), self._sessions, self._interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
         with (
             # Held before a device is opened, which stops whatever another run has it do.
@@ -134,7 +134,7 @@ class Record:
             culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
         ):
             protocol = self._protocol(len(culture.patterns))
-            settings = self._sessions, self.interval_min, self.seed
+            settings = self._sessions, self._interval_min, self.seed
             series = record_in_held_folder(culture, protocol, self.out, *settings, progress)
         for minute in series.missed_min:
             print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
@@ -146,6 +146,13 @@ class Record:
             return self.sessions
         # Made-up recordings are the paper's.
         return 15 if self.paper or self.culture == "made-up" else 2
+
+    @property
+    def _interval_min(self) -> float:
+        if self.interval_min is not None:
+            return self.interval_min
+        # A recording of a protocol in a file may be as long as the paper's interval.
+        return 10.0 if self.paper or self.protocol is not None or self.culture == "made-up" else 5.0
 
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""

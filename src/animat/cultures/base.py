@@ -126,7 +126,7 @@ class Culture(Openable):
 
     @final
     def rest(self, duration_s: float) -> None:
-        """Let time pass unobserved, in closed form where the culture knows how.
+        """Let time pass unobserved.
 
         Raises:
             InvalidArgument: for a culture that is not open, or a negative time.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt64
 
-from animat.cultures.tissue.kernel import axonal_draws
+from animat.cultures.tissue.kernel import AXONAL_KICK_MV, axonal_draws
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument
@@ -16,9 +16,6 @@ from animat.errors import InvalidArgument
 SMALLEST_KICK_MV = 0.5
 """Kicks below this are left out: they change no spike that noise does not."""
 REMEMBERED_PATTERNS = 10_000
-AXONAL_KICK_MV = 1000.0
-"""A spike that arrives along the axon brings the soma over any threshold."""
-
 
 LARGEST_STRENGTH = 2.0
 """Pulses up to twice the full one are modelled."""

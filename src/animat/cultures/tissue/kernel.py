@@ -20,6 +20,12 @@ f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
 FAINT = f4(1e-20)
 """Added at every decay, so that silence ends at about 1e-17 and never at subnormal numbers, which are slow."""
+AXONAL_KICK_MV = f4(1000.0)
+"""A spike that arrives along the axon brings the soma over any threshold."""
+NOISE_STEPS = 5
+"""How often a neuron's noise moves: 1 ms, well below its time constant."""
+SHARED_STEPS = 25
+"""How often the noise that a community shares moves: it is slow."""
 STRETCH = 128
 SUM_OF_FOUR_MEAN = f4(2 * 65535)
 SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
@@ -42,8 +48,10 @@ class Constants(NamedTuple):
     lose_gaba: np.float32
     lose_potassium: np.float32
     lose_adaptation: np.float32
-    keep_noise: np.float32
+    keep_noise: np.float32  # over `NOISE_STEPS`, as the next
     noise_scale_mv: np.float32
+    keep_shared: np.float32  # over `SHARED_STEPS`, as the next
+    shared_scale_mv: np.float32
     nmda_saturation: np.float32
     nmda_fill: np.float32  # share of what is missing to saturation that a unit of AMPA adds
     hyperpolarisation: np.float32
@@ -54,8 +62,12 @@ class Constants(NamedTuple):
     facilitation_s: Float64[np.ndarray, "from_type to_type"]
     availability_loss: float
     availability_s: float
-    release_loss: float
-    release_recovery_s: float
+    scaling_loss: float  # of all weights, by one spike of one neuron
+    scaling_rest: float
+    scaling_recovery_s: float
+    load_gain: float
+    load_s: float
+    conduction_s: float
     n_excitatory: int
 
 
@@ -66,6 +78,9 @@ class Wiring(NamedTuple):
     refractory_steps: Int32[np.ndarray, " neurons"]
     drive_mv: Float32[np.ndarray, " neurons"]
     noise_key: UInt64[np.ndarray, " neurons"]
+    axon_key: UInt64[np.ndarray, " neurons"]
+    community: Int32[np.ndarray, " neurons"]
+    shared_key: UInt64[np.ndarray, " communities"]
     needed: Float64[np.ndarray, " neurons"]
     start: Int64[np.ndarray, " neurons_and_one"]
     target: Int32[np.ndarray, " synapses"]
@@ -76,13 +91,16 @@ class Wiring(NamedTuple):
 class State(NamedTuple):
     """All that changes. Columns of `x` and `u` are towards excitatory and towards inhibitory neurons.
 
-    `drive` is the noisy drive in mV; `refractory` the steps left; `arriving_*` a ring of what is under way, one row a
-    step: for AMPA and GABA conductance, for NMDA the share of what is missing to saturation that will be filled; `x`,
-    `u`, `available` and `release` are as they were just after each neuron's last spike.
+    `drive` is the noisy drive, `shared` what its mean has from the community, in mV; `refractory` the steps left;
+    `arriving_*` a ring of what is under way, one row a step: for AMPA and GABA conductance, for NMDA the share of what
+    is missing to saturation that will be filled; `x`, `u` and `available` are as they were just after each neuron's
+    last spike, `scaling` just after the last spike of any excitatory neuron, `load` and `missing` (what conduction
+    lacks) after the last that a stimulus brought on the axon.
     """
 
     v_mv: Float32[np.ndarray, " neurons"]
     drive_mv: Float32[np.ndarray, " neurons"]
+    shared_mv: Float32[np.ndarray, " communities"]
     ampa: Float32[np.ndarray, " neurons"]
     nmda: Float32[np.ndarray, " neurons"]
     gaba: Float32[np.ndarray, " neurons"]
@@ -96,7 +114,11 @@ class State(NamedTuple):
     x: Float64[np.ndarray, "neurons 2"]
     u: Float64[np.ndarray, "neurons 2"]
     available: Float64[np.ndarray, " neurons"]
-    release: Float64[np.ndarray, " neurons"]
+    scaling: Float64[np.ndarray, " 1"]
+    last_scaled: Int64[np.ndarray, " 1"]
+    load: Float64[np.ndarray, " neurons"]
+    missing: Float64[np.ndarray, " neurons"]
+    last_driven: Int64[np.ndarray, " neurons"]
 
 
 class Arrivals(NamedTuple):
@@ -127,8 +149,8 @@ def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
 
 
 compiled = kept_njit(error_model="numpy", fastmath=False)
-# Without inlining, every call copies the description of every array of its arguments; and each helper would also be
-# compiled separately.
+# Without inlining, every call copies the description of every array of its arguments; and each would be compiled for
+# itself, too.
 inlined = numba.njit(error_model="numpy", inline="always")
 
 
@@ -139,6 +161,12 @@ def mixed(key: np.uint64, step: int) -> np.uint64:
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
+
+
+@inlined
+def uniform(bits: np.uint64) -> float:
+    """A number from 0 to before 1, of the upper 53 bits."""
+    return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @inlined
@@ -162,8 +190,12 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
     for i in range(v_mv.size):
         v = v_mv[i]
         y = min(max((v - middle_mv) * per_mv, -ONE), ONE)
-        unblocked = b4 + y * (b5 + y * (b6 + y * (b7 + y * (b8 + y * b9))))
-        unblocked = b0 + y * (b1 + y * (b2 + y * (b3 + y * unblocked)))
+        # Estrin's scheme: its products do not wait for each other as Horner's do.
+        y2 = y * y
+        y4 = y2 * y2
+        low = (b0 + b1 * y) + (b2 + b3 * y) * y2
+        high = (b4 + b5 * y) + (b6 + b7 * y) * y2
+        unblocked = low + y4 * (high + y4 * (b8 + b9 * y))
         total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
         current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
         z = total * step_over_membrane[i]
@@ -180,11 +212,27 @@ def move_noise(
     key: UInt64[np.ndarray, " neurons"],
     step: int,
 ) -> None:
-    """One step of the Ornstein-Uhlenbeck drive, its noise a function of the neuron and the step alone."""
+    """`NOISE_STEPS` of the Ornstein-Uhlenbeck drive, its noise a function of the neuron and the step alone."""
     keep, scale = constants.keep_noise, constants.noise_scale_mv
     for i in range(drive_mv.size):
         noise_mv = scale * sum_of_four(mixed(key[i], step))
         drive_mv[i] = mean_mv[i] + (drive_mv[i] - mean_mv[i]) * keep + noise_mv
+
+
+@inlined
+def move_shared(constants: Constants, wiring: Wiring, state: State, step: int) -> None:
+    """`SHARED_STEPS` of the slow Ornstein-Uhlenbeck noise that the neurons of a community share."""
+    shared_mv = state.shared_mv
+    for community in range(shared_mv.size):
+        noise_mv = constants.shared_scale_mv * sum_of_four(mixed(wiring.shared_key[community], step))
+        shared_mv[community] = shared_mv[community] * constants.keep_shared + noise_mv
+
+
+@inlined
+def fill_mean(wiring: Wiring, state: State, mean_mv: Float32[np.ndarray, " neurons"]) -> None:
+    """What each neuron's drive fluctuates about: its own, and what its community shares."""
+    for i in range(mean_mv.size):
+        mean_mv[i] = wiring.drive_mv[i] + state.shared_mv[wiring.community[i]]
 
 
 @inlined
@@ -241,6 +289,21 @@ def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: floa
 
 
 @inlined
+def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: int) -> bool:
+    """Whether neuron i's stimulated axon brings its spike to the soma: what is missing follows the load, slowly."""
+    since_s = (step - state.last_driven[i]) * constants.step_s
+    load_kept, missing_kept = math.exp(-since_s / constants.load_s), math.exp(-since_s / constants.conduction_s)
+    follows = constants.load_s / (constants.load_s - constants.conduction_s)
+    missing = state.missing[i] * missing_kept + follows * state.load[i] * (load_kept - missing_kept)
+    if uniform(mixed(wiring.axon_key[i], step)) < missing:
+        return False
+    state.last_driven[i], state.missing[i] = step, missing
+    load = state.load[i] * load_kept
+    state.load[i] = load + constants.load_gain * (1.0 - load)
+    return True
+
+
+@inlined
 def fire(
     constants: Constants, wiring: Wiring, state: State, arrivals: Arrivals, i: int, step: int, gain: float
 ) -> None:
@@ -250,9 +313,11 @@ def fire(
     state.last_spike[i] = step
     strength = 1.0
     if kind == 0:
-        release = recovered(state.release[i], 1.0, elapsed_s, constants.release_recovery_s)
-        strength = release * gain
-        state.release[i] = release * (1.0 - constants.release_loss)
+        since_s = (step - state.last_scaled[0]) * constants.step_s
+        state.last_scaled[0] = step
+        scaling = recovered(state.scaling[0], constants.scaling_rest, since_s, constants.scaling_recovery_s)
+        strength = scaling * gain
+        state.scaling[0] = scaling * (1.0 - constants.scaling_loss)
     available = recovered(state.available[i], 1.0, elapsed_s, constants.availability_s)
     state.available[i] = available * (1.0 - constants.availability_loss)
     to_e = f4(strength * release_of(constants, state, i, kind, 0, elapsed_s))
@@ -337,6 +402,8 @@ def advance(
     constants, wiring, state, arrivals = record[0], Wiring(*wires), State(*values), Arrivals(*arriving)
     n = state.v_mv.size
     last_row = state.arriving_ampa.shape[0] - 1
+    mean_mv = np.empty(n, np.float32)
+    fill_mean(wiring, state, mean_mv)
     kicks = 0
     spikes = 0
     for step in range(first_step, first_step + n_steps):
@@ -347,11 +414,16 @@ def advance(
             i = kick_neuron[kicks]
             elapsed_s = (step - state.last_spike[i]) * constants.step_s
             available = recovered(state.available[i], 1.0, elapsed_s, constants.availability_s)
-            if state.refractory[i] == 0 and available > wiring.needed[i]:
+            ready = state.refractory[i] == 0 and available > wiring.needed[i]
+            if ready and (kick_mv[kicks] < AXONAL_KICK_MV or conducts(constants, wiring, state, i, step)):
                 state.v_mv[i] += kick_mv[kicks]
             kicks += 1
         move_membrane(constants, state, wiring.step_over_membrane)
-        move_noise(constants, state.drive_mv, wiring.drive_mv, wiring.noise_key, step)
+        if step % SHARED_STEPS == 0:
+            move_shared(constants, wiring, state, step)
+            fill_mean(wiring, state, mean_mv)
+        if step % NOISE_STEPS == 0:
+            move_noise(constants, state.drive_mv, mean_mv, wiring.noise_key, step)
         decay(state.ampa, constants.lose_ampa)
         decay(state.nmda, constants.lose_nmda)
         decay(state.gaba, constants.lose_gaba)
@@ -380,5 +452,5 @@ def axonal_draws(
 ) -> None:
     """Draws of one pulse at `step`: a uniform and a nearly standard normal number for each axon's key."""
     for j in range(key.size):
-        draw[j] = (mixed(key[j], 2 * step) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+        draw[j] = uniform(mixed(key[j], 2 * step))
         jitter[j] = sum_of_four(mixed(key[j], 2 * step + 1)) / SUM_OF_FOUR_SD

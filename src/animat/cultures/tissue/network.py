@@ -17,6 +17,7 @@ class Network:
     Attributes:
         x_um, y_um: positions, shape (neurons,).
         is_excitatory: type of each neuron, shape (neurons,).
+        community: which patch of the plane each neuron belongs to, shape (neurons,).
         drive_mv: constant drive of each neuron, shape (neurons,).
         start: first synapse of each neuron, and the end of the last, shape (neurons + 1,).
         target: the neuron a synapse ends on, shape (synapses,).
@@ -27,6 +28,7 @@ class Network:
     x_um: Float64[np.ndarray, " neurons"]
     y_um: Float64[np.ndarray, " neurons"]
     is_excitatory: Bool[np.ndarray, " neurons"]
+    community: Int64[np.ndarray, " neurons"]
     drive_mv: Float32[np.ndarray, " neurons"]
     start: Int64[np.ndarray, " neurons_and_one"]
     target: Int32[np.ndarray, " synapses"]
@@ -41,8 +43,9 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
     """Grow a network: neurons uniform on the array, each with a fixed number of synapses from each type.
 
     The probability of a synapse from j to i falls with their distance d as
-    s_j ((1 - a) exp(-d / reach) / Z_i + a / n), where a is the long-range share, s_j the log-normal propensity of j to
-    send, Z_i the sum of the exponentials over the n neurons of j's type; the weight is log-normal about its mean.
+    s_j c_ij ((1 - a) exp(-d / reach) / Z_i + a / C_i), where a is the long-range share, s_j the log-normal propensity
+    of j to send, c_ij 1 within a community and `between_share` between two, and Z_i and C_i the sums of
+    c exp(-d / reach) and of c over the neurons of j's type; the weight is log-normal about its mean.
 
     Args:
         seed: decides every draw.
@@ -52,15 +55,20 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
     n, n_e = parameters.neurons, parameters.n_excitatory
     x_um, y_um = rng.uniform(0, parameters.width_um, n), rng.uniform(0, parameters.height_um, n)
     drive_mv = rng.normal(parameters.drive_mv, parameters.drive_spread_mv, n)
+    community, community_drive_mv = _communities(np.random.default_rng([seed, 9]), x_um, y_um, parameters)
+    drive_mv += community_drive_mv[community]
+    coupled = np.where(community[:, None] == community, 1.0, parameters.between_share)
     sends = rng.lognormal(0.0, parameters.out_degree_sigma, n)
     distance_um = np.hypot(x_um[:, None] - x_um[None, :], y_um[:, None] - y_um[None, :])
 
     sources, targets = [], []
     for first, last, degree in ((0, n_e, parameters.in_degree_e), (n_e, n, parameters.in_degree_i)):
-        near = np.exp(-distance_um[:, first:last] / parameters.reach_um)
+        anywhere = coupled[:, first:last]
+        near = anywhere * np.exp(-distance_um[:, first:last] / parameters.reach_um)
         near /= near.sum(axis=1, keepdims=True)
-        far_share = parameters.long_range_share
-        chance = sends[first:last] * ((1 - far_share) * near + far_share / (last - first))
+        far = anywhere / anywhere.sum(axis=1, keepdims=True)
+        share = parameters.long_range_share
+        chance = sends[first:last] * ((1 - share) * near + share * far)
         # The largest of log chance + Gumbel noise are a draw without replacement in proportion to the chances.
         score = np.log(chance) + rng.gumbel(size=chance.shape)
         own = np.arange(first, last)
@@ -83,9 +91,28 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
         x_um=x_um,
         y_um=y_um,
         is_excitatory=np.arange(n) < n_e,
+        community=community,
         drive_mv=drive_mv.astype(np.float32),
         start=np.searchsorted(source, np.arange(n + 1)).astype(np.int64),
         target=target.astype(np.int32),
         weight=weight.astype(np.float32),
         delay_steps=delay_steps,
     )
+
+
+def _communities(
+    rng: np.random.Generator,
+    x_um: Float64[np.ndarray, " neurons"],
+    y_um: Float64[np.ndarray, " neurons"],
+    parameters: TissueParameters,
+) -> tuple[Int64[np.ndarray, " neurons"], Float64[np.ndarray, " communities"]]:
+    """Each neuron's community, whose centre is the nearest, and what all neurons of a community are driven more, mV."""
+    communities = parameters.communities
+    size_um = np.array([parameters.width_um, parameters.height_um])
+    # Of many draws the one whose centres keep furthest apart: communities of similar size.
+    drawn = rng.uniform(0, size_um, (200, communities, 2))
+    apart_um = np.hypot(*np.moveaxis(drawn[:, :, None] - drawn[:, None], -1, 0))
+    apart_um[:, np.arange(communities), np.arange(communities)] = np.inf
+    centre_x_um, centre_y_um = drawn[np.argmax(apart_um.min(axis=(1, 2)))].T
+    community = np.argmin(np.hypot(x_um[:, None] - centre_x_um, y_um[:, None] - centre_y_um), axis=1)
+    return community, parameters.community_drive_mv * rng.standard_normal(communities)

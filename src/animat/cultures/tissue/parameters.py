@@ -7,7 +7,7 @@ from math import isfinite
 
 from animat.errors import InvalidArgument
 
-REVISION = 2
+REVISION = 3
 """Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
 before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
 another revision are then refused, in place of being gone on with as if they were of this tissue."""
@@ -66,13 +66,14 @@ class TissueParameters:
     refractory_e_ms: float = 3.0
     refractory_i_ms: float = 2.0
     """[L] Absolute refractory periods."""
-    hyperpolarisation: float = 0.0055
+    hyperpolarisation: float = 0.00175
     """[C] Added to the potassium conductance by each spike."""
-    hyperpolarisation_ms: float = 4000.0
-    """[L] Its time constant."""
-    adaptation_mv: float = 1.05
+    hyperpolarisation_ms: float = 25000.0
+    """[L] Its time constant: after a train the sodium pump hyperpolarises for about 20 s (Gulledge et al. 2013,
+    doi 10.1523/JNEUROSCI.0220-13.2013)."""
+    adaptation_mv: float = 0.7
     """[C] Added to the threshold by each spike."""
-    adaptation_ms: float = 100.0
+    adaptation_ms: float = 126.0
     """[C] Its time constant."""
 
     # Synapses.
@@ -80,18 +81,18 @@ class TissueParameters:
     nmda_ms: float = 110.0
     gaba_ms: float = 10.0
     """[L] Decay of the synaptic conductances."""
-    nmda_ratio: float = 0.81
+    nmda_ratio: float = 0.785
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
     nmda_saturation: float = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
-    e_to_e: ShortTerm = ShortTerm(0.12, 750.0, 220.0)
+    e_to_e: ShortTerm = ShortTerm(0.12, 1000.0, 220.0)
     e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
-    i_to_any: ShortTerm = ShortTerm(0.137, 750.0)
+    i_to_any: ShortTerm = ShortTerm(0.137, 665.0)
     """[C] within [L]: short-term plasticity."""
-    weight_ee: float = 0.62
-    weight_ei: float = 1.04
-    weight_ie: float = 0.40
-    weight_ii: float = 0.88
+    weight_ee: float = 0.5505
+    weight_ei: float = 0.9483
+    weight_ie: float = 0.3593
+    weight_ii: float = 0.7774
     """[C] Mean weights, from the first letter to the second."""
     weight_sigma: float = 0.5
     """[C] Sigma of the log-normal weights."""
@@ -104,19 +105,30 @@ class TissueParameters:
     """[C] Share of connections regardless of distance."""
     out_degree_sigma: float = 0.4
     """[C] Sigma of the log-normal spread of out-degrees."""
+    communities: int = 3
+    """[C] Number of communities, each the neurons nearest to one of as many centres."""
+    between_share: float = 0.055
+    """[C] A connection between communities is this share as likely as one within, at the same distance."""
     delay_ms: float = 0.8
     """Delay of a synapse without distance."""
     conduction_um_per_ms: float = 500.0
     """[L] Speed of axons."""
 
     # Drive.
-    drive_mv: float = 10.3
+    drive_mv: float = 9.47
     drive_spread_mv: float = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
+    community_drive_mv: float = 0.1
+    """[C] Standard deviation over communities of what all of a community's neurons have more: some lead."""
     noise_mv: float = 7.5
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
     """[C] Its time constant."""
+    shared_noise_mv: float = 0.562
+    """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
+    shared_noise_ms: float = 575.0
+    """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
+    doi 10.1016/j.neuron.2004.08.011)."""
 
     # Stimulation.
     kick_mv: float = 68.0
@@ -125,7 +137,7 @@ class TissueParameters:
     """[C] Sigma of its log-normal spread over neurons (median 1)."""
     kick_reach_um: float = 40.0
     """[C] The kick falls as 1 / (1 + (distance / reach)^2)."""
-    axons_per_electrode: float = 14.5
+    axons_per_electrode: float = 14.21
     """[C] Expected number of neurons that an electrode drives through their axons."""
     axon_reach_um: float = 500.0
     """[C] Their probability falls as exp(-distance / reach)."""
@@ -144,15 +156,19 @@ class TissueParameters:
     availability_needed_high: float = 0.55
     """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
 
-    # Fatigue.
-    release_loss: float = 2.5e-4
-    """[C] Share of an excitatory neuron's release lost with each spike."""
-    release_recovery_min: float = 60.0
-    """[C] Time constant of its recovery."""
-    fatigue_share: float = 0.35
-    """[C] Share of all excitatory weights that is lost in the long run."""
-    fatigue_min: float = 80.0
-    """[C] Time constant of that loss."""
+    # What changes over minutes and hours.
+    scaling_loss: float = 1.1e-4
+    """[C] Share of all excitatory weights lost with a spike of each excitatory neuron (homeostatic scaling)."""
+    scaling_min: float = 60.0
+    """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
+    scaling_at_hz: float = 0.52
+    """[C] The mean rate that scaling holds: loss and recovery then balance at the full weights."""
+    load_gain: float = 0.08
+    """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
+    load_min: float = 30.0
+    """[C] Time constant with which the load leaves."""
+    conduction_min: float = 90.0
+    """[C] Time constant with which the share of them that fail follows the load (Grubb & Burrone 2010: hours)."""
     drift_share: float = 0.03
     drift_min: float = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""
@@ -172,6 +188,12 @@ class TissueParameters:
                 raise InvalidArgument(f"{each.name}: expected a number above 0, got {value}")
             if each.name.endswith(("_share", "_loss", "_reliability")) and not 0 <= value <= 1:
                 raise InvalidArgument(f"{each.name}: expected a number from 0 to 1, got {value}")
+        if self.communities < 1:
+            raise InvalidArgument(f"communities: expected 1 or more, got {self.communities}")
+        if self.between_share == 0:
+            raise InvalidArgument("between_share: expected above 0, got 0: take a small one")
+        if self.load_min == self.conduction_min:
+            raise InvalidArgument(f"load_min, conduction_min: expected two that differ, got {self.load_min} twice")
         for degree, available in (
             (self.in_degree_e, self.n_excitatory),
             (self.in_degree_i, self.neurons - self.n_excitatory),

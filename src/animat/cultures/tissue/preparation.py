@@ -27,7 +27,7 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
         )
         return np.array([[getattr(kind, of) for kind in row] for row in kinds])
 
-    noise_keep = np.exp(-step_ms / parameters.noise_ms)
+    noise_keep = np.exp(-kernel.NOISE_STEPS * step_ms / parameters.noise_ms)
     return kernel.Constants(
         block=block_polynomial(),
         block_middle_mv=f4(BLOCK_MIDDLE_MV),
@@ -44,6 +44,12 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
         lose_adaptation=lose(parameters.adaptation_ms),
         keep_noise=f4(noise_keep),
         noise_scale_mv=f4(parameters.noise_mv * np.sqrt(1 - noise_keep**2) / kernel.SUM_OF_FOUR_SD),
+        keep_shared=f4(np.exp(-kernel.SHARED_STEPS * step_ms / parameters.shared_noise_ms)),
+        shared_scale_mv=f4(
+            parameters.shared_noise_mv
+            * np.sqrt(-np.expm1(-2 * kernel.SHARED_STEPS * step_ms / parameters.shared_noise_ms))
+            / kernel.SUM_OF_FOUR_SD
+        ),
         nmda_saturation=f4(parameters.nmda_saturation),
         nmda_fill=f4(parameters.nmda_ratio / parameters.nmda_saturation),
         hyperpolarisation=f4(parameters.hyperpolarisation),
@@ -54,8 +60,12 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
         facilitation_s=table("facilitation_ms") / 1000,
         availability_loss=parameters.availability_loss,
         availability_s=parameters.availability_s,
-        release_loss=parameters.release_loss,
-        release_recovery_s=parameters.release_recovery_min * 60,
+        scaling_loss=parameters.scaling_loss / parameters.n_excitatory,
+        scaling_rest=1 + parameters.scaling_loss * parameters.scaling_at_hz * parameters.scaling_min * 60,
+        scaling_recovery_s=parameters.scaling_min * 60,
+        load_gain=parameters.load_gain,
+        load_s=parameters.load_min * 60,
+        conduction_s=parameters.conduction_min * 60,
         n_excitatory=parameters.n_excitatory,
     )
 
@@ -86,6 +96,9 @@ def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) ->
         refractory_steps=np.rint(refractory_ms / step_ms).astype(np.int32),
         drive_mv=network.drive_mv,
         noise_key=rng.integers(0, 2**64, len(network), dtype=np.uint64),
+        axon_key=np.random.default_rng([seed, 10]).integers(0, 2**64, len(network), dtype=np.uint64),
+        community=network.community.astype(np.int32),
+        shared_key=np.random.default_rng([seed, 11]).integers(0, 2**64, parameters.communities, dtype=np.uint64),
         needed=rng.uniform(parameters.availability_needed_low, parameters.availability_needed_high, len(network)),
         start=network.start,
         target=network.target,
@@ -112,6 +125,7 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
     return kernel.State(
         v_mv=rng.uniform(parameters.leak_mv, parameters.reset_mv, n).astype(np.float32),
         drive_mv=drive_mv.astype(np.float32),
+        shared_mv=zeros(parameters.communities),
         ampa=zeros(n),
         nmda=zeros(n),
         gaba=zeros(n),
@@ -125,5 +139,9 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
         x=np.ones((n, 2)),
         u=use,
         available=np.ones(n),
-        release=np.ones(n),
+        scaling=np.ones(1),
+        last_scaled=np.zeros(1, np.int64),
+        load=np.zeros(n),
+        missing=np.zeros(n),
+        last_driven=np.zeros(n, np.int64),
     )

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.cultures.tissue import kernel
 from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
-from animat.cultures.tissue.fatigue import MARK_S, Fatigue
+from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.network import grow
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.cultures.tissue.preparation import fresh_state, prepare_constants, prepare_wiring
@@ -19,6 +19,7 @@ from animat.cultures.tissue.snapshot import Snapshot, expect_sound
 from animat.errors import InvalidArgument, Mismatch
 
 NS = 1_000_000_000
+MINUTE_NS = 60 * NS
 
 
 class Spikes(NamedTuple):
@@ -58,7 +59,7 @@ class Tissue:
         self.parameters = parameters or TissueParameters()
         self._network = grow(seed, self.parameters)
         self._coupling = Coupling(seed, self.parameters, self._network)
-        self._fatigue = Fatigue(seed, self.parameters)
+        self._drift = Drift(seed, self.parameters)
         self._constants = kernel.packed(prepare_constants(self.parameters))
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
         self._have(fresh_state(seed, self.parameters, self._network, self._wiring))
@@ -118,7 +119,7 @@ class Tissue:
                 *self._run,
                 self._step,
                 min(last_step, mark_end) - self._step,
-                self._fatigue.gain(mark),
+                self._drift.gain(mark),
                 *self._kicks,
                 self._spike_step,
                 self._spike_neuron,
@@ -131,13 +132,7 @@ class Tissue:
         return parts[0] if len(parts) == 1 else Spikes(*map(np.concatenate, zip(NO_SPIKES, *parts, strict=True)))
 
     def rest(self, duration_s: float) -> None:
-        """Let time pass in closed form: without stepping, without a stimulus, and as if no neuron spiked.
-
-        Everything that decays or recovers exponentially (after-hyperpolarisation, adaptation, conductances, short-term
-        plasticity, availability, release) goes to where it is after that time, and the slow drift goes on as it would
-        have. The noisy drive is drawn anew from its distribution given where it was; the membrane settles at its drive,
-        or at the reset where the drive is above; what was under way arrives nowhere. Afterwards advance a second or so
-        before trusting the fast variables.
+        """Let time pass as `advance` does and forget the spikes: any length, in the memory of a minute.
 
         Args:
             duration_s: how long, zero or more.
@@ -145,34 +140,9 @@ class Tissue:
         Raises:
             InvalidArgument: for a negative duration.
         """
-        self._now_ns += _nanoseconds("duration_s", duration_s)
-        steps = self._now_ns // self._step_ns - self._step
-        if steps == 0:
-            return
-        parameters, state = self.parameters, self._state
-        rested_ms = float(steps) * parameters.step_ms
-        for values, time_constant_ms in (
-            (state.ampa, parameters.ampa_ms),
-            (state.nmda, parameters.nmda_ms),
-            (state.gaba, parameters.gaba_ms),
-            (state.potassium, parameters.hyperpolarisation_ms),
-            (state.adaptation_mv, parameters.adaptation_ms),
-        ):
-            values *= np.float32(np.exp(-rested_ms / time_constant_ms))
-        rng = np.random.default_rng([self.seed, 6, self._step])
-        kept = float(np.exp(-rested_ms / parameters.noise_ms))
-        spread_mv = parameters.noise_mv * np.sqrt(1 - kept**2)
-        mean_mv = self._wiring.drive_mv
-        state.drive_mv[:] = mean_mv + (state.drive_mv - mean_mv) * kept + spread_mv * rng.standard_normal(len(mean_mv))
-        state.v_mv[:] = np.minimum(np.float32(parameters.leak_mv) + state.drive_mv, np.float32(parameters.reset_mv))
-        # As 64 bits: a rest of five days is more steps than 32 hold.
-        state.refractory[:] = np.maximum(state.refractory.astype(np.int64) - steps, 0)
-        for ring in (state.arriving_ampa, state.arriving_nmda, state.arriving_gaba):
-            ring[:] = 0
-        self._have(state)
-        # x, u, availability and release are kept as of each neuron's last spike: moving the clock recovers them.
-        self._step += steps
-        self._kicks = NO_KICKS
+        end_ns = self._now_ns + _nanoseconds("duration_s", duration_s)
+        while self._now_ns < end_ns:
+            self.advance(min(end_ns - self._now_ns, MINUTE_NS) / NS)
 
     def snapshot(self) -> Snapshot:
         """A copy of the state, to come back to."""
