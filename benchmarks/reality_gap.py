@@ -8,8 +8,9 @@
 For each virtual culture and way - the commands without options, as in the README; the paper's blocks with one pulse,
 mixed with one, mixed with five, and mixed with one, recorded five times as long and simulated with its memory, through
 one threshold and through nine - the culture is
-recorded at 0 and 10 min (without options at 0 and 5), policies are trained on that, and run in closed loop on the same culture from where the last
-recording left it. Everything is kept under `--out`, one folder each; what is there already is not done again.
+recorded at 0 and 10 min (without options at 0 and 5), policies are trained on that, and run in closed loop on the same
+culture from where the last recording left it.
+Everything is kept under `--out`, one folder each; what is there already is not done again.
 
 With `--backends` each culture is opened once, recorded once as in `memory9`, and run: the virtual culture with so many
 channels, the CL1 through its SDK's simulator and the MaxOne through the tests' stand-in, both over the same tissue.

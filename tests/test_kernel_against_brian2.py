@@ -83,7 +83,7 @@ def test_the_same_spikes_at_the_same_steps(pulses: list[Pulse]) -> None:
     assert len(aside) <= 1
 
 
-@pytest.mark.parametrize("change", [{"nmda_ms": 110.1}, {"membrane_e_ms": 20.01}, {"hyperpolarisation": 0.00551}])
+@pytest.mark.parametrize("change", [{"nmda_ms": 110.1}, {"membrane_e_ms": 20.01}, {"hyperpolarisation": 0.00177}])
 def test_what_is_a_little_different_is_noticed(change: dict[str, float]) -> None:
     with pytest.raises(AssertionError):
         for seed in range(1, 6):

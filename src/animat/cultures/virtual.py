@@ -263,7 +263,7 @@ class VirtualCulture(Culture):
         self._tissue, self._visibility = tissue, visibility
 
     def _scan_array(self, tissue: Tissue, visibility: Visibility) -> ScannedActivity:
-        """Spontaneous activity of the whole array; a real one sees its blocks one after the other, and takes minutes."""
+        """Spontaneous activity of the whole array at once; a real one sees its blocks one after the other."""
         rng = np.random.default_rng([self.seed, 12])
         self._progress.update(0, 1, f"scanning the array for {self._scan_s:g} s")
         spikes_of = np.bincount(tissue.advance(self._scan_s).neuron, minlength=len(tissue.x_um))
