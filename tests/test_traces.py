@@ -15,7 +15,7 @@ from cultures import small_culture
 
 @pytest.fixture(scope="module")
 def quiet() -> Traces:
-    with small_culture() as culture:
+    with small_culture(scan_s=20.0) as culture:
         return record_traces(culture, 8.0, channels=range(0, 100, 4))
 
 
