@@ -29,7 +29,7 @@ def opened(backend: str, channels: int, seed: int) -> Iterator[Culture]:
         with CL1Culture(seed=seed) as cl1:
             yield cl1
         return
-    rule = SelectionRule(recording_sites=channels) if channels else None
+    rule = SelectionRule(recording_sites=channels, stimulation_sites=min(32, channels)) if channels else None
     with VirtualCulture(seed, rule=rule) as virtual:
         if backend == "virtual":
             yield virtual

@@ -8,13 +8,13 @@ few arrays, because that is what the compiler turns into vector code.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
 
 from animat.compilation import kept_njit
+from animat.cultures.tissue.arrays import Arrivals, Constants, State, Wiring
 
 f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
@@ -30,122 +30,6 @@ STRETCH = 128
 SUM_OF_FOUR_MEAN = f4(2 * 65535)
 SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 """Mean and standard deviation of the sum of four uniform 16-bit integers."""
-
-
-class Constants(NamedTuple):
-    """Numbers that hold for all neurons; factors are per time step, conductances in units of the leak."""
-
-    block: Float32[np.ndarray, " coefficients"]  # B(V) = b0 + b1 y + ... + b9 y^9
-    block_middle_mv: np.float32  # y = (V - middle) / half, between -1 and 1
-    block_per_mv: np.float32  # 1 / half
-    leak_mv: np.float32
-    threshold_mv: np.float32
-    reset_mv: np.float32
-    potassium_mv: np.float32
-    gaba_mv: np.float32
-    lose_ampa: np.float32
-    lose_nmda: np.float32
-    lose_gaba: np.float32
-    lose_potassium: np.float32
-    lose_adaptation: np.float32
-    keep_noise: np.float32  # over `NOISE_STEPS`, as the next
-    noise_scale_mv: np.float32
-    keep_shared: np.float32  # over `SHARED_STEPS`, as the next
-    shared_scale_mv: np.float32
-    nmda_saturation: np.float32
-    nmda_fill: np.float32  # share of what is missing to saturation that a unit of AMPA adds
-    hyperpolarisation: np.float32
-    adaptation_mv: np.float32
-    step_s: float
-    use: Float64[np.ndarray, "from_type to_type"]
-    recovery_s: Float64[np.ndarray, "from_type to_type"]
-    facilitation_s: Float64[np.ndarray, "from_type to_type"]
-    availability_loss: float
-    availability_s: float
-    scaling_loss: float  # of all weights, by one spike of one neuron
-    scaling_rest: float
-    scaling_recovery_s: float
-    load_gain: float
-    load_s: float
-    conduction_s: float
-    n_excitatory: int
-
-
-class Wiring(NamedTuple):
-    """What each neuron is, and its synapses; see `Network`."""
-
-    step_over_membrane: Float32[np.ndarray, " neurons"]
-    refractory_steps: Int32[np.ndarray, " neurons"]
-    drive_mv: Float32[np.ndarray, " neurons"]
-    noise_key: UInt64[np.ndarray, " neurons"]
-    axon_key: UInt64[np.ndarray, " neurons"]
-    community: Int32[np.ndarray, " neurons"]
-    shared_key: UInt64[np.ndarray, " communities"]
-    needed: Float64[np.ndarray, " neurons"]
-    start: Int64[np.ndarray, " neurons_and_one"]
-    target: Int32[np.ndarray, " synapses"]
-    weight: Float32[np.ndarray, " synapses"]
-    delay_steps: Int32[np.ndarray, " synapses"]
-
-
-class State(NamedTuple):
-    """All that changes. Columns of `x` and `u` are towards excitatory and towards inhibitory neurons.
-
-    `drive` is the noisy drive, `shared` what its mean has from the community, in mV; `refractory` the steps left;
-    `arriving_*` a ring of what is under way, one row a step: for AMPA and GABA conductance, for NMDA the share of what
-    is missing to saturation that will be filled; `x`, `u` and `available` are as they were just after each neuron's
-    last spike, `scaling` just after the last spike of any excitatory neuron, `load` and `missing` (what conduction
-    lacks) after the last that a stimulus brought on the axon.
-    """
-
-    v_mv: Float32[np.ndarray, " neurons"]
-    drive_mv: Float32[np.ndarray, " neurons"]
-    shared_mv: Float32[np.ndarray, " communities"]
-    ampa: Float32[np.ndarray, " neurons"]
-    nmda: Float32[np.ndarray, " neurons"]
-    gaba: Float32[np.ndarray, " neurons"]
-    potassium: Float32[np.ndarray, " neurons"]
-    adaptation_mv: Float32[np.ndarray, " neurons"]
-    refractory: Int32[np.ndarray, " neurons"]
-    arriving_ampa: Float32[np.ndarray, "ring neurons"]
-    arriving_nmda: Float32[np.ndarray, "ring neurons"]
-    arriving_gaba: Float32[np.ndarray, "ring neurons"]
-    last_spike: Int64[np.ndarray, " neurons"]
-    x: Float64[np.ndarray, "neurons 2"]
-    u: Float64[np.ndarray, "neurons 2"]
-    available: Float64[np.ndarray, " neurons"]
-    scaling: Float64[np.ndarray, " 1"]
-    last_scaled: Int64[np.ndarray, " 1"]
-    load: Float64[np.ndarray, " neurons"]
-    missing: Float64[np.ndarray, " neurons"]
-    last_driven: Int64[np.ndarray, " neurons"]
-
-
-class Arrivals(NamedTuple):
-    """Which places of the rings are not empty: a step looks at these alone, as most are.
-
-    The first axis is excitation (AMPA and NMDA arrive together) and inhibition; the targets of a row stand in its
-    first `filled`, each once.
-    """
-
-    filled: Int32[np.ndarray, "2 ring"]
-    target: Int32[np.ndarray, "2 ring neurons"]
-
-
-def arrivals_of(state: State) -> Arrivals:
-    """What a state's rings hold."""
-    is_arriving = np.stack([state.arriving_ampa, state.arriving_gaba]) != 0
-    targets_first = np.argsort(~is_arriving, axis=2, kind="stable")
-    return Arrivals(is_arriving.sum(2, dtype=np.int32), targets_first.astype(np.int32))
-
-
-def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
-    """The constants as one record with the same names: a call takes a tuple of 28 numbers apart one by one, 3 us."""
-    values = {name: np.asarray(value) for name, value in constants._asdict().items()}
-    record = np.zeros(1, np.dtype([(name, value.dtype, value.shape) for name, value in values.items()], align=True))
-    for name, value in values.items():
-        record[name] = value
-    return record
 
 
 compiled = kept_njit(error_model="numpy", fastmath=False)

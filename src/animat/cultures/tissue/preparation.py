@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from animat.cultures.tissue import kernel
+from animat.cultures.tissue.arrays import Constants, State, Wiring
 from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
 
@@ -13,7 +14,7 @@ BLOCK_MIDDLE_MV, BLOCK_HALF_MV, BLOCK_DEGREE = -60.0, 25.0, 9
 """Where a polynomial stands for the NMDA block, to 1e-7; outside, its value at the nearer end holds."""
 
 
-def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
+def prepare_constants(parameters: TissueParameters) -> Constants:
     """The parameters as the kernel takes them: per step, and in single precision."""
     f4, step_ms = np.float32, parameters.step_ms
 
@@ -28,7 +29,7 @@ def prepare_constants(parameters: TissueParameters) -> kernel.Constants:
         return np.array([[getattr(kind, of) for kind in row] for row in kinds])
 
     noise_keep = np.exp(-kernel.NOISE_STEPS * step_ms / parameters.noise_ms)
-    return kernel.Constants(
+    return Constants(
         block=block_polynomial(),
         block_middle_mv=f4(BLOCK_MIDDLE_MV),
         block_per_mv=f4(1 / BLOCK_HALF_MV),
@@ -85,13 +86,13 @@ def block_polynomial() -> Float32[np.ndarray, " coefficients"]:
     return coefficients.astype(np.float32)
 
 
-def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> kernel.Wiring:
+def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> Wiring:
     """The network as the kernel takes it, with each neuron's key of its noise and its need of availability."""
     rng = np.random.default_rng([seed, 7])
     is_e, step_ms = network.is_excitatory, parameters.step_ms
     membrane_ms = np.where(is_e, parameters.membrane_e_ms, parameters.membrane_i_ms)
     refractory_ms = np.where(is_e, parameters.refractory_e_ms, parameters.refractory_i_ms)
-    return kernel.Wiring(
+    return Wiring(
         step_over_membrane=(step_ms / membrane_ms).astype(np.float32),
         refractory_steps=np.rint(refractory_ms / step_ms).astype(np.int32),
         drive_mv=network.drive_mv,
@@ -107,7 +108,7 @@ def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) ->
     )
 
 
-def fresh_state(seed: int, parameters: TissueParameters, network: Network, wiring: kernel.Wiring) -> kernel.State:
+def fresh_state(seed: int, parameters: TissueParameters, network: Network, wiring: Wiring) -> State:
     """A rested tissue: recovered synapses, no conductances, drive and membrane drawn from a plausible spread."""
     rng = np.random.default_rng([seed, 8])
     n = len(network)
@@ -122,7 +123,7 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
     def zeros(*shape: int) -> np.ndarray:
         return np.zeros(shape, np.float32)
 
-    return kernel.State(
+    return State(
         v_mv=rng.uniform(parameters.leak_mv, parameters.reset_mv, n).astype(np.float32),
         drive_mv=drive_mv.astype(np.float32),
         shared_mv=zeros(parameters.communities),

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.cultures.tissue import kernel
+from animat.cultures.tissue.arrays import State, Wiring
 from animat.cultures.tissue.coupling import Kicks
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument, shown
@@ -35,10 +35,10 @@ class Snapshot:
     now_ns: int
     step: int
     kicks: Kicks
-    state: kernel.State
+    state: State
 
 
-def expect_sound(snapshot: Snapshot, like: kernel.State, wiring: kernel.Wiring, step_ns: int) -> None:
+def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) -> None:
     """Refuse a snapshot whose clock, shapes, indices or values are none of a tissue's.
 
     Args:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from animat.cultures.tissue import kernel
+from animat.cultures.tissue.arrays import State, arrivals_of, packed
 from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
 from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.network import grow
@@ -60,7 +61,7 @@ class Tissue:
         self._network = grow(seed, self.parameters)
         self._coupling = Coupling(seed, self.parameters, self._network)
         self._drift = Drift(seed, self.parameters)
-        self._constants = kernel.packed(prepare_constants(self.parameters))
+        self._constants = packed(prepare_constants(self.parameters))
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
         self._have(fresh_state(seed, self.parameters, self._network, self._wiring))
         self._step_ns = round(self.parameters.step_ms * 1e6)
@@ -146,7 +147,7 @@ class Tissue:
 
     def snapshot(self) -> Snapshot:
         """A copy of the state, to come back to."""
-        state = kernel.State(*(values.copy() for values in self._state))
+        state = State(*(values.copy() for values in self._state))
         return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks, state)
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -162,12 +163,12 @@ class Tissue:
                 "other parameters: make a tissue with those"
             )
         expect_sound(snapshot, self._state, self._wiring, self._step_ns)
-        self._have(kernel.State(*(values.copy() for values in snapshot.state)))
+        self._have(State(*(values.copy() for values in snapshot.state)))
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
 
-    def _have(self, state: kernel.State) -> None:
+    def _have(self, state: State) -> None:
         self._state = state
-        self._run = self._constants, tuple(self._wiring), tuple(state), tuple(kernel.arrivals_of(state))
+        self._run = self._constants, tuple(self._wiring), tuple(state), tuple(arrivals_of(state))
 
     def _kicks_of(self, pulse: Pulse, end_ns: int) -> Kicks:
         pulse_ns = round(pulse.time_s * NS) if isfinite(pulse.time_s) else -1
