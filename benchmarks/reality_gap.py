@@ -177,7 +177,10 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
                 pulse=pulse,
                 patterns=protocol.patterns,
             )
-        table.write_text(json.dumps(gap.to_dict()) + "\n")
+        lived = gap.to_dict()
+        if lived["session"]["ended_by"] != "plan":
+            raise SystemExit(f"{folder}: {lived['session']['ended']}")
+        table.write_text(json.dumps(lived) + "\n")
     return told(seed, way, "follow", json.loads(table.read_text()))
 
 
