@@ -1,4 +1,4 @@
-"""How fast the virtual culture's tissue runs against real time, with Brian2 on the same equations in the same run.
+"""How fast the virtual culture's tissue runs against real time, with Brian2 in the same run.
 
     python benchmarks/culture.py [--seconds 20] [--repeats 3] [--pairs 60]
 

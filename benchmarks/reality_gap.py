@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -116,8 +117,10 @@ def main() -> None:
             (backend, n) for backend in options.backends for n in (options.channels if backend == "virtual" else [0])
         ]
         for seed, (backend, channels), robot in itertools.product(options.seeds, asked, options.robots):
-            lines.append(f"| {backend} {channels or ''} {live_once(backend, channels, seed, robot, options)}")
-            print(lines[-1], flush=True)
+            line = live_once(backend, channels, seed, robot, options)
+            if line is not None:
+                lines.append(f"| {backend} {channels or ''} {line}")
+                print(lines[-1], flush=True)
         print(f"\n| backend | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
         print("\n".join(lines))
         return
@@ -142,8 +145,11 @@ def main() -> None:
     print("\n".join(lines))
 
 
-def live_once(backend: str, channels: int, seed: int, robot: str, options: argparse.Namespace) -> str:
-    """A line of the table: a culture that is opened once is recorded, and driven by policies trained on that."""
+def live_once(backend: str, channels: int, seed: int, robot: str, options: argparse.Namespace) -> str | None:
+    """A line of the table: a culture that is opened once is recorded, and driven by policies trained on that.
+
+    None for a session that did not end by its plan.
+    """
     from animat.cultures.kinds import pulse_for
     from animat.reality_gap import Calibration, run_policies
     from animat.recordings.formats.nwb import write_nwb
@@ -179,7 +185,8 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
             )
         lived = gap.to_dict()
         if lived["session"]["ended_by"] != "plan":
-            raise SystemExit(f"{folder}: {lived['session']['ended']}")
+            print(f"{folder}: no row: {lived['session']['ended']}", file=sys.stderr)
+            return None
         table.write_text(json.dumps(lived) + "\n")
     return told(seed, way, "follow", json.loads(table.read_text()))
 

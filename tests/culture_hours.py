@@ -77,14 +77,15 @@ def window(time_s: np.ndarray, neuron: np.ndarray, first_min: int, seen: np.ndar
     """The figures of the ten minutes from `first_min`, of the spikes within them."""
     from_s, to_s = 60.0 * first_min, 60.0 * (first_min + WINDOW_MIN)
     start_s, end_s, share, leader = bursts_of(time_s, neuron, from_s, to_s, seen)
+    rate_hz = len(neuron) / (to_s - from_s) / seen.shape[1]
     if len(start_s) < 3:
         nan = float("nan")
-        return Spontaneous(first_min, len(neuron) / 600 / seen.shape[1], len(start_s) / 10, *6 * [nan])
+        return Spontaneous(first_min, rate_hz, len(start_s) / WINDOW_MIN, *6 * [nan])
     between_s = np.diff(start_s)
     leads = np.sort(np.unique(leader[leader >= 0], return_counts=True)[1])[::-1]
     return Spontaneous(
         first_min,
-        len(neuron) / (to_s - from_s) / seen.shape[1],
+        rate_hz,
         len(start_s) / WINDOW_MIN,
         float(between_s.std() / between_s.mean()),
         float(1000 * np.mean(end_s - start_s)),
@@ -94,17 +95,12 @@ def window(time_s: np.ndarray, neuron: np.ndarray, first_min: int, seen: np.ndar
     )
 
 
-def over_hours(seed: int, first_min: tuple[int, ...] = FIRST_MIN, rest: bool = False) -> list[Spontaneous]:
-    """The figures of a tissue that nothing stimulates; with `rest`, what lies between the windows is rested."""
-    rig = Rig(seed, spontaneous_s=120.0)
-    seen = rig.seen
+def over_hours(seed: int) -> list[Spontaneous]:
+    """The figures of a tissue that nothing stimulates; what lies between the windows is rested."""
+    seen = Rig(seed).seen
     tissue, rows = Tissue(seed), []
-    for minute in first_min:
-        between_s = 60.0 * minute - tissue.now_s
-        if rest:
-            tissue.rest(between_s)
-        while not rest and tissue.now_s < 60.0 * minute:
-            tissue.advance(min(60.0, 60.0 * minute - tissue.now_s))
+    for minute in FIRST_MIN:
+        tissue.rest(60.0 * minute - tissue.now_s)
         spikes = [tissue.advance(60.0) for _ in range(WINDOW_MIN)]
         rows.append(window(*(np.concatenate(column) for column in zip(*spikes, strict=True)), minute, seen))
     return rows

@@ -6,6 +6,7 @@ import itertools
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -356,3 +357,22 @@ def test_a_replay_answers_with_what_was_measured() -> None:
         pytest.raises(InvalidArgument, match=r"expected one that was recorded \(10, 40 Hz\), got 20"),
     ):
         replay.present([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)])
+
+
+def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypatch: pytest.MonkeyPatch) -> None:
+    with small_culture() as culture:
+        began_s, advance, minutes = culture.now_s, Tissue.advance, []
+
+        def stopped(self: Tissue, *of: Any) -> Spikes:
+            minutes.append(1)
+            if len(minutes) == 2:
+                raise KeyboardInterrupt
+            return advance(self, *of)
+
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(Tissue, "advance", stopped)
+            culture.rest(180.0)
+        assert culture.now_s - began_s == pytest.approx(60.0)
+        seen = culture.deliver([], 1.0)
+        assert len(seen.spikes.time_s) > 0
+        assert seen.spikes.time_s.min() >= 0

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.cli.record import Record
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
+from animat.cultures.series import check_interval
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
@@ -137,6 +139,28 @@ def test_pulses_faster_than_the_response_window_are_warned_of(
     (tmp_path / "mine.json").write_text('{"frequencies_hz": [80, 100, 125, 500]}')
     assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]) == 0
     assert "warning: at 125 Hz, 500 Hz the next pulse comes before the response window ends" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "interval_min"),
+    [
+        ({}, 5.0),
+        ({"seed": 2, "sessions": 3}, 5.0),
+        ({"interval_min": 7.0, "paper": True}, 7.0),
+        ({"paper": True}, 10.0),
+        ({"protocol": Path("mine.json")}, 10.0),
+        ({"presentations": 800}, 10.0),
+        ({"places": "halves"}, 10.0),
+        ({"culture": "made-up"}, 10.0),
+    ],
+)
+def test_recordings_are_as_far_apart_as_the_usual_ones_take(options: dict[str, Any], interval_min: float) -> None:
+    assert Record(**options)._interval_min == interval_min
+
+
+def test_halves_fit_into_the_usual_interval() -> None:
+    record = Record(places="halves")
+    check_interval(record._protocol(), 2, record._interval_min)
 
 
 def test_made_up_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

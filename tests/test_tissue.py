@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.cultures.tissue import Pulse, ShortTerm, Spikes, Tissue, TissueParameters
+from animat.cultures.tissue.arrays import Arrivals, State, Wiring
 from animat.cultures.tissue.coupling import Kicks
 from animat.cultures.tissue.drift import Drift
-from animat.cultures.tissue.kernel import AXONAL_KICK_MV
+from animat.cultures.tissue.kernel import AXONAL_KICK_MV, ORDER
 from animat.cultures.tissue.network import _communities, grow
 from animat.cultures.tissue.preparation import block_polynomial, nmda_block, prepare_wiring
 from animat.errors import InvalidArgument, Mismatch
@@ -326,6 +327,10 @@ def test_resting_is_advancing_without_being_watched() -> None:
     assert rested.now_s == watched.now_s == pytest.approx(126.3)
 
 
+def test_the_compiled_loop_is_made_again_where_the_order_of_its_arrays_changes() -> None:
+    assert tuple(" ".join(each._fields) for each in (Wiring, State, Arrivals)) == ORDER
+
+
 def test_a_clock_may_be_longer_than_32_bits_of_steps() -> None:
     tissue = Tissue(1, SILENT)
     tissue.advance(0.1)
@@ -551,6 +556,8 @@ def test_requests_that_cannot_be_met_are_refused_and_change_nothing() -> None:
     ("name", "value"),
     [
         ("neurons", 5),
+        ("scaling_at_hz", -0.1),
+        ("load_gain", 1.5),
         ("in_degree_i", 400),
         ("ampa_ms", 0.0),
         ("excitatory_share", 1.5),

@@ -1,6 +1,6 @@
 """The figures that the virtual culture must hold, over seeds 1 to 5: behaviour that must emerge from the model.
 
-The measuring is in `culture_figures.py`; about twenty minutes on one core, so it is marked.
+The measuring is in `culture_figures.py`; about half an hour on one core, so it is marked.
 """
 
 from __future__ import annotations
@@ -37,14 +37,16 @@ def test_every_figure_of_a_seed_is_within_its_bounds_but_those_said_to_be_missed
     assert missed(figures(seed)) == MISSED[seed]
 
 
-def test_spontaneous_activity_holds_its_bounds_over_three_hours() -> None:
-    assert [row.missed() for row in over_hours(1)] == [[]] * len(FIRST_MIN)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_spontaneous_activity_holds_its_bounds_over_three_hours(seed: int) -> None:
+    assert [row.missed() for row in over_hours(seed)] == [[]] * len(FIRST_MIN)
 
 
 def test_medians_rise_with_frequency_in_blocks_to_40_hz() -> None:
-    # At 80 Hz they miss: a block of it is over soon after the burst that it begins with.
+    # From 40 to 80 Hz they miss the bound, shown in docs/virtual-culture.md: to be mended, and noticed when it is.
     means_hz = np.mean([figures(seed).medians_hz for seed in SEEDS], axis=0)
     assert np.all(np.diff(means_hz[:4]) > 0), means_hz
+    assert means_hz[4] < means_hz[3]
 
 
 def test_medians_rise_with_frequency_when_frequencies_are_mixed() -> None:

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol
 
 
+_PRESENTED = ("order", "pulses", "presentations", "places")
+
+
 @dataclass(frozen=True)
 class Record:
     """Record a culture: one NWB file a recording. Goes on where it stopped."""
@@ -34,7 +37,7 @@ class Record:
     sessions: int | None = None
     """How many recordings; default: 2, with --paper 15"""
     interval_min: float | None = None
-    """Minutes from one recording to the next; default: 5, with --paper 10"""
+    """Minutes from one recording to the next; default: 5; 10 for all that is presented otherwise"""
     order: Literal["blocked", "mixed"] | None = None
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
@@ -68,8 +71,7 @@ class Record:
         # Before any device is powered.
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        given = ("order", "pulses", "presentations", "places")
-        asked = [f"--{name}" for name in given if getattr(self, name) is not None]
+        asked = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
@@ -151,8 +153,9 @@ class Record:
     def _interval_min(self) -> float:
         if self.interval_min is not None:
             return self.interval_min
-        # A recording of a protocol in a file may be as long as the paper's interval.
-        return 10.0 if self.paper or self.protocol is not None or self.culture == "made-up" else 5.0
+        # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
+        usual = not self.paper and self.culture != "made-up" and self.protocol is None
+        return 5.0 if usual and all(getattr(self, name) is None for name in _PRESENTED) else 10.0
 
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""

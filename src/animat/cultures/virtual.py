@@ -52,8 +52,8 @@ class VirtualCulture(Culture):
         parameters: of the tissue.
         selection: electrodes to use; None: scan and choose, which takes some seconds.
         rule: by which they are chosen.
-        scan_s: how long the array is scanned, all blocks of 1,024 electrodes at once; 20 s (the paper) find 1,024
-            electrodes on most seeds, 5 s about 930, as neurons that are silent meanwhile stay unseen.
+        scan_s: how long the array is scanned, all blocks of 1,024 electrodes at once; in less, more neurons stay
+            unseen, as they are silent meanwhile.
         limits: tighter limits than `SIMULATED_LIMITS`.
         progress: told about the scan.
 
@@ -80,7 +80,7 @@ class VirtualCulture(Culture):
         if seed < 0:
             raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
         if not 0 < scan_s <= 3600:
-            raise InvalidArgument(f"scan_s: expected above 0 to 3600 s a block, got {scan_s}")
+            raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")
         self.seed = seed
         self._parameters = None if parameters is None else _with_floats(parameters)
         self._rule, self._scan_s = None if rule is None else _with_floats(rule), float(scan_s)
@@ -327,9 +327,13 @@ class VirtualCulture(Culture):
         return Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]])
 
     def _rest(self, duration_s: float) -> None:
-        self._now_ns += round(duration_s * NS)
-        target_ns = -(-self._now_ns // self._step_ns) * self._step_ns
-        self.tissue.rest(max(0, target_ns - round(self.tissue.now_s * NS)) / NS)
+        now_ns = self._now_ns + round(duration_s * NS)
+        target_ns = -(-now_ns // self._step_ns) * self._step_ns
+        try:
+            self.tissue.rest(max(0, target_ns - round(self.tissue.now_s * NS)) / NS)
+        finally:
+            # A rest takes long to compute: broken off (Ctrl-C), it was as long as the tissue has rested.
+            self._now_ns = min(now_ns, round(self.tissue.now_s * NS))
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
 

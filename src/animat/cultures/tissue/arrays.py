@@ -1,7 +1,4 @@
-"""What the stepping loop works on: constants, wiring, state, and what is under way, as plain arrays.
-
-Numba keeps the compiled loop by the date of `kernel.py` alone: where the order of two arrays changes here, save it too.
-"""
+"""What the stepping loop works on: constants, wiring, state, and what is under way, as plain arrays."""
 
 from __future__ import annotations
 
@@ -119,7 +116,7 @@ def arrivals_of(state: State) -> Arrivals:
 
 
 def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
-    """The constants as one record with the same names: a call takes a tuple of 28 numbers apart one by one, 3 us."""
+    """The constants as one record with the same names: a call takes a tuple of 34 values apart one by one, 3 us."""
     values = {name: np.asarray(value) for name, value in constants._asdict().items()}
     record = np.zeros(1, np.dtype([(name, value.dtype, value.shape) for name, value in values.items()], align=True))
     for name, value in values.items():

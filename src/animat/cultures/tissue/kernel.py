@@ -16,6 +16,16 @@ from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
 from animat.compilation import kept_njit
 from animat.cultures.tissue.arrays import Arrivals, Constants, State, Wiring
 
+ORDER = (
+    "step_over_membrane refractory_steps drive_mv noise_key axon_key community shared_key needed "
+    "start target weight delay_steps",
+    "v_mv drive_mv shared_mv ampa nmda gaba potassium adaptation_mv refractory arriving_ampa arriving_nmda "
+    "arriving_gaba last_spike x u available scaling last_scaled load missing last_driven",
+    "filled target",
+)
+"""Of the arrays of `Wiring`, `State` and `Arrivals`. Numba keeps the compiled loop by the date of this file alone: what
+is changed there must be changed here too (a test holds them together)."""
+
 f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
 FAINT = f4(1e-20)

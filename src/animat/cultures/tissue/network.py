@@ -106,7 +106,7 @@ def _communities(
     y_um: Float64[np.ndarray, " neurons"],
     parameters: TissueParameters,
 ) -> tuple[Int64[np.ndarray, " neurons"], Float64[np.ndarray, " communities"]]:
-    """Each neuron's community, whose centre is the nearest, and what all neurons of a community are driven more, mV."""
+    """Each neuron's community, of the nearest centre, and the drive in mV that each community has in addition."""
     communities = parameters.communities
     size_um = np.array([parameters.width_um, parameters.height_um])
     # Of many draws the one whose centres keep furthest apart: communities of similar size.

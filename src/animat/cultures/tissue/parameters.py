@@ -119,7 +119,7 @@ class TissueParameters:
     drive_spread_mv: float = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
     community_drive_mv: float = 0.1
-    """[C] Standard deviation over communities of what all of a community's neurons have more: some lead."""
+    """[C] Standard deviation over communities of the drive that a community's neurons have in addition: some lead."""
     noise_mv: float = 7.5
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
@@ -162,13 +162,13 @@ class TissueParameters:
     scaling_min: float = 60.0
     """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
     scaling_at_hz: float = 0.52
-    """[C] The mean rate that scaling holds: loss and recovery then balance at the full weights."""
+    """[C] The excitatory neurons' mean rate that scaling holds: loss and recovery then balance at the full weights."""
     load_gain: float = 0.08
     """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
     load_min: float = 30.0
     """[C] Time constant with which the load leaves."""
     conduction_min: float = 90.0
-    """[C] Time constant with which the share of them that fail follows the load (Grubb & Burrone 2010: hours)."""
+    """[C] Time constant with which the share of such spikes that fail follows it (Grubb & Burrone 2010: hours)."""
     drift_share: float = 0.03
     drift_min: float = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""
@@ -186,7 +186,9 @@ class TissueParameters:
                 raise InvalidArgument(f"{each.name}: expected a finite number, got {value}")
             if each.name.endswith(("_ms", "_um", "_s", "_min")) and value <= 0 and each.name not in _MAY_BE_ZERO:
                 raise InvalidArgument(f"{each.name}: expected a number above 0, got {value}")
-            if each.name.endswith(("_share", "_loss", "_reliability")) and not 0 <= value <= 1:
+            if each.name.endswith("_hz") and value < 0:
+                raise InvalidArgument(f"{each.name}: expected 0 or more, got {value}")
+            if each.name.endswith(("_share", "_loss", "_reliability", "_gain")) and not 0 <= value <= 1:
                 raise InvalidArgument(f"{each.name}: expected a number from 0 to 1, got {value}")
         if self.communities < 1:
             raise InvalidArgument(f"communities: expected 1 or more, got {self.communities}")
@@ -203,6 +205,11 @@ class TissueParameters:
                     f"in_degree_e, in_degree_i: expected fewer synapses than the {available} neurons of that type, "
                     f"got {degree}: lower it or raise neurons"
                 )
+
+    @property
+    def scaling_rest(self) -> float:
+        """What the scaling recovers to: there, recovery balances the loss at `scaling_at_hz` and full weights."""
+        return 1 + self.scaling_loss * self.scaling_at_hz * self.scaling_min * 60
 
     @property
     def n_excitatory(self) -> int:

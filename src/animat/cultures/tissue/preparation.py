@@ -62,7 +62,7 @@ def prepare_constants(parameters: TissueParameters) -> Constants:
         availability_loss=parameters.availability_loss,
         availability_s=parameters.availability_s,
         scaling_loss=parameters.scaling_loss / parameters.n_excitatory,
-        scaling_rest=1 + parameters.scaling_loss * parameters.scaling_at_hz * parameters.scaling_min * 60,
+        scaling_rest=parameters.scaling_rest,
         scaling_recovery_s=parameters.scaling_min * 60,
         load_gain=parameters.load_gain,
         load_s=parameters.load_min * 60,
