@@ -233,8 +233,8 @@ def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixt
     ]
     assert main([*command, "--recordings", str(tmp_path / "made-up"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert [Path(file).name for file in told["recordings"]] == ["recording_0000_min.nwb", "recording_0005_min.nwb"]
-    assert read_recording(told["recordings"][1]).start_min == pytest.approx(5.0)
+    assert [Path(file).name for file in told["recordings"]] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
+    assert read_recording(told["recordings"][1]).start_min == pytest.approx(10.0)
     for wrong in (command, ["record", "--selection", "x.json"], ["record", "--culture", "maxone"]):
         assert main(wrong) != 0
         error = capsys.readouterr().err.strip()
