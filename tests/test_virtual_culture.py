@@ -42,11 +42,10 @@ def test_spontaneous_activity_holds_its_bounds_over_three_hours(seed: int) -> No
     assert [row.missed() for row in over_hours(seed)] == [[]] * len(FIRST_MIN)
 
 
-def test_medians_rise_with_frequency_in_blocks_to_40_hz() -> None:
-    # From 40 to 80 Hz they miss the bound, shown in docs/virtual-culture.md: to be mended, and noticed when it is.
+@pytest.mark.xfail(strict=True, reason="seed means fall from 40 to 80 Hz: docs/virtual-culture.md")
+def test_medians_rise_with_frequency_in_blocks() -> None:
     means_hz = np.mean([figures(seed).medians_hz for seed in SEEDS], axis=0)
-    assert np.all(np.diff(means_hz[:4]) > 0), means_hz
-    assert means_hz[4] < means_hz[3]
+    assert np.all(np.diff(means_hz) > 0), means_hz
 
 
 def test_medians_rise_with_frequency_when_frequencies_are_mixed() -> None:
