@@ -2,18 +2,20 @@
 
 A network burst: the spikes of all neurons, in bins of 25 ms, pass four times their mean over ten minutes; stretches
 less than 100 ms apart are one; at least 20 % of the active channels (above 0.02 Hz) take part. Written in plain NumPy,
-apart from animat's own burst detection. Run it to print the table of the docs: `python tests/culture_hours.py 1 2 3`.
+apart from animat's own burst detection. Run it to print the table of the docs: `python tests/culture_hours.py 1 2 3`;
+with `--under protocol` or `--under loop` the tissue is stimulated between the windows.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from animat.cultures.tissue import Tissue
-from culture_figures import Rig
+from culture_figures import FREQUENCIES_HZ, PATTERNS, Rig
 
 BIN_S, TIMES_MEAN, JOIN_S = 0.025, 4.0, 0.1
 ACTIVE_HZ, LEAST_PARTICIPATION = 0.02, 0.2
@@ -106,7 +108,39 @@ def over_hours(seed: int) -> list[Spontaneous]:
     return rows
 
 
-def main(seeds: list[int]) -> None:
+def under_protocol(seed: int) -> list[Spontaneous]:
+    """The same with the paper's protocol, a recording every ten minutes for 140; each window follows a recording."""
+    rig, rows = Rig(seed), []
+    for minute in range(0, 141, 10):
+        rig.tissue.rest(max(0.0, 60.0 * minute - rig.tissue.now_s))
+        rig.blocked()
+        if minute in (10, 60, 140):
+            rows.append(_after(rig))
+    return rows
+
+
+def under_loop(seed: int, loop_min: float = 40.0) -> list[Spontaneous]:
+    """The same after a loop of 40 min: episodes of 70 presentations, conditions and patterns at random, 2 s between."""
+    rig = Rig(seed)
+    tissue, until_s = rig.tissue, rig.tissue.now_s + 60.0 * loop_min
+    while tissue.now_s < until_s:
+        tissue.rest(2.0)
+        times_s = tissue.now_s + np.cumsum(1 / rig.rng.choice(FREQUENCIES_HZ, 70))
+        pulses = [rig.pulse(float(time_s), int(rig.rng.integers(PATTERNS))) for time_s in times_s]
+        tissue.advance(times_s[-1] - tissue.now_s + 0.05, pulses)
+    return [_after(rig)]
+
+
+def _after(rig: Rig) -> Spontaneous:
+    """The ten minutes that begin now."""
+    from_s = rig.tissue.now_s
+    spikes = [rig.tissue.advance(60.0) for _ in range(WINDOW_MIN)]
+    time_s, neuron = (np.concatenate(column) for column in zip(*spikes, strict=True))
+    found = window(time_s - from_s, neuron, 0, rig.seen)
+    return found._replace(first_min=round(from_s / 60.0))
+
+
+def main(seeds: list[int], measure: Callable[[int], list[Spontaneous]]) -> None:
     """Print the table of the docs."""
     names = (
         "seed, from min, Hz a neuron, bursts a minute, variation of intervals, ms, participation (10th-90th percentile)"
@@ -115,7 +149,7 @@ def main(seeds: list[int]) -> None:
     print(f"| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
     for seed in seeds:
-        for row in over_hours(seed):
+        for row in measure(seed):
             spread = f"{row.participation:.2f} ({row.participation_p10:.2f}-{row.participation_p90:.2f})"
             bursts = f"{row.bursts_per_min:.1f} | {row.interval_cv:.2f} | {row.burst_ms:.0f} | {spread}"
             missed = "; ".join(row.missed()) or "none"
@@ -126,4 +160,8 @@ def main(seeds: list[int]) -> None:
 
 
 if __name__ == "__main__":
-    main([int(seed) for seed in sys.argv[1:]] or [1, 2, 3, 4, 5])
+    asked = argparse.ArgumentParser()
+    asked.add_argument("seeds", nargs="*", type=int, default=[1, 2, 3, 4, 5])
+    asked.add_argument("--under", choices=["nothing", "protocol", "loop"], default="nothing")
+    given = asked.parse_args()
+    main(given.seeds, {"nothing": over_hours, "protocol": under_protocol, "loop": under_loop}[given.under])
