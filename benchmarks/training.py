@@ -154,9 +154,9 @@ def algorithm() -> Any:
 
 def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
     """(environment, settings, simulator, compiled-to-be chunk, learners-to-be), as a worker makes them."""
-    from animat.animat import Animat
     from animat.coding.mapping import mapping_named
     from animat.compilation import keep_compilations
+    from animat.environment import Animat
     from animat.neurons.made_up import made_up_simulator
     from animat.robots.cartpole import Cartpole
     from animat.training.group import programs
@@ -316,8 +316,8 @@ def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
     It is all of `train`: starting processes, importing, loading compiled programs, training, checkpoints, saving. The
     next length must reach the return too.
     """
-    from animat.animat import Animat
     from animat.coding.mapping import mapping_named
+    from animat.environment import Animat
     from animat.evaluation.rollouts import networks_of, roll_out
     from animat.execution.training import train
     from animat.robots.cartpole import Cartpole

@@ -19,7 +19,8 @@ from jaxtyping import install_import_hook
 install_import_hook(
     [
         "animat.neurons.simulator",
-        "animat.animat",
+        "animat.environment",
+        "animat.wrappers",
         "animat.training.sac",
         "animat.evaluation.rollouts",
     ],

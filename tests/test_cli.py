@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.animat import Animat
 from animat.cli import COMMANDS, main
 from animat.cli.responses import say_findings
 from animat.cli.train import Train
 from animat.coding.mapping import Thresholds
+from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import with_intervals

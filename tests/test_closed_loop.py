@@ -396,6 +396,7 @@ class RecordedAs:
     """What a loop takes from a policy."""
 
     robot, mapping, readouts, conditions = SHORT, Thresholds(1), ALL, CONDITIONS
+    neural_observation = False
 
     def __init__(self, presentation: Presentation | None, window_ms: tuple[float, float] | None = (2.0, 10.0)) -> None:
         self.presentation, self.window_ms = presentation, window_ms

@@ -70,6 +70,8 @@ def test_the_examples_in_python_run(
     assert capsys.readouterr().out.startswith(
         "cartpole, 9-thresholds, recording at 50 min: 2 policies, 100 episodes each"
     )
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "training.md").read_text(), flags=re.DOTALL)
+    wrapped, example = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "training.md").read_text(), flags=re.DOTALL)
+    exec(compile(wrapped, "training.md", "exec"), {})
+    assert capsys.readouterr().out == "1 1.0 False\n"
     exec(compile(example, "training.md", "exec"), {})
     assert capsys.readouterr().out.strip() in ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.animat import Animat, WithoutNeurons
 from animat.coding.mapping import Linear, Thresholds
+from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import Optimum, best_return
@@ -103,11 +103,11 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
         while True:
             key, use = jax.random.split(key)
             action = policy.act(np.asarray(environment.observe(state)), rng)
-            outcome = step(use, state, jnp.int32(action), simulator)
-            state, total = outcome.state, total + float(outcome.reward)
-            presented[int(outcome.delivered)] += 1
-            passed[int(outcome.delivered)] += float(outcome.rate_hz) >= float(simulator.percentiles[5])
-            if outcome.terminated or outcome.truncated:
+            state = step(use, state, jnp.int32(action), simulator)
+            total += float(state.reward)
+            presented[int(state.info["delivered"])] += 1
+            passed[int(state.info["delivered"])] += float(state.info["rate_hz"]) >= float(simulator.percentiles[5])
+            if state.ended.terminated or state.ended.truncated:
                 break
         returns.append(total)
     error = np.hypot(many.std() / np.sqrt(len(many)), np.std(returns, ddof=1) / np.sqrt(len(returns)))

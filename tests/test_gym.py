@@ -17,8 +17,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import animat
-from animat.animat import Animat
 from animat.coding.mapping import Linear, mapping_named
+from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.gym import IDS, register_environments
 from animat.neurons.made_up import LABELS, made_up_simulator
@@ -26,6 +26,7 @@ from animat.neurons.simulator import silenced
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.robots import Cartpole, robot_named
+from animat.wrappers import EpisodeLimit
 
 assert animat.__doc__  # importing animat registers the environments
 
@@ -82,20 +83,19 @@ def test_an_episode_is_a_rollout_of_the_animat(id_: str, mapping: str) -> None:
     rng.bit_generator.state = env.unwrapped.np_random.bit_generator.state
 
     body, simulator = robot_named(IDS[id_]), made_up_simulator()
-    direct = Animat(body, mapping_named(mapping), 5)
+    direct = EpisodeLimit(Animat(body, mapping_named(mapping), 5))
     state, advance = direct.reset(jax.random.key(0)), jax.jit(direct.advance)
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(action)
         uniforms = jnp.asarray(rng.random(direct.noise_size, np.float32))
-        outcome = advance(uniforms, state, jnp.int32(action), simulator)
-        state = outcome.state
+        state = advance(uniforms, state, jnp.int32(action), simulator)
         np.testing.assert_allclose(observation, direct.observe(state), rtol=1e-5, atol=1e-6)
-        assert reward == pytest.approx(float(outcome.reward), rel=1e-5)
-        assert (terminated, truncated) == (bool(outcome.terminated), bool(outcome.truncated))
+        assert reward == pytest.approx(float(state.reward), rel=1e-5)
+        assert (terminated, truncated) == (bool(state.ended.terminated), bool(state.ended.truncated))
         assert info == {
             "delivered": action,
-            "rate_hz": pytest.approx(float(outcome.rate_hz), rel=1e-5),
-            "command": pytest.approx(float(outcome.command), abs=1e-5),
+            "rate_hz": pytest.approx(float(state.info["rate_hz"]), rel=1e-5),
+            "command": pytest.approx(float(state.info["command"]), abs=1e-5),
         }
         if terminated or truncated:
             break
@@ -159,7 +159,7 @@ def test_an_episode_that_ends_by_itself_at_the_limit_is_terminated_only() -> Non
 
 def test_robot_parameters_and_mappings_are_options() -> None:
     env = gymnasium.make("Animat/Cartpole-v0", pole_mass_kg=0.55, force_noise=0.0, mapping=Linear()).unwrapped
-    assert env.setup.animat == Animat(Cartpole(pole_mass_kg=0.55, force_noise=0.0), Linear(), 5)
+    assert env.setup.environment == EpisodeLimit(Animat(Cartpole(pole_mass_kg=0.55, force_noise=0.0), Linear(), 5))
     assert env.setup.condition_labels == LABELS
     with pytest.warns(UserWarning, match="the goal cannot be reached: 20 iterations"):
         gymnasium.make("Animat/Navigation-v0", episode_limit=20)

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import animat.gym  # noqa: F401
-from animat.animat import Animat, WithoutNeurons
 from animat.cli.train import _memories
 from animat.coding.mapping import Linear, Thresholds
+from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.hand_made import hand_made
@@ -46,6 +46,7 @@ from animat.studies.paper import paper_study
 from animat.studies.simulating import load_timeline, save_timeline
 from animat.studies.specification import Simulators
 from animat.training.specification import Training
+from animat.wrappers import ShuffledDelivery
 from test_optimum import STEPS, Stairs, coins
 from test_responses import recording
 from test_simulator import responses_of
@@ -333,16 +334,16 @@ def test_an_animat_remembers() -> None:
     simulator = fit_memory(stubborn)
     animat = Animat(Cartpole(), Thresholds(1), 2)
     state = animat.reset(jax.random.key(0))
-    assert float(state.past) == 0.5
+    assert float(state.neurons) == 0.5
     for past, answer in ((0.8, 90.0), (0.2, 10.0)):
-        outcome = animat.step(jax.random.key(1), state._replace(past=jnp.float32(past)), jnp.int32(0), simulator)
-        assert float(outcome.rate_hz) == answer
+        came = animat.step(jax.random.key(1), state._replace(neurons=jnp.float32(past)), jnp.int32(0), simulator)
+        assert float(came.info["rate_hz"]) == answer
         after = float(simulator.answer(jnp.int32(0), jnp.float32(0.5), jnp.float32(past)).past)
-        assert float(outcome.state.past) == after
+        assert float(came.neurons) == after
         assert after not in (past, 0.5)
     # Without neurons nothing changes it.
     alone = WithoutNeurons(Cartpole(), (-1.0, 1.0))
-    assert float(alone.step(jax.random.key(1), state, jnp.int32(0), None).state.past) == 0.5
+    assert float(alone.step(jax.random.key(1), state, jnp.int32(0), None).neurons) == 0.5
 
 
 def persistent(n: int = 10) -> MemorySimulator:
@@ -502,7 +503,7 @@ def test_an_environment_without_neurons_has_its_limit_whatever_simulator_is_besi
 
 def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
     simulator = fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9)))
-    environment = Animat(Stairs(), Thresholds(1), 2, "shuffled")
+    environment = ShuffledDelivery(Animat(Stairs(), Thresholds(1), 2))
     limit = best_return(environment, simulator, grid=STEPS, episodes=0)
     played = [
         roll_out(environment, simulator, actor, 1, episodes=4000, seed=1).returns

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.animat import Animat, WithoutNeurons
 from animat.coding.mapping import Linear, Thresholds
+from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import commands_of
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
@@ -25,6 +25,7 @@ from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
 from animat.robots.grid import Axis, Grid, grid_for
 from animat.robots.navigation import Navigation, NavigationState
+from animat.wrappers import ShuffledDelivery
 
 SIMULATOR = made_up_simulator()
 
@@ -170,7 +171,7 @@ def test_cartpole_tried_to_the_end() -> None:
 )
 def test_where_nothing_can_be_chosen_the_limit_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
     """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
-    environment = Animat(robot, Thresholds(1), 5, delivery="shuffled")
+    environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
     found = best_return(environment, SIMULATOR, resolution=resolution, episodes=2)
     returns = roll_out(environment, SIMULATOR, Uniform(), 1, episodes=8000, seed=5).returns
     error = float(returns.std() / math.sqrt(returns.size))

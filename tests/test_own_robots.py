@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.animat import Animat
 from animat.closed_loop.contenders import HandMadeRule
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
+from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.evaluation.hand_made import HandMade
 from animat.execution.training import train

@@ -22,7 +22,6 @@ from safetensors import safe_open
 from safetensors.numpy import load, save
 from scipy import stats
 
-from animat.animat import Delivery
 from animat.cli.responses import fit_as
 from animat.closed_loop.loop import Loop
 from animat.coding.mapping import mapping_named
@@ -37,6 +36,7 @@ from animat.training.policy import Policy, load_policies
 from animat.training.provenance import Simulated, Trained
 from animat.training.sac import Layer, forward
 from animat.training.specification import Percentiles
+from animat.wrappers import Delivery
 
 CONDITIONS = tuple(Condition(f"{f} Hz", float(f), "Hz") for f in (5, 10, 20, 40, 80))
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from animat.animat import Animat
 from animat.cli import main
 from animat.coding.mapping import Thresholds
+from animat.environment import Animat
 from animat.errors import UnusableData
 from animat.evaluation.optimum import Optimum, best_return, rough_values
 from animat.evaluation.prospects import prospects

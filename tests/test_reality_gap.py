@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from animat.animat import Animat
 from animat.cli import main
 from animat.closed_loop.contenders import HandMadeRule
 from animat.closed_loop.following import Following
@@ -26,6 +25,7 @@ from animat.cultures.budget import Account, Budget
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
+from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import best_return
@@ -50,6 +50,7 @@ from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.selection import Selection
 from animat.training.policy import Policy
+from animat.wrappers import ShuffledDelivery
 from fake_culture import FakeCulture
 
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
@@ -139,7 +140,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(tmp_path: Path, 
     # Under the controls of the policies all of them act in turn, and no choice of theirs is delivered.
     for name, in_, on in (
         ("silent", environment, silenced(calibration.simulator)),
-        ("shuffled", replace(environment, delivery="shuffled"), calibration.simulator),
+        ("shuffled", ShuffledDelivery(environment), calibration.simulator),
     ):
         returns = roll_out(in_, on, both, 2, episodes=ROLL_OUTS * EPISODES, seed=1).returns.ravel()
         error = np.hypot(*(each.std() / np.sqrt(each.size) for each in (returns, rows[name].predicted)))

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from animat.animat import Animat, Environment, WithoutNeurons
 from animat.coding.mapping import mapping_named
+from animat.environment import Animat, Environment, WithoutNeurons
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.cartpole import Cartpole
@@ -33,6 +33,7 @@ from animat.training.sac import (
     train_chunk,
 )
 from animat.training.settings import SAC
+from animat.wrappers import EpisodeLimit
 from sac_toys import Follower, FollowerOfTwo, Payer
 
 SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)
@@ -51,6 +52,7 @@ def trained_for(
     simulator: NeuronSimulator | None = None,
     learner: Learner | None = None,
 ) -> tuple[Learner, Finished]:
+    environment = EpisodeLimit(environment)
     learner = start(environment, settings, jax.random.key(seed)) if learner is None else learner
     trained: tuple[Learner, Finished] = chunk(
         environment, settings, learner, simulator, jnp.int32(0), jnp.int32(rounds)
@@ -117,7 +119,7 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
     after, _ = trained_for(environment, settings, 1, learner=before)
-    n = environment.n_observations + 1
+    n = len(environment.quantities) + 1
     rows = jnp.tile(after.replay[:1], (4, 1))
     action = rows[:, 2 * n] if commands is not None else rows[:, 2 * n : 2 * n + 1]
     batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, 2 * n + 1], rows[:, 2 * n + 2])
@@ -223,12 +225,12 @@ def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
     environment = Animat(Navigation(), mapping_named("1-threshold"), simulator.n_conditions)
     settings = SAC(replay=16_384)
     keys = jax.random.split(jax.random.key(1), 8)
-    learners = jax.jit(jax.vmap(partial(begin, environment, settings)))(keys)
-    run = jax.jit(jax.vmap(partial(train_chunk, environment, settings), in_axes=(0, None, None, None)))
+    learners = jax.jit(jax.vmap(partial(begin, EpisodeLimit(environment), settings)))(keys)
+    run = jax.jit(jax.vmap(partial(train_chunk, EpisodeLimit(environment), settings), in_axes=(0, None, None, None)))
     learners, _ = run(learners, simulator, jnp.int32(0), jnp.int32(400))
 
     def alive(actor: Network, replay: jax.Array) -> jax.Array:
-        hidden = replay[:8_000, : environment.n_observations]
+        hidden = replay[:8_000, : len(environment.quantities)]
         for layer in actor[:-1]:
             hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
         return jnp.mean(jnp.any(hidden > 0, axis=0))
@@ -247,8 +249,11 @@ def animat() -> tuple[Environment[Any], NeuronSimulator]:
 def test_policies_side_by_side_are_what_they_are_alone() -> None:
     environment, simulator = animat()
     keys = jax.random.split(jax.random.key(5), 3)
-    together = jax.jit(jax.vmap(partial(train_chunk, environment, SMALL), in_axes=(0, None, None, None)))(
-        jax.jit(jax.vmap(partial(begin, environment, SMALL)))(keys), simulator, jnp.int32(0), jnp.int32(30)
+    together = jax.jit(jax.vmap(partial(train_chunk, EpisodeLimit(environment), SMALL), in_axes=(0, None, None, None)))(
+        jax.jit(jax.vmap(partial(begin, EpisodeLimit(environment), SMALL)))(keys),
+        simulator,
+        jnp.int32(0),
+        jnp.int32(30),
     )
     for i, key in enumerate(keys):
         learner = start(environment, SMALL, key)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from animat.animat import Animat
 from animat.coding.decoder import Decoder, decoded
 from animat.coding.mapping import Linear, Mapping, Thresholds
+from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import mean_commands
 from animat.neurons.fidelity import fidelity

@@ -25,11 +25,11 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from animat.animat import Animat
 from animat.cli import main
 from animat.coding.mapping import mapping_named
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
+from animat.environment import Animat
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.hand_made import hand_made
 from animat.execution.jobs import in_order

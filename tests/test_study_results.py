@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.animat import Animat
 from animat.cli import main
 from animat.coding.mapping import Thresholds
+from animat.environment import Animat
 from animat.errors import InvalidFile
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
@@ -38,6 +38,7 @@ from animat.studies.specification import Body, Compared, Study, StudyCondition, 
 from animat.studies.tabulating import References, Tabulate, _known
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
+from animat.wrappers import ShuffledDelivery
 
 # --- which side is better -------------------------------------------------------------------------------------------
 
@@ -176,14 +177,15 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     timeline = fit_timeline(extract_series(read_recordings(tmp_path / "recordings")))
     policies = load_policies(tmp_path / "policies" / "navigation" / "control")
     networks = networks_of(list(policies.values()), greedy=False)
-    environment = Animat(Navigation(episode_limit=60), Thresholds(1), 5, delivery)
+    chosen = Animat(Navigation(episode_limit=60), Thresholds(1), 5)
+    shuffled = ShuffledDelivery(chosen)
+    environment, turned = (shuffled, chosen) if delivery == "shuffled" else (chosen, shuffled)
     expected = {}
     for at_min in (0.0, 140.0):
         seed = draw_seed(study.seed, "navigation", "control", at_min)
         for name, answering in (("own", at_min), ("other", 140.0 - at_min)):
             ran = roll_out(environment, timeline.at(answering), networks, 2, episodes=7, seed=seed)
             expected[name, at_min] = ran.returns
-        turned = replace(environment, delivery="chosen" if delivery == "shuffled" else "shuffled")
         expected["turned", at_min] = roll_out(turned, timeline.at(at_min), networks, 2, episodes=7, seed=seed).returns
         returns = got[got["at_min"] == at_min]["return"].to_numpy().reshape(2, 7)
         np.testing.assert_allclose(returns, expected["own", at_min], rtol=1e-6)

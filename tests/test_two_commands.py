@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.animat import WithoutNeurons
 from animat.cli import main
 from animat.closed_loop.contenders import Contender, HandMadeRule, OneCondition, random_control
 from animat.closed_loop.following import Following
@@ -27,6 +26,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
+from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.evaluation.hand_made import Heuristic
 from animat.evaluation.table import evaluate

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 from animat.gym import register_environments
 
 if TYPE_CHECKING:
-    from animat.animat import Animat as Animat
-    from animat.animat import WithoutNeurons as WithoutNeurons
     from animat.closed_loop.loop import Loop as Loop
     from animat.coding.decoder import Decoder as Decoder
     from animat.coding.encoder import Encoder as Encoder
@@ -25,6 +23,8 @@ if TYPE_CHECKING:
     from animat.cultures.replay import ReplayCulture as ReplayCulture
     from animat.cultures.safety import Limits as Limits
     from animat.cultures.virtual import VirtualCulture as VirtualCulture
+    from animat.environment import Animat as Animat
+    from animat.environment import WithoutNeurons as WithoutNeurons
     from animat.errors import AnimatError as AnimatError
     from animat.errors import BudgetSpent as BudgetSpent
     from animat.errors import DeviceFailed as DeviceFailed
@@ -83,6 +83,9 @@ if TYPE_CHECKING:
     from animat.training.policy import load_policies as load_policies
     from animat.training.settings import SAC as SAC
     from animat.training.specification import Training as Training
+    from animat.wrappers import EpisodeLimit as EpisodeLimit
+    from animat.wrappers import NeuralObservation as NeuralObservation
+    from animat.wrappers import ShuffledDelivery as ShuffledDelivery
 
 _WHERE = {
     "recordings.recording": ("Recording", "Channels"),
@@ -110,7 +113,8 @@ _WHERE = {
     "coding.decoder": ("Decoder",),
     "coding.mapping": ("Mapping", "Thresholds", "Linear", "register_mapping", "mapping_named"),
     "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
-    "animat": ("Animat", "WithoutNeurons"),
+    "environment": ("Animat", "WithoutNeurons"),
+    "wrappers": ("EpisodeLimit", "ShuffledDelivery", "NeuralObservation"),
     "training.settings": ("SAC",),
     "training.specification": ("Training",),
     "execution.training": ("train",),

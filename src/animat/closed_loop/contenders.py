@@ -13,7 +13,7 @@ from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 
 LoopDelivery = Literal["chosen", "shuffled", "silent"]
-"""What the culture is given; a training (`animat.animat.Delivery`) has no silence."""
+"""What the culture is given; a training (`animat.wrappers.Delivery`) has no silence."""
 
 
 class Controller(Protocol):

@@ -58,6 +58,10 @@ class Trained(Protocol):
     def presentation(self) -> Presentation | None:
         """How stimuli were presented when its neurons were recorded."""
 
+    @property
+    def neural_observation(self) -> bool:
+        """Whether it sees the neurons too, which a loop does not show."""
+
 
 @dataclass(frozen=True, eq=False)
 class Loop:
@@ -181,10 +185,15 @@ class Loop:
             settings: the other attributes.
 
         Raises:
-            UnusableData: for a policy without neurons.
+            UnusableData: for a policy without neurons, or with a neural observation.
         """
         if policy.mapping is None:
             raise UnusableData("policy: expected one that acts through neurons, got one that was trained without")
+        if policy.neural_observation:
+            raise UnusableData(
+                "policy: expected one that sees the robot alone, got one with a neural observation, which no closed "
+                "loop makes; evaluate it on a simulator, or train with neural_observation=False"
+            )
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses

@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from animat.animat import Animat, Environment
 from animat.coding.decoder import decoded
 from animat.coding.mapping import Mapping, Thresholds
+from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import AT_FIRST, NeuronSimulator, Stored
+from animat.neurons.simulator import NeuronSimulator, Stored
+from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
 
 CONTINUOUS_ACTIONS = 21
 """How many evenly spaced commands stand for a continuous action."""
@@ -106,26 +107,27 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     Raises:
         InvalidArgument: for an Animat without a simulator.
     """
-    if not isinstance(environment, Animat):
+    animat = unwrapped(environment)
+    if not isinstance(animat, Animat):
         actions: np.ndarray
         if environment.n_actions is None:
             actions = np.linspace(-1.0, 1.0, CONTINUOUS_ACTIONS).astype(np.float32)
         else:
             actions = np.arange(environment.n_actions)
-        nothing_random = jnp.zeros(environment.noise_size - environment.robot.noise_size)
-        leads_to = [
-            float(environment.actuate(nothing_random, jnp.float32(AT_FIRST), jnp.asarray(a), simulator)[2])
-            for a in actions
-        ]
-        return Commands(actions, np.array(leads_to)[:, None], np.ones((len(actions), 1)))
+        start, nothing_random = environment.reset(jax.random.key(0)), jnp.zeros(environment.noise_size)
+        after = jax.vmap(environment.advance, (None, None, 0, None))(
+            nothing_random, start, jnp.asarray(actions), simulator
+        )
+        leads_to = np.asarray(after.info["command"], np.float64)
+        return Commands(actions, leads_to[:, None], np.ones((len(actions), 1)))
     if simulator is None:
         raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
-    if isinstance(environment.mapping, Thresholds):
-        levels, probabilities = _steps(environment.mapping, simulator)
+    if isinstance(animat.mapping, Thresholds):
+        levels, probabilities = _steps(animat.mapping, simulator)
     else:
-        levels, probabilities = _quantiles(environment.mapping, simulator)
-    n_actions = environment.n_conditions
-    if environment.delivery == "shuffled":
+        levels, probabilities = _quantiles(animat.mapping, simulator)
+    n_actions = animat.n_conditions
+    if _is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: every action leads to the mixture of all.
         levels = np.tile(levels.reshape(1, -1), (n_actions, 1))
         probabilities = np.tile(probabilities.reshape(1, -1) / n_actions, (n_actions, 1))
@@ -139,9 +141,10 @@ def mean_commands(
 
     Args and errors: as `commands_of`. Several commands are averaged over 2048 responses of equal probability.
     """
-    if isinstance(environment, Animat) and simulator is not None and environment.robot.n_commands > 1:
-        commands = decoded(environment.mapping, _responses(simulator), jnp.asarray(simulator.percentiles))
-        return np.arange(environment.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
+    animat = unwrapped(environment)
+    if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
+        commands = decoded(animat.mapping, _responses(simulator), jnp.asarray(simulator.percentiles))
+        return np.arange(animat.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
     of_one = commands_of(environment, simulator)
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
 
@@ -152,7 +155,7 @@ def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) 
     Raises:
         InvalidArgument: for a simulator of one's own that remembers: its pasts are not known.
     """
-    if not isinstance(environment, Animat) or simulator is None or not simulator.has_memory:
+    if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return 1
     if not isinstance(simulator, MemorySimulator):
         raise InvalidArgument(
@@ -182,12 +185,12 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
         come with it; over all of these they add up to 1. Where nothing is remembered, one class and the commands of
         `commands_of`.
     """
-    is_one = layers_of(environment, simulator) == 1
-    if is_one or not (isinstance(environment, Animat) and isinstance(simulator, MemorySimulator)):
+    is_one, animat = layers_of(environment, simulator) == 1, unwrapped(environment)
+    if is_one or not (isinstance(animat, Animat) and isinstance(simulator, MemorySimulator)):
         return [[commands_of(environment, simulator)]]
-    levels, pasts = _answers(environment, simulator, _pasts(simulator))
+    levels, pasts = _answers(animat, simulator, _pasts(simulator))
     levels, classes = np.asarray(levels), np.asarray(class_of(simulator, pasts))
-    if environment.delivery == "shuffled":
+    if _is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: one action stands for all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
     actions, even = np.arange(levels.shape[1]), np.full(levels.shape[1:], 1 / levels.shape[-1])
@@ -196,6 +199,12 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
         [commands.that(likely=then == of) for of in range(len(levels))]
         for commands, then in zip(after, classes, strict=True)
     ]
+
+
+def _is_shuffled(environment: Environment[Any]) -> bool:
+    if isinstance(environment, ShuffledDelivery):
+        return True
+    return isinstance(environment, Wrapper) and _is_shuffled(environment.inside)
 
 
 def _recorded(simulator: MemorySimulator) -> Float[Array, " responses"]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 
-from animat.animat import Animat, Environment
+from animat.environment import Animat, Environment
 from animat.evaluation.hand_made import Heuristic, hand_made
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, silenced
+from animat.wrappers import ShuffledDelivery, unwrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +65,8 @@ def controls_of(
             rule = hand_made(environment, simulator)
             meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
         controls.append(Control("made by hand", meaning, environment, simulator, rule))
-    if policies is not None and isinstance(environment, Animat) and simulator is not None:
-        silent, shuffled = silenced(simulator), replace(environment, delivery="shuffled")
+    if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
+        silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
         controls += [
             Control("silent", "the culture always answers 0", environment, silent, policies, n_policies),
             Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),

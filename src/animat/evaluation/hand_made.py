@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from animat.animat import Environment
+from animat.environment import Environment
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.rollouts import Actor, Seen, Uniforms
 from animat.neurons.simulator import NeuronSimulator
@@ -32,7 +32,7 @@ class HandMade(Actor):
     means: Float[Array, "..."]
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        wanted = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
+        wanted = _wanted(environment, observation)
         apart = self.means - wanted[:, None]
         distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
         return self.actions[jnp.argmin(distance, axis=1)]
@@ -45,8 +45,14 @@ class Heuristic(Actor):
     """The very commands of the robot's `heuristic`, where any can be given: without neurons, continuous ones."""
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(observation * environment.scales)
-        return commands
+        return _wanted(environment, observation)
+
+
+def _wanted(environment: Environment[Any], observation: Seen) -> Array:
+    """The commands of the robot's `heuristic`, which sees the robot alone."""
+    of_robot = (observation * environment.scales)[:, : len(environment.robot.quantities)]
+    commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
+    return commands
 
 
 def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) -> HandMade:

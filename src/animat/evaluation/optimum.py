@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
-from animat.animat import Environment
+from animat.environment import Environment
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, layers_of, nodes_for
 from animat.evaluation.landings import Motion
@@ -335,17 +335,16 @@ class _Programme:
                 landings.places[:, :, 0],
                 landings.rewards[:, :, 0],
                 self._grid.row_offsets,
-                self._layer(case, state.past),
+                self._layer(case, state.neurons),
                 pairs,
                 outcomes.weights,
                 remaining,
                 chosen,
             )
             action = actions[np.minimum(chosen, len(actions) - 1)]
-            outcome = step(key, state, action, simulator)
-            state = outcome.state
-            returns += np.where(going, np.asarray(outcome.reward, np.float64), 0.0)
-            going &= ~np.asarray(outcome.terminated)
+            state = step(key, state, action, simulator)
+            returns += np.where(going, np.asarray(state.reward, np.float64), 0.0)
+            going &= ~np.asarray(state.ended.terminated)
             if not going.any():
                 break
         return returns

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from animat.animat import Animat
 from animat.coding.mapping import Mapping, Thresholds
+from animat.environment import Animat
 from animat.evaluation.optimum import Optimum, best_returns
 from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Uniform, roll_out

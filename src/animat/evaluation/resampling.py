@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from animat.animat import Animat
+from animat.environment import Animat
 from animat.errors import UnusableData
 from animat.evaluation.optimum import Optimum, rough_values
 from animat.evaluation.statistics import CONFIDENCE, Interval
@@ -20,6 +20,7 @@ from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.responses.responses import Responses
 from animat.robots.grid import Grid, grid_for
+from animat.wrappers import ShuffledDelivery
 
 RESAMPLES = 39
 """The fewest whose smallest and largest are their 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
@@ -162,7 +163,7 @@ def with_intervals(
         low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
         low, high = min(low, -high, 0.0), max(high, 0.0)
         if not differ:
-            at_random = replace(environment, delivery="shuffled")
+            at_random = ShuffledDelivery(environment)
             low = min(low, float(rough_values([(at_random, simulators[0])], grid, seed)[0][0] - values[0]))
         error = optimum.grid_error
         ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
-from animat.animat import Environment
 from animat.brief import briefly
 from animat.coding.mapping import N_PERCENTILES
 from animat.compilation import FAST_TO_COMPILE
+from animat.environment import Environment
 from animat.errors import InvalidArgument, shown
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
@@ -192,7 +192,7 @@ def _roll_out(
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
         start, key = jax.random.split(key)
         carry = (
-            jax.vmap(environment.reset)(jax.random.split(start, episodes)),
+            jax.vmap(environment.reset)(jax.random.split(start, episodes)).carried,
             jnp.ones(episodes, bool),
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),
@@ -207,19 +207,19 @@ def _roll_out(
         uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales
         action = actor.act(environment, observation, uniforms[:, :n_drawn])
-        outcome = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
+        after = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
         # An ended episode is carried along, and counts no further.
-        returns = returns + jnp.where(going, outcome.reward, 0.0)
-        terminated = terminated | (going & outcome.terminated)
+        returns = returns + jnp.where(going, after.reward, 0.0)
+        terminated = terminated | (going & after.ended.terminated)
         lengths = lengths + going
         if simulator is not None:
-            delivered = going[:, None] & (outcome.delivered[:, None] == jnp.arange(n_conditions))
-            passes = outcome.rate_hz >= simulator.percentiles[..., N_PERCENTILES // 2]
+            delivered = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(n_conditions))
+            passes = after.info["rate_hz"] >= simulator.percentiles[..., N_PERCENTILES // 2]
             presented = presented + delivered.sum(axis=0)
             of_each = delivered.reshape(*delivered.shape, *(1 for _ in readouts))
             passed = passed + (of_each & passes[:, None]).sum(axis=0)
-        going = going & ~(outcome.terminated | outcome.truncated)
-        return outcome.state, going, returns, lengths, presented, passed, terminated
+        going = going & ~jnp.logical_or(*after.ended)
+        return after.carried, going, returns, lengths, presented, passed, terminated
 
     # The loop is outside of the `vmap`, and ends with the last episode: controls fail long before the limit.
     first, of_iteration = jax.vmap(begin)(keys)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.animat import Animat, Environment, WithoutNeurons
 from animat.brief import briefly
+from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of
@@ -29,6 +29,7 @@ from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, first_of_alike
+from animat.wrappers import NeuralObservation, ShuffledDelivery, unwrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,13 +244,16 @@ def evaluate(
         held_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = (timeline if held_from_min is None else timeline.with_first_percentiles()).at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))
+        if first.neural_observation:
+            environment = NeuralObservation(environment)
 
     networks = networks_of(list(policies.values()), greedy=greedy)
     n = len(policies)
     # A policy that was trained as a control is one here too: what it chooses decides nothing.
-    trained_in, meaning = environment, "as trained"
-    if isinstance(environment, Animat) and first.delivery == "shuffled":
-        trained_in, meaning = replace(environment, delivery="shuffled"), "as trained: what is delivered is drawn anew"
+    trained_in: Environment[Any] = environment
+    meaning = "as trained"
+    if simulator is not None and first.delivery == "shuffled":
+        trained_in, meaning = ShuffledDelivery(environment), "as trained: what is delivered is drawn anew"
     acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
     every = controls_of(environment, simulator, _action_labels(first), networks, n)
     acting += [control for control in every if controls is None or control.name in controls]
@@ -296,6 +300,7 @@ def _limit(
     seed: int,
 ) -> Optimum:
     """The best possible return; with its interval, without conditions of few responses, where responses are known."""
+    environment = unwrapped(environment)
     if not (isinstance(environment, Animat) and simulator is not None and timeline and minute is not None):
         return best_return(environment, simulator, resolution=resolution, seed=seed)
     if not timeline.responses:

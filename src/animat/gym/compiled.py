@@ -1,7 +1,7 @@
-"""The Animat as two compiled functions from arrays to arrays: what the environments step.
+"""An environment as two compiled functions from arrays to arrays: what Gymnasium's environments step.
 
 A call into compiled code costs by the number of arrays that go in and out, more than by what it computes. So an
-iteration takes and gives one row of float32 per environment, with the state packed inside.
+iteration takes and gives one row of float32 per environment, with the state and what is observed packed inside.
 """
 
 from __future__ import annotations
@@ -16,26 +16,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float32, Int64
 
-from animat.animat import Animat, Outcome
+from animat.environment import Environment, State
 from animat.gym.setup import Setup
 
 Rows = Float32[np.ndarray, "environments numbers"]
-
-
-class Step(NamedTuple):
-    """What one iteration gave, each of shape (environments, ...); rates in Hz, commands in [-1, 1].
-
-    Of several readouts rates and commands have an axis of them.
-    """
-
-    states: Rows
-    observations: Rows
-    rewards: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    delivered: np.ndarray
-    rate_hz: np.ndarray
-    command: np.ndarray
 
 
 class CompiledAnimat:
@@ -43,77 +27,64 @@ class CompiledAnimat:
 
     def __init__(self, setup: Setup) -> None:
         """Compilation waits for the first call, and is shared by all environments of the same Animat."""
-        self._animat, self._simulator = setup.animat, setup.simulator
-        self._noise_size = setup.animat.noise_size
+        self._environment, self._simulator = setup.environment, setup.simulator
 
     def __getstate__(self) -> dict[str, Any]:
         """Compiled functions stay behind when an environment is pickled; they are made again where it arrives."""
         return {name: value for name, value in vars(self).items() if name != "_functions"}
 
-    def start(self, n: int, rng: np.random.Generator) -> tuple[Rows, Rows]:
-        """(states, observations) at the start of `n` episodes."""
-        seeds = rng.integers(0, 2**32, n, dtype=np.uint32)
-        rows = np.asarray(self._functions.start(seeds))
-        return self._split(rows, self._size)
+    def start(self, n: int, rng: np.random.Generator) -> Rows:
+        """The start of `n` episodes."""
+        return np.asarray(self._functions.start(rng.integers(0, 2**32, n, dtype=np.uint32)))
 
-    def step(self, states: Rows, actions: Int64[np.ndarray, " environments"], rng: np.random.Generator) -> Step:
+    def step(self, rows: Rows, actions: Int64[np.ndarray, " environments"], rng: np.random.Generator) -> Rows:
         """One iteration of each."""
-        n = len(states)
-        given = np.empty((n, 1 + self._noise_size), np.float32)
+        n, noise_size = len(rows), self._environment.noise_size
+        given = np.empty((n, 1 + noise_size), np.float32)
         given[:, 0] = actions
-        given[:, 1:] = rng.random((n, self._noise_size), np.float32)
-        rows = np.asarray(self._functions.step(given, states, self._simulator))
-        states, rest = self._split(rows, self._size)
-        n_commands = self._animat.robot.n_commands
-        observations, outcome = self._split(rest, rest.shape[1] - 4 - 2 * n_commands)
-        reward, terminated, truncated, delivered, *answered = outcome.T
-        rate_hz, command = answered if n_commands == 1 else np.split(outcome[:, 4:], 2, axis=1)
-        return Step(
-            states,
-            observations,
-            reward,
-            terminated != 0,
-            truncated != 0,
-            delivered.astype(np.int64),
-            rate_hz,
-            command,
-        )
+        given[:, 1:] = rng.random((n, noise_size), np.float32)
+        return np.asarray(self._functions.step(given, rows, self._simulator))
 
-    @staticmethod
-    def _split(rows: Rows, at: int) -> tuple[Rows, Rows]:
-        # The second part is copied: what users keep of it must not hold on to, or change with, the rest.
-        return rows[:, :at], rows[:, at:].copy()
+    def read(self, rows: Rows) -> tuple[Any, Rows]:
+        """The `State` in them and what is observed, in copies of numpy, shape (environments, ...)."""
+        return self._functions.read(rows)
 
     @cached_property
     def _functions(self) -> _Functions:
-        return _compiled(self._animat)
-
-    @cached_property
-    def _size(self) -> int:
-        return self._functions.state_size
+        return _compiled(self._environment)
 
 
 class _Functions(NamedTuple):
-    state_size: int
     start: Callable[..., Array]
     step: Callable[..., Array]
+    read: Callable[[Rows], tuple[Any, Rows]]
 
 
 @lru_cache(maxsize=64)
-def _compiled(animat: Animat[Any]) -> _Functions:
-    template = animat.reset(jax.random.key(0))
-    flat, unpack = ravel_pytree(template)
+def _compiled(environment: Environment[Any]) -> _Functions:
+    def with_observation(state: State) -> tuple[State, Array]:
+        return state, environment.observe(state)
 
-    def pack(state: Any) -> Array:
-        return ravel_pytree(state)[0].astype(jnp.float32)
+    template = with_observation(environment.reset(jax.random.key(0)))
+    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, template))
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    _, unpack = ravel_pytree(template)
+
+    def pack(state: State) -> Array:
+        return ravel_pytree(with_observation(state))[0].astype(jnp.float32)
 
     def start(seed: Array) -> Array:
-        state = animat.reset(jax.random.key(seed))
-        return jnp.concatenate([pack(state), animat.observe(state)])
+        return pack(environment.reset(jax.random.key(seed)))
 
-    def step(given: Array, state: Array, simulator: Any) -> Array:
-        outcome: Outcome = animat.advance(given[1:], unpack(state), given[0].astype(jnp.int32), simulator)
-        numbers = [jnp.ravel(x).astype(jnp.float32) for x in outcome[1:]]
-        return jnp.concatenate([pack(outcome.state), animat.observe(outcome.state), *numbers])
+    def step(given: Array, row: Array, simulator: Any) -> Array:
+        return pack(environment.advance(given[1:], unpack(row)[0], given[0].astype(jnp.int32), simulator))
 
-    return _Functions(flat.size, jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))))
+    def read(rows: Rows) -> tuple[Any, Rows]:
+        parts = [
+            rows[:, end - leaf.size : end].reshape(-1, *leaf.shape).astype(leaf.dtype)
+            for end, leaf in zip(ends, leaves, strict=True)
+        ]
+        state, observations = jax.tree.unflatten(structure, parts)
+        return state, observations
+
+    return _Functions(jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read)

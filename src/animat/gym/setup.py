@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from animat.animat import Animat, Delivery
 from animat.coding.checking import check_mapping
 from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
+from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.neurons.kinds import Kind
 from animat.neurons.made_up import LABELS, made_up_simulator
@@ -28,6 +28,7 @@ from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS
 from animat.robots.registry import robot_named
+from animat.wrappers import Delivery, EpisodeLimit, ShuffledDelivery
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -37,26 +38,26 @@ class Setup:
     """What an environment runs on.
 
     Attributes:
-        animat: neurons, mapping and robot; static.
+        environment: neurons, mapping and robot, and what is around them; static.
         simulator: how the neurons answer; data.
         condition_labels: what the actions 0, 1, ... do, `("5 Hz", ...)`.
     """
 
-    animat: Animat[Any]
+    environment: EpisodeLimit[Any]
     simulator: NeuronSimulator
     condition_labels: tuple[str, ...]
 
     @property
     def observation_space(self) -> spaces.Box:
-        """The robot's quantities in its own units, within the bounds that no episode passes."""
-        quantities = self.animat.robot.quantities
+        """What is observed, in its own units, within the bounds that no episode passes."""
+        quantities = self.environment.quantities
         low, high = (np.array([getattr(q, end) for q in quantities], np.float32) for end in ("low", "high"))
         return spaces.Box(low, high, dtype=np.float32)
 
     @property
     def action_space(self) -> spaces.Discrete:
         """The conditions."""
-        return spaces.Discrete(self.animat.n_conditions)
+        return spaces.Discrete(len(self.condition_labels))
 
 
 def set_up(
@@ -119,7 +120,8 @@ def set_up(
     chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
     if not is_ours(chosen):
         check_mapping(chosen)
-    return Setup(Animat(body, chosen, simulator.n_conditions, delivery), simulator, labels)
+    animat = Animat(body, chosen, simulator.n_conditions)
+    return Setup(EpisodeLimit(ShuffledDelivery(animat) if delivery == "shuffled" else animat), simulator, labels)
 
 
 def _simulator_of(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from animat.errors import InvalidArgument
-from animat.gym.compiled import CompiledAnimat, Step
+from animat.gym.compiled import CompiledAnimat
 from animat.gym.setup import set_up
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
@@ -38,7 +38,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
 
     def __init__(self, robot: str = "", *, render_mode: str | None = None, **options: Any) -> None:
         self.setup = set_up(robot, **options)
-        check_render_mode(render_mode, self.setup.animat.robot)
+        check_render_mode(render_mode, self.setup.environment.robot)
         self.render_mode = render_mode
         self.observation_space = self.setup.observation_space
         self.action_space = self.setup.action_space
@@ -52,7 +52,8 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
     ) -> tuple[Float32[np.ndarray, " observations"], dict[str, Any]]:
         """Start an episode; `options` are not used."""
         super().reset(seed=seed)
-        self._states, observations = self._compiled.start(1, self.np_random)
+        self._states = self._compiled.start(1, self.np_random)
+        _, observations = self._compiled.read(self._states)
         self._shown, self._command = [], 0.0
         self._show(observations[0])
         return observations[0], {}
@@ -62,24 +63,16 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
         if self._states is None:
             raise gymnasium.error.ResetNeeded("step: expected an episode that reset() started, got none")
         if not self.action_space.contains(action):
-            last = self.setup.animat.n_conditions - 1
+            last = len(self.setup.condition_labels) - 1
             raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {action!r}")
-        after: Step = self._compiled.step(self._states, np.array([action]), self.np_random)
-        self._states = after.states
-        self._command = after.command[0] if np.ndim(after.command[0]) else float(after.command[0])
-        self._show(after.observations[0])
-        info = {
-            "delivered": int(after.delivered[0]),
-            "rate_hz": after.rate_hz[0] if np.ndim(after.rate_hz[0]) else float(after.rate_hz[0]),
-            "command": self._command,
-        }
-        return (
-            after.observations[0],
-            float(after.rewards[0]),
-            bool(after.terminated[0]),
-            bool(after.truncated[0]),
-            info,
-        )
+        self._states = self._compiled.step(self._states, np.array([action]), self.np_random)
+        after, observations = self._compiled.read(self._states)
+        # Numbers are plain ones; of several readouts they are arrays.
+        info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in after.info.items()}
+        self._command = info["command"]
+        self._show(observations[0])
+        terminated, truncated = (bool(each[0]) for each in after.ended)
+        return observations[0], float(after.reward[0]), terminated, truncated, info
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """A picture of the robot as it is now, with `render_mode="rgb_array"`."""
@@ -89,7 +82,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
         if not self._shown:
             raise gymnasium.error.ResetNeeded("render: expected an episode that reset() started, got none")
         *earlier, now = self._shown
-        return draw_robot(self.setup.animat.robot, now, command=self._command, earlier=earlier)
+        return draw_robot(self.setup.environment.robot, now, command=self._command, earlier=earlier)
 
     def _show(self, observation: Float32[np.ndarray, " observations"]) -> None:
         """Keep what pictures need; the observation itself is the user's, so it is copied."""

@@ -16,8 +16,6 @@ from animat.gym.setup import set_up
 from animat.gym.single import check_render_mode
 from animat.robots.drawing import draw_robot
 
-IN_INFO = ("delivered", "rate_hz", "command")
-
 
 class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float32[np.ndarray, " environments"]]):
     """`num_envs` independent Animats in one compiled call; each is an `AnimatEnv` (see there).
@@ -43,7 +41,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         if num_envs < 1:
             raise InvalidArgument(f"num_envs: expected at least 1, got {num_envs}")
         self.setup = set_up(robot, **options)
-        check_render_mode(render_mode, self.setup.animat.robot)
+        check_render_mode(render_mode, self.setup.environment.robot)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = self.setup.observation_space
@@ -54,15 +52,15 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         self._states: Rows | None = None
         self._ended: Bool[np.ndarray, " environments"] = np.zeros(num_envs, bool)
         self._shown: list[list[Float32[np.ndarray, " observations"]]] = [[] for _ in range(num_envs)]
-        n_commands = self.setup.animat.robot.n_commands
+        n_commands = self.setup.environment.robot.n_commands
         self._at_rest = np.zeros(num_envs if n_commands == 1 else (num_envs, n_commands), np.float32)
         self._commands = self._at_rest
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Rows, dict[str, Any]]:
         """Start all episodes; one seed decides all of them, and `options` are not used."""
         super().reset(seed=seed)
-        states, observations = self._compiled.start(self.num_envs, self.np_random)
-        self._states = states
+        self._states = self._compiled.start(self.num_envs, self.np_random)
+        _, observations = self._compiled.read(self._states)
         self._ended = np.zeros(self.num_envs, bool)
         self._show(observations, self._at_rest, np.ones(self.num_envs, bool))
         return observations, {}
@@ -80,31 +78,24 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         if self._states is None:
             raise gymnasium.error.ResetNeeded("step: expected episodes that reset() started, got none")
         actions = np.asarray(actions)
-        n_conditions = self.setup.animat.n_conditions
+        n_conditions = len(self.setup.condition_labels)
         is_whole = np.issubdtype(actions.dtype, np.integer)
         if not is_whole or actions.shape != (self.num_envs,) or np.any((actions < 0) | (actions >= n_conditions)):
             raise InvalidArgument(
                 f"actions: expected {self.num_envs} conditions, whole numbers from 0 to {n_conditions - 1}, "
                 f"got {actions!r}"
             )
-        after = self._compiled.step(self._states, actions, self.np_random)
-        begun, going = self._ended, ~self._ended
-        states, observations = after.states, after.observations
+        states = self._compiled.step(self._states, actions, self.np_random)
+        begun = self._ended
         if begun.any():
-            start_states, start_observations = self._compiled.start(self.num_envs, self.np_random)
-            states = np.where(begun[:, None], start_states, states)
-            observations = np.where(begun[:, None], start_observations, observations)
+            states = np.where(begun[:, None], self._compiled.start(self.num_envs, self.np_random), states)
         self._states = states
-        rewards = np.where(begun, np.float32(0), after.rewards)
-        terminated, truncated = after.terminated & going, after.truncated & going
-        self._ended = terminated | truncated
-        info: dict[str, Any] = {}
-        for name in IN_INFO:
-            value = getattr(after, name)
-            info[name] = np.where(going.reshape(-1, *(1 for _ in value.shape[1:])), value, value.dtype.type(0))
-            info[f"_{name}"] = going.copy()
+        after, observations = self._compiled.read(states)
+        self._ended = np.logical_or(*after.ended)
+        info = after.info | {"delivered": after.info["delivered"].astype(np.int64)}
+        info |= {f"_{name}": ~begun for name in info}
         self._show(observations, info["command"], begun)
-        return observations, rewards, terminated, truncated, info
+        return observations, after.reward, *after.ended, info
 
     def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
         """A picture of each robot as it is now, with `render_mode="rgb_array"`."""
@@ -113,7 +104,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
             return None
         if self._states is None:
             raise gymnasium.error.ResetNeeded("render: expected episodes that reset() started, got none")
-        robot = self.setup.animat.robot
+        robot = self.setup.environment.robot
         return tuple(
             draw_robot(robot, shown[-1], command=u if np.ndim(u) else float(u), earlier=shown[:-1])
             for shown, u in zip(self._shown, self._commands, strict=True)

@@ -77,12 +77,14 @@ def check_plan(
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
-        InvalidArgument: for a training without neurons, recordings that take longer than an interval, no episodes, a
-            setting of the closed loop that cannot be, or a file in the folder's place.
+        InvalidArgument: for a training without neurons or with a neural observation, recordings that take longer than
+            an interval, no episodes, a setting of the closed loop that cannot be, or a file in the folder's place.
         Mismatch: if something is in the folder already; for an earlier live run, what, and what can be done with it.
     """
     if training.mapping is None:
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
+    if training.neural_observation:
+        raise InvalidArgument("neural_observation: expected False, as no closed loop makes one, got True")
     if (n := training.robot.n_commands) > 1:
         raise InvalidArgument(
             f"robot: expected one command, as a live run reads all channels as one, got {training.robot.name}, which "

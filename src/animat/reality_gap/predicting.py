@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.animat import Animat
 from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, OneCondition
+from animat.environment import Animat
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import silenced
 from animat.progress import Progress, Silent

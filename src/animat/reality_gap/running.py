@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from animat.animat import Animat
 from animat.closed_loop.contenders import Contender, Greedy, controls, random_control
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -21,6 +20,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
+from animat.environment import Animat
 from animat.errors import Mismatch
 from animat.evaluation.hand_made import hand_made
 from animat.evaluation.optimum import rough_values

@@ -27,7 +27,7 @@ def _whole(given: Any) -> Any:
     return int(given) if isinstance(given, float) and given.is_integer() else given
 
 
-EpisodeLimit = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_whole)]
+Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_whole)]
 Size = Annotated[Number, Field(ge=1e-9, le=1e9)]
 Amount = Annotated[Number, Field(ge=0, le=1e9)]
 """Parameters of a robot: a size is never 0."""

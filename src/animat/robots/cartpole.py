@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
 from animat.records import Number, record
-from animat.robots.base import Amount, EpisodeLimit, Quantity, Robot, Size
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, INK, PAPER, RAIL, Canvas, Picture
 from animat.robots.registry import register_robot
 
@@ -75,7 +75,7 @@ class Cartpole(Robot[CartpoleState]):
     step_s: Size = 0.02
     reward_upright: Number = 1.0
     reward_failed: Number = -100.0
-    episode_limit: EpisodeLimit = 120
+    episode_limit: Iterations = 120
 
     name: ClassVar[str] = "cartpole"
     noise_size: ClassVar[int] = 1

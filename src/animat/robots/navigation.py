@@ -12,7 +12,7 @@ from pydantic import Field
 
 from animat.errors import InvalidArgument
 from animat.records import Number, record
-from animat.robots.base import Amount, EpisodeLimit, Quantity, Robot, Size
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import (
     ACCENT,
     AIM,
@@ -81,7 +81,7 @@ class Navigation(Robot[NavigationState]):
     goal_y_m: Amount = 0.7
     goal_radius_m: Size = 0.1
     reward_goal: Number = 50.0
-    episode_limit: EpisodeLimit = 100
+    episode_limit: Iterations = 100
 
     name: ClassVar[str] = "navigation"
     noise_size: ClassVar[int] = 0

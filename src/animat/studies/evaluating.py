@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
-from animat.animat import Environment
+from animat.environment import Environment
 from animat.evaluation.controls import controls_of
 from animat.evaluation.rollouts import Actor, Episodes, Networks, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator

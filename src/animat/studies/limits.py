@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
-from animat.animat import Animat
+from animat.environment import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
 from animat.progress import Part, Progress

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int64
 
-from animat.animat import Environment
+from animat.environment import Environment
 from animat.evaluation.rollouts import Actor
 from animat.neurons.simulator import NeuronSimulator
 from animat.studies.results import read_arrays, write_arrays
@@ -68,12 +68,12 @@ def _record(environment: Environment[Any], simulator: NeuronSimulator | None, ac
             uniforms = jax.random.uniform(key, (n_drawn + environment.noise_size,))
             observation = environment.observe(state)
             action = actor.act(environment, (observation / environment.scales)[None], uniforms[None, :n_drawn])[0]
-            outcome = environment.advance(uniforms[n_drawn:], state, action, simulator)
-            still = going & ~(outcome.terminated | outcome.truncated)
-            return (outcome.state, still), (environment.observe(outcome.state), outcome.command, going)
+            after = environment.advance(uniforms[n_drawn:], state, action, simulator)
+            still = going & ~jnp.logical_or(*after.ended)
+            return (after.carried, still), (environment.observe(after), after.info["command"], going)
 
         start, key = jax.random.split(key)
-        state = environment.reset(start)
+        state = environment.reset(start).carried
         keys = jax.random.split(key, environment.robot.episode_limit)
         _, (after, commands, going) = jax.lax.scan(iteration, (state, jnp.bool_(True)), keys)
         return jnp.concatenate([environment.observe(state)[None], after]), commands, going.sum()

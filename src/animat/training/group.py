@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from animat.animat import Environment
 from animat.compilation import FAST_TO_COMPILE
+from animat.environment import Environment
 from animat.errors import InvalidFile
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
@@ -25,6 +25,7 @@ from animat.training.policy import Policy
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
+from animat.wrappers import EpisodeLimit
 from animat.writing import written_whole
 
 CHECKPOINT_S = 2.0
@@ -104,8 +105,9 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
 
     The same for the same arguments: a process that trains one group after another traces them once.
     """
-    beginning = jax.vmap(partial(begin, environment, algorithm))
-    chunk = jax.vmap(partial(train_chunk, environment, algorithm), in_axes=(0, None, None, None))
+    limited = EpisodeLimit(environment)
+    beginning = jax.vmap(partial(begin, limited, algorithm))
+    chunk = jax.vmap(partial(train_chunk, limited, algorithm), in_axes=(0, None, None, None))
     return (
         jax.jit(beginning, compiler_options=FAST_TO_COMPILE),
         jax.jit(chunk, donate_argnums=0, compiler_options=FAST_TO_COMPILE),
@@ -179,6 +181,7 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
         window_ms=timeline.window_ms if timeline else None,
         presentation=timeline.presentation if timeline else None,
         readouts=timeline.readouts if timeline else ALL,
+        neural_observation=training.neural_observation,
         provenance=group.provenance,
         learning_curve=curve,
     )

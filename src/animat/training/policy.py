@@ -68,6 +68,7 @@ class Policy:
         provenance: what it was trained on and how, as plain data.
         learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
         readouts: what is read of the neurons, by the electrodes of each command.
+        neural_observation: whether it sees what the neurons remember, too (`animat.wrappers.NeuralObservation`).
     """
 
     __repr__ = briefly
@@ -84,6 +85,7 @@ class Policy:
     provenance: Dict[str, Any] = field(default_factory=dict)
     learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     readouts: Readouts = ALL
+    neural_observation: bool = False
 
     def __post_init__(self) -> None:
         self._expect_network()
@@ -100,8 +102,12 @@ class Policy:
 
     def _expect_network(self) -> None:
         """Refuse weights of which no action can be made, or one that means nothing."""
+        if self.neural_observation not in (False, self.mapping is not None):
+            raise InvalidArgument(
+                f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
+            )
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
-        widths = [len(self.robot.quantities), *(bias.size for bias in self.biases)]
+        widths = [len(self.robot.quantities) + self.neural_observation, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
             raise InvalidArgument(
@@ -175,7 +181,7 @@ class Policy:
         return first_min + float(trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"])
 
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
-        """The network's outputs for an observation in the robot's own units."""
+        """The network's outputs for an observation in its own units."""
         hidden = observation / self.scales
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = hidden @ weight
@@ -195,7 +201,7 @@ class Policy:
         """Draw an action from the policy: the index of a condition (or command), or what is commanded.
 
         Args:
-            observation: in the robot's own units, shape (observations,).
+            observation: in its own units, shape (observations,).
             rng: source of the draw.
         """
         if self.n_actions is None:
@@ -240,6 +246,7 @@ class Policy:
             "presentation": None if self.presentation is None else asdict(self.presentation),
             "provenance": dict(self.provenance),
             "readouts": self.readouts.to_dict(),
+            "neural_observation": self.neural_observation,
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
@@ -270,8 +277,9 @@ class Policy:
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
                 provenance=described["provenance"],
                 learning_curve=arrays["learning_curve"],
-                # Files of before read all channels as one.
+                # Files of before read all channels as one, and their policies saw the robot alone.
                 readouts=Readouts.from_dict(described.get("readouts")),
+                neural_observation=described.get("neural_observation", False),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             said = f"nothing called {error}" if isinstance(error, KeyError) else error
@@ -322,13 +330,13 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
 
     Raises:
         InvalidArgument: for none.
-        Mismatch: if they differ in one of the attributes, with the advice.
+        Mismatch: if they differ in one of the attributes, or in what they see, with the advice.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))
     for name, policy in policies.items():
-        for attribute in attributes:
+        for attribute in (*attributes, "neural_observation"):
             if getattr(policy, attribute) != getattr(first, attribute):
                 raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; {advice}")
     return first

@@ -26,9 +26,10 @@ import optax
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from animat.animat import Environment, EpisodeState
+from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
 from animat.training.settings import SAC
+from animat.wrappers import EpisodeLimit
 
 
 class Layer(NamedTuple):
@@ -57,7 +58,7 @@ class Learner(NamedTuple):
     targets: Network
     optimiser: Any
     replay: Float[Array, "transitions row"]
-    episodes: EpisodeState
+    episodes: State
     returns: Float[Array, " environments"]
     key: PRNGKeyArray
 
@@ -208,10 +209,10 @@ def continuous_losses(
 # --- acting and learning --------------------------------------------------------------------------------------------
 
 
-def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
+def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
     """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
-    n, n_actions, hidden = environment.n_observations, environment.n_actions, settings.hidden
+    n, n_actions, hidden = len(environment.quantities), environment.n_actions, settings.hidden
     n_drawn = environment.n_drawn
     inputs, values, outputs = (n + 1 + n_drawn, 1, 2 * n_drawn) if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics = initial_networks(
@@ -224,14 +225,14 @@ def begin(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Le
         targets=critics,
         optimiser=_adam(settings).init(trained),
         replay=jnp.zeros((settings.replay, 2 * (n + 1) + n_drawn + 2)),
-        episodes=jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments)),
+        episodes=jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments)).carried,
         returns=jnp.zeros(settings.environments),
         key=key,
     )
 
 
 def train_chunk(
-    environment: Environment[Any],
+    environment: EpisodeLimit[Any],
     settings: SAC,
     learner: Learner,
     simulator: NeuronSimulator | None,
@@ -276,7 +277,7 @@ def train_chunk(
 
 
 def _act(
-    environment: Environment[Any],
+    environment: EpisodeLimit[Any],
     settings: SAC,
     learner: Learner,
     simulator: NeuronSimulator | None,
@@ -287,24 +288,24 @@ def _act(
     """One step of every environment, remembered in the replay; ended episodes start anew."""
     scales, n_drawn = environment.scales, environment.n_drawn
 
-    def state_of(episodes: EpisodeState) -> Float[Array, "environments state"]:
+    def state_of(episodes: State) -> Float[Array, "environments state"]:
         left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
         return jnp.concatenate([jax.vmap(environment.observe)(episodes) / scales, left], axis=1)
 
     state = state_of(learner.episodes)
     action = draw_action(environment, learner.trained.actor, state[:, :-1], uniforms[:, :n_drawn])
     noise = uniforms[:, n_drawn:]
-    outcome = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
-    ended = outcome.terminated | outcome.truncated
+    after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
+    ended = jnp.logical_or(*after.ended)
     of_action = action.reshape(len(state), n_drawn).astype(jnp.float32)
-    row = jnp.stack([settings.reward_scale * outcome.reward, ended], axis=1, dtype=jnp.float32)
-    rows = jnp.concatenate([state, state_of(outcome.state), of_action, row], axis=1)
+    row = jnp.stack([settings.reward_scale * after.reward, ended], axis=1, dtype=jnp.float32)
+    rows = jnp.concatenate([state, state_of(after), of_action, row], axis=1)
 
-    returns = learner.returns + outcome.reward
+    returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
     learner = learner._replace(
         replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
-        episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started, outcome.state),
+        episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried),
         returns=jnp.where(ended, 0.0, returns),
     )
     return learner, Finished(jnp.sum(ended, dtype=jnp.float32), jnp.sum(jnp.where(ended, returns, 0.0)))
@@ -343,7 +344,7 @@ def _learn(
 ) -> Learner:
     """`settings.updates` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
-    n, n_drawn = environment.n_observations + 1, environment.n_drawn
+    n, n_drawn = len(environment.quantities) + 1, environment.n_drawn
     is_continuous = environment.n_actions is None
 
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:

@@ -9,15 +9,16 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 
 import numpy as np
 
-from animat.animat import Animat, Delivery, Environment, WithoutNeurons
 from animat.coding.decoder import expect_one_command
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
+from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
 from animat.neurons.timeline import SimulatorTimeline
 from animat.registry import is_ours
 from animat.robots.base import Robot
 from animat.robots.registry import register_robot, robot_named, robot_to_dict
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
+from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery
 
 Percentiles = Literal["moving", "first"]
 
@@ -64,6 +65,8 @@ class Training:
             as the recordings that it is trained on (`SimulatorTimeline.span_min`).
         percentiles: `"moving"` with the simulator in use, or those of the `"first"` recording held.
         delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random whatever it chose.
+        neural_observation: whether policies see what the neurons remember, too (`animat.wrappers.NeuralObservation`);
+            no closed loop runs such policies; they are evaluated on simulators.
         commands: without neurons, the commands to pick from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
 
@@ -80,6 +83,7 @@ class Training:
     duration_min: float | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
+    neural_observation: bool = False
     commands: tuple[float, ...] | None = None
     algorithm: SAC = field(default_factory=SAC)
 
@@ -98,6 +102,10 @@ class Training:
             if not self.commands or not all(abs(u) <= 1 for u in self.commands):
                 raise InvalidArgument(f"commands: expected numbers from -1 to 1, got {shown(self.commands)}")
             expect_one_command(self.robot.name, self.robot.n_commands)
+        if self.neural_observation not in (False, self.mapping is not None):
+            raise InvalidArgument(
+                f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
+            )
         if self.duration_min is not None and not (math.isfinite(self.duration_min) and self.duration_min > 0):
             raise InvalidArgument(f"duration_min: expected positive minutes, got {self.duration_min:g}")
         for name, allowed in (("percentiles", get_args(Percentiles)), ("delivery", get_args(Delivery))):
@@ -132,14 +140,20 @@ class Training:
         return replace(self, duration_min=timeline.span_min)
 
     def environment(self, n_conditions: int) -> Environment[Any]:
-        """What the policies act in."""
+        """What the policies act in, but for the episode limit."""
         if self.mapping is None:
             return WithoutNeurons(self.robot, self.commands)
-        return Animat(self.robot, self.mapping, n_conditions, self.delivery)
+        environment: Environment[Any] = Animat(self.robot, self.mapping, n_conditions)
+        if self.delivery == "shuffled":
+            environment = ShuffledDelivery(environment)
+        return NeuralObservation(environment) if self.neural_observation else environment
 
     def to_dict(self) -> dict[str, Any]:
         """The same as plain data, for a file."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        if not self.neural_observation:
+            # Folders of before have none, and go on.
+            del plain["neural_observation"]
         return plain | {
             "robot": robot_to_dict(self.robot),
             "mapping": None if self.mapping is None else mapping_to_data(self.mapping),

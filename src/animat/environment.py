@@ -1,0 +1,212 @@
+"""What a policy acts in: neurons, mapping and robot as one environment (`Animat`), pure and jittable."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from animat.coding.decoder import decoded, expect_fit, expect_one_command
+from animat.coding.mapping import Mapping
+from animat.errors import InvalidArgument
+from animat.neurons.simulator import AT_FIRST, Answer, NeuronSimulator
+from animat.robots.base import Quantity, Robot
+
+RobotState = TypeVar("RobotState")
+
+Uniforms = Float[Array, " noise"]
+Number = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+
+_OF_THE_LAST = ("delivered", "rate_hz", "command")
+"""In an environment's `info`: what the last iteration did, and the next one does not ask for."""
+
+
+class Ended(NamedTuple):
+    """Whether an episode has ended, and how: never in both ways.
+
+    Attributes:
+        terminated: by itself (fell, reached).
+        truncated: it was cut off (`animat.wrappers.EpisodeLimit`).
+    """
+
+    terminated: Flag
+    truncated: Flag
+
+
+class State(NamedTuple):
+    """Where an episode stands, and what the iteration did that led there (at the start: nothing, all of it 0).
+
+    Attributes:
+        robot: the state of the robot.
+        iteration: how many are done.
+        neurons: what they remember, in [0, 1], see `animat.neurons.simulator.Answer`.
+        reward: in the task's own units.
+        ended: whether the episode has.
+        info: by name. `delivered`: the condition that reached the neurons (the action itself, where there are none).
+            `rate_hz`: the response x, Hz per channel (NaN without neurons); of several readouts, shape (readouts,).
+            `command`: the motor command u in [-1, 1]; of several, shape (commands,). And what a wrapper remembers.
+    """
+
+    robot: Any
+    iteration: Int[Array, ""]
+    neurons: Number
+    reward: Number
+    ended: Ended
+    info: dict[str, Array]
+
+    @property
+    def carried(self) -> State:
+        """What the next iteration asks for, alone: a compiled loop that carries no more is the smaller for it."""
+        remembered = {name: value for name, value in self.info.items() if name not in _OF_THE_LAST}
+        return self._replace(reward=None, ended=None, info=remembered)  # type: ignore[arg-type]
+
+
+class Environment(abc.ABC, Generic[RobotState]):
+    """What a policy acts in: a robot, moved through neurons (`Animat`) or directly (`WithoutNeurons`), or a wrapper.
+
+    Everything in it is static; the simulator is an argument of each step, so refreshing it changes data, not code.
+    Episodes go on until the task ends by itself, unless a wrapper cuts them off (`animat.wrappers`).
+    """
+
+    robot: Robot[RobotState]
+
+    @property
+    @abc.abstractmethod
+    def n_actions(self) -> int | None:
+        """How many discrete actions there are; None: continuous ones in [-1, 1], one a command."""
+
+    @property
+    @abc.abstractmethod
+    def noise_size(self) -> int:
+        """How many uniforms in [0, 1) one iteration consumes."""
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What the numbers of an observation are, in order; those of the robot come first."""
+        return self.robot.quantities
+
+    def observe(self, state: State) -> Float[Array, " observations"]:
+        """What a policy sees, in the units of `quantities`."""
+        return self.robot.observe(state.robot)
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        """Start an episode."""
+        rest = jnp.zeros(() if self.robot.n_commands == 1 else self.robot.n_commands)
+        delivered = rest if self.n_actions is None else jnp.int32(0)
+        return State(
+            self.robot.reset(key),
+            jnp.int32(0),
+            jnp.float32(AT_FIRST),
+            jnp.float32(0.0),
+            Ended(jnp.bool_(False), jnp.bool_(False)),
+            {"delivered": delivered, "rate_hz": rest, "command": rest},
+        )
+
+    @abc.abstractmethod
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        """One iteration, its random numbers handed in: training draws them for many iterations at once.
+
+        Args:
+            uniforms: random numbers in [0, 1), shape (noise_size,).
+            state: before the iteration; `State.carried` is enough.
+            action: an index, or the commands.
+            simulator: the neurons; None without.
+        """
+
+    @final
+    def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        """One iteration: action, response, command, movement."""
+        return self.advance(jax.random.uniform(key, (self.noise_size,)), state, action, simulator)
+
+    @property
+    def n_drawn(self) -> int:
+        """How many uniforms drawing an action takes: one, or one for each continuous command."""
+        return 1 if self.n_actions is not None else self.robot.n_commands
+
+    @property
+    def scales(self) -> Float[np.ndarray, " observations"]:
+        """What a policy divides an observation by, so that its numbers are of order one."""
+        return np.array([quantity.scale for quantity in self.quantities], np.float32)
+
+    def _moved(
+        self, uniforms: Uniforms, state: State, delivered: Array, answer: Answer, command: Float[Array, "*commands"]
+    ) -> State:
+        """After the neurons' answer and the robot's movement."""
+        robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
+        info = {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
+        ended = Ended(terminated, jnp.bool_(False))
+        return State(robot, state.iteration + 1, answer.past, reward, ended, info)
+
+
+@dataclass(frozen=True)
+class Animat(Environment[RobotState]):
+    """A robot that moves as neurons answer to the condition the agent picks.
+
+    Attributes:
+        robot: the body and its task.
+        mapping: from the response of a readout to a motor command.
+        n_conditions: how many conditions the agent picks from.
+    """
+
+    robot: Robot[RobotState]
+    mapping: Mapping
+    n_conditions: int
+
+    @property
+    def n_actions(self) -> int:
+        return self.n_conditions
+
+    @property
+    def noise_size(self) -> int:
+        # The last one is for who draws what is delivered (`ShuffledDelivery`): with it or without, robot and neurons
+        # meet the same random numbers.
+        return self.robot.noise_size + 2
+
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        if simulator is None:
+            raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
+        expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
+        answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
+        command = decoded(self.mapping, answer.rate_hz, simulator.percentiles)
+        return self._moved(uniforms, state, action, answer, command)
+
+
+@dataclass(frozen=True)
+class WithoutNeurons(Environment[RobotState]):
+    """The baseline: the agent moves the robot directly, by one of a few commands or by continuous ones.
+
+    Attributes:
+        robot: the body and its task.
+        commands: the commands to pick from, such as (-1, 1) for the cartpole; None: any in [-1, 1], of as many
+            dimensions as the robot takes commands.
+
+    Raises:
+        InvalidArgument: for commands to pick from, and a robot that takes several at once.
+    """
+
+    robot: Robot[RobotState]
+    commands: tuple[float, ...] | None
+
+    def __post_init__(self) -> None:
+        if self.commands is not None:
+            expect_one_command(self.robot.name, self.robot.n_commands)
+
+    @property
+    def n_actions(self) -> int | None:
+        return None if self.commands is None else len(self.commands)
+
+    @property
+    def noise_size(self) -> int:
+        return self.robot.noise_size
+
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        nothing = Answer(jnp.float32(jnp.nan), state.neurons)
+        command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
+        return self._moved(uniforms, state, action, nothing, jnp.clip(command, -1.0, 1.0))
