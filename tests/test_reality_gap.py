@@ -183,8 +183,8 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     told = json.loads(json.dumps(gap.to_dict()))
     assert (told["limit"], told["gap_share"]) == (None, None)
     (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-limit"]
-    assert sentence == "no best possible return: these conditions have too few responses: 80 Hz (3)"
-    assert sentence in gap.to_text() and "best possible return on this" not in gap.to_text()
+    assert sentence == "no optimal return: these conditions have too few responses: 80 Hz (3)"
+    assert sentence in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
 def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
@@ -203,7 +203,7 @@ def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     with of[1]:
         gap = run_policies(*of, tmp_path / "simulation", episodes=1, with_controls=False)
     assert gap.session.ending.by == "plan"
-    assert "no best possible return: MemoryError: no room" in gap.to_text()
+    assert "no optimal return: MemoryError: no room" in gap.to_text()
 
 
 @pytest.mark.oracle

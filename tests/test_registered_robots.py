@@ -135,7 +135,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     told = json.loads(said.splitlines()[-1])
     assert "made by hand" not in {row["name"] for row in told["rows"]}
     assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
-    assert "no best possible return: rover has no method `value_grid`" in said
+    assert "no optimal return: rover has no method `value_grid`" in said
 
 
 @pytest.mark.oracle

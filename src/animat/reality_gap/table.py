@@ -21,7 +21,7 @@ from animat.recordings.findings import Finding
 from animat.records import as_json
 
 LARGE_SHARE = 0.1
-"""Of the range from random to the best possible return: a gap that is worth a word though it may be none."""
+"""Of the range from random to the optimal return: a gap that is worth a word though it may be none."""
 _RESAMPLES = 10_000
 
 
@@ -108,7 +108,7 @@ class RealityGap:
         robot, mapping: names.
         loop: the settings of the closed loop.
         calibrated_at_min: of the recording that predicted.
-        limit: the best possible return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
+        limit: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
         session: as it was lived.
@@ -214,7 +214,7 @@ class RealityGap:
             share = ""
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
-            lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
+            lines.append(f"  the optimal return on this simulator is about {self.limit:.1f}{share}")
         lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")

@@ -10,7 +10,7 @@ from animat.robots.base import Robot
 
 WITHOUT = {
     "heuristic": "no rule made by hand among the controls",
-    "value_grid": "no best possible return",
+    "value_grid": "no optimal return",
     "draw": "no pictures of the robot",
     "draw_paths": "no figure of paths",
 }

@@ -155,15 +155,15 @@ def explain(row: ComparedReturns) -> str:
     error_second = row.limit_error_second or 0.0
     if second - random <= error_second:
         return (
-            f"The best possible return for {row.second}, {second:.1f}, is not above that of random actions: "
+            f"The optimal return for {row.second}, {second:.1f}, is not above that of random actions: "
             "there is nothing to learn."
         )
-    limits = f"The best possible return is {second:.1f} for {row.second}"
+    limits = f"The optimal return is {second:.1f} for {row.second}"
     if first is None:
         # A control has no limit of its own: whatever it chooses, another condition is delivered.
         limits += f"; {row.first} cannot do better than random actions, {random:.1f}"
     else:
-        limits = f"The best possible return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
+        limits = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
         error = (row.limit_error_first or 0.0) + error_second
         if first - second > error:
             return f"{limits}: with these responses the order of the limits is itself the other way round."

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Limit:
-    """The best possible return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
+    """The optimal return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
 
     Attributes:
         at_min: the recording that answers.

@@ -25,7 +25,8 @@ MANY_BURSTS = 0.25
 SMALL_DIFFERENCE = 0.1
 """Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
 LITTLE_DIFFERENCE = 0.2
-"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200 (docs/evaluation)."""
+"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200
+(docs/evidence/optimal-return.md)."""
 
 _WINDOW_PARTS = 8
 
