@@ -409,7 +409,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     assert [f.severity for f in findings] == ["warning"]
     assert "blocked" in findings[0].sentence
     _, findings = Loop.of_policy(RecordedAs(Presentation("mixed", 5)), PERCENTILES, pulses=2)
-    assert "5 pulse(s) a presentation, the loop has 2" in findings[0].sentence
+    assert "5 pulse(s) per trial, the loop has 2" in findings[0].sentence
     loop, findings = Loop.of_policy(RecordedAs(None), PERCENTILES)
     assert loop.pulses == 1
     assert "not known" in findings[0].sentence

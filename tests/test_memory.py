@@ -313,7 +313,7 @@ def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> 
     words = {
         "histogram": "20 bins are percentiles",
         "empirical": "there are none",
-        "memory": "past like the present one",
+        "memory": "similar history is drawn",
     }
     for other, sentence in words.items():
         assert any(sentence in text for text in said.values()) == (other == kind)

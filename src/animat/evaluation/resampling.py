@@ -127,7 +127,7 @@ def with_intervals(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> tuple[Optimum, ...]:
-    """Best possible returns with intervals for those that the distributions of all responses would give.
+    """Optimal returns with intervals for those that the distributions of all responses would give.
 
         low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
 

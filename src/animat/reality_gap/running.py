@@ -113,7 +113,7 @@ def run_policies(
     if calibration.simulator.has_memory and loop.pulses == 1 and not loop.lead_in:
         sentence = (
             "episodes begin after a rest (--lead-in 0), and those of the simulator as after stimuli of all conditions: "
-            "what is lived will be less than predicted"
+            "the measured return will be less than predicted"
         )
         findings += (Finding("no-lead-in", "warning", sentence),)
     if follow and first.percentiles == "first":

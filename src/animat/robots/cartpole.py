@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from animat.robots.grid import Grid
 
 FORESIGHT_S = 0.1
-"""The rule made by hand goes by where the pole will lean so much later, at the speed it falls with now."""
+"""The heuristic goes by where the pole will lean so much later, at the speed it falls with now."""
 
 
 class CartpoleState(NamedTuple):

@@ -53,8 +53,8 @@ ROBOT: dict[str, tuple[str, str]] = {
     ),
     "over-time": (
         "at every recording",
-        "The same policies on the simulator of each recording: median and quartiles over policies, with the best "
-        "possible return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
+        "The same policies on the simulator of each recording: median and quartiles over policies, with the "
+        "optimal return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
         "falls faster is the policy's. At every recording that return is on a rough grid, which can lie some below "
         "the fine one, and is left out for mappings without steps, such as `linear`.",
     ),

@@ -13,7 +13,7 @@ from animat.studies.tabulating import AIM, LEVEL
 _CULTURES = {
     "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
     "to the paper's results. How large its responses are and how they tire differ from the paper's.",
-    "made-up": "Here responses are made up: drawn from distributions that were written down, for trials.",
+    "made-up": "Here responses are synthetic: drawn from distributions that were written down, for trials.",
     "files": "Here recordings at hand are used.",
 }
 
@@ -53,7 +53,7 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
         yield (
             "Memory",
             "The paper's histogram answers the same whatever was before. Here one of the measured responses that had a "
-            "past like the present one is drawn, so what a culture remembers is in it.",
+            "similar history is drawn, so what a culture remembers is in it.",
         )
     else:
         if simulators.range_hz is None:

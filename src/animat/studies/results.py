@@ -131,7 +131,7 @@ class ControlReturns:
 
 @dataclass(frozen=True)
 class BesideHeuristic:
-    """Trained policies beside the rule made by hand: mean returns, Mann-Whitney over episodes, share of pairs won."""
+    """Trained policies beside the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
 
     robot: str
     condition: str
