@@ -429,7 +429,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"pulses": 0}, "pulses: expected at least 1"),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),
-        ({"conditions": (Condition("electrode 5", 0.0),)}, "tell the frequency of its pulses"),
+        ({"conditions": (Condition("electrode 5", 0.0),)}, "state the frequency of its pulses"),
         ({"on_burst": "panic"}, "use, repeat, skip"),
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),

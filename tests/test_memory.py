@@ -565,7 +565,7 @@ def test_training_tells_what_is_remembered() -> None:
     first, last = _memories(fit_timeline(series, kind="memory"))
     decay, weight, reach = fit_memory(series[0]).memory
     assert first.startswith(
-        f"memory at 0 min: {decay:.2g} of the past is left by each presentation, which weighs {weight:g} "
+        f"memory at 0 min: {decay:.2g} of the history state is left by each trial, which weighs {weight:g} "
     )
     assert f"one of the n^{reach:.2g} responses" in first
     assert last == "memory at 10 min: none was found"

@@ -55,9 +55,9 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     assert outcome_of(compare(np.arange(4.0), np.arange(4.0) + 100)) == TOO_FEW
     assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
     words = _as_in_paper([replace(ROW, as_in_paper=each) for each in ("yes", "cannot tell", "cannot tell")])
-    assert words.startswith("1 of 3 comparisons") and "Of 2 it cannot be told" in words
+    assert words.startswith("1 of 3 comparisons") and "For 2 there are too few policies" in words
     assert "otherwise" not in words
-    assert "cannot be told" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
+    assert "is not known, with so few policies" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
 
 
 def test_an_outcome_that_the_correction_takes_back_says_so() -> None:

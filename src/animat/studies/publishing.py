@@ -117,7 +117,7 @@ def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
         return f"Whether the {len(rows)} comparisons come out as in the paper is not known, with so few policies."
     words = f"{told['yes']} of {len(rows)} comparisons came out as in the paper: the same one better, at p < {LEVEL:g}."
     if told["cannot tell"]:
-        words += f" Of {told['cannot tell']} it cannot be told, with as few policies."
+        words += f" For {told['cannot tell']} there are too few policies."
     if told["no"]:
         words += f" {told['no']} came out otherwise: highlighted, and explained under Differences from the paper."
     return words
