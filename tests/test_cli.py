@@ -146,7 +146,7 @@ def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
     interval = told["limit"].pop("interval")
     assert interval["low"] <= interval["value"] == direct.value <= interval["high"]
     assert told["limit"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
-    assert f"best possible return {direct.value:.1f}, 95 % interval {interval['low']:.1f} to" in said
+    assert f"optimal return {direct.value:.1f}, 95 % interval {interval['low']:.1f} to" in said
     means = {row["name"]: row["mean_return"] for row in told["rows"]}
     score = (means["policies"] - means["random"]) / (direct.value - means["random"])
     assert told["rows"][0]["normalised_score"] == pytest.approx(score)

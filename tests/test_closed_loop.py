@@ -410,7 +410,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     assert [f.severity for f in findings] == ["warning"]
     assert "blocked" in findings[0].sentence
     _, findings = Loop.of_policy(RecordedAs(Presentation("mixed", 5)), PERCENTILES, pulses=2)
-    assert "5 pulse(s) a presentation, the loop has 2" in findings[0].sentence
+    assert "5 pulse(s) per trial, the loop has 2" in findings[0].sentence
     loop, findings = Loop.of_policy(RecordedAs(None), PERCENTILES)
     assert loop.pulses == 1
     assert "not known" in findings[0].sentence
@@ -430,7 +430,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"pulses": 0}, "pulses: expected at least 1"),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),
-        ({"conditions": (Condition("electrode 5", 0.0),)}, "tell the frequency of its pulses"),
+        ({"conditions": (Condition("electrode 5", 0.0),)}, "state the frequency of its pulses"),
         ({"on_burst": "panic"}, "use, repeat, skip"),
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),

@@ -15,4 +15,4 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
     assert len(blocks) == 1
     exec(compile(blocks[0], str(PAGE), "exec"), {})
-    assert capsys.readouterr().out.startswith("best possible return")
+    assert capsys.readouterr().out.startswith("optimal return")

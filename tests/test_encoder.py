@@ -173,8 +173,8 @@ def test_what_is_open_is_dealt_evenly_and_what_is_not_is_as_recorded(pulses: int
 @pytest.mark.parametrize(
     ("condition", "words"),
     [
-        (Condition("pattern 3", 3.0), "condition pattern 3: expected recordings that tell the frequency"),
-        (Condition("pattern 3", 3.0, "", (5.0,), ()), "condition pattern 3: expected recordings that tell the elec"),
+        (Condition("pattern 3", 3.0), "condition pattern 3: expected recordings that state the frequency"),
+        (Condition("pattern 3", 3.0, "", (5.0,), ()), "condition pattern 3: expected recordings that state the elec"),
         (Condition("0 Hz", 0.0, "Hz"), "condition 0 Hz: expected a frequency from 0.001 to 10000 Hz"),
     ],
 )

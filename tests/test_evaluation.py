@@ -273,7 +273,7 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
     environment = Animat(SHORT, Thresholds(1), 3)
     assert found.limit is not None
     assert replace(found.limit, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
-    assert told[-2:] == ["shuffled", "best possible return"]
+    assert told[-2:] == ["shuffled", "optimal return"]
     assert set(found.limit.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))
@@ -293,7 +293,7 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
     # Nothing else changes by it, and nothing is told of it where it was not asked for.
     assert plainly.limit is None and plainly.no_limit is None
     assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in data["rows"]]
-    assert "score" not in plainly.to_text() and "best possible" not in plainly.to_text()
+    assert "score" not in plainly.to_text() and "optimal return" not in plainly.to_text()
     assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
 
 
@@ -310,7 +310,7 @@ def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch:
     held = replace(fit_histogram(lucky.only([0, 1, 2, 3])), percentiles=timeline.at(0.0).percentiles)
     assert found.limit.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
     assert {row["normalised_score"] for row in found.to_dict()["rows"]} == {None}
-    assert "no score, as the best possible return is without conditions" in found.to_text()
+    assert "no score, as the optimal return is without conditions" in found.to_text()
 
 
 @pytest.mark.oracle
@@ -331,7 +331,7 @@ def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
 def test_where_there_is_no_limit_or_no_score_a_line_says_so() -> None:
     wide = replace(WITHOUT_NEURONS, robot=Cartpole(angle_limit_rad=1.0, episode_limit=10))
     unknown = evaluate({"a": wide}, None, episodes=3, limit_resolution=0.25)
-    (line,) = [line for line in unknown.to_text().splitlines() if "no best possible return: " in line]
+    (line,) = [line for line in unknown.to_text().splitlines() if "no optimal return: " in line]
     assert "angle_limit_rad" in line
     data = unknown.to_dict()
     assert data["limit"] is None and data["no_limit"] in line
@@ -339,7 +339,7 @@ def test_where_there_is_no_limit_or_no_score_a_line_says_so() -> None:
 
     nothing_to_learn = replace(unknown, limit=Optimum(-200.0, 0.0, -200.0, 1.0, -200.0, 1.0, 100, 1000), no_limit=None)
     assert {row["normalised_score"] for row in nothing_to_learn.to_dict()["rows"]} == {None}
-    assert "no score, as the best possible return is not above" in nothing_to_learn.to_text()
+    assert "no score, as the optimal return is not above" in nothing_to_learn.to_text()
 
 
 def test_shuffling_makes_every_policy_a_random_one() -> None:

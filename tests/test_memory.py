@@ -314,7 +314,7 @@ def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> 
     words = {
         "histogram": "20 bins are percentiles",
         "empirical": "there are none",
-        "memory": "past like the present one",
+        "memory": "similar history is drawn",
     }
     for other, sentence in words.items():
         assert any(sentence in text for text in said.values()) == (other == kind)
@@ -566,7 +566,7 @@ def test_training_tells_what_is_remembered() -> None:
     first, last = _memories(fit_timeline(series, kind="memory"))
     decay, weight, reach = fit_memory(series[0]).memory
     assert first.startswith(
-        f"memory at 0 min: {decay:.2g} of the past is left by each presentation, which weighs {weight:g} "
+        f"memory at 0 min: {decay:.2g} of the history state is left by each trial, which weighs {weight:g} "
     )
     assert f"one of the n^{reach:.2g} responses" in first
     assert last == "memory at 10 min: none was found"

@@ -1,4 +1,4 @@
-"""The best possible return against closed forms, games tried to the end, and the environments themselves."""
+"""The optimal return against closed forms, games tried to the end, and the environments themselves."""
 
 from __future__ import annotations
 

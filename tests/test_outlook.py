@@ -88,6 +88,6 @@ def test_one_line_tells_it() -> None:
     assert str(Outlook(26.2, (-5.0, -9.0), 30.0)).endswith("the plan is longer: ask for fewer --episodes")
     assert "in more than 10 h (40 min at least)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
     assert str(Outlook(6.0, None, 7.0)) == (
-        "the session is planned for about 6 min of the culture's time; how the culture drifts takes two recordings to "
-        "tell; the budget of pulses lasts for about 7 min"
+        "the session is planned for about 6 min of the culture's time; how the culture drifts is known from two "
+        "recordings on; the budget of pulses lasts for about 7 min"
     )

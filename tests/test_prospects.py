@@ -69,7 +69,7 @@ def test_inspect_tells_the_limit(
     assert one["best"]["value"] == pytest.approx(direct.value, abs=0.5)
     assert one["best"]["interval"]["low"] <= one["best"]["value"] <= one["best"]["interval"]["high"]
     told = next(line for line in said if "1-threshold: random" in line)
-    assert f"best possible return {one['best']['value']:.1f}" in told
+    assert f"optimal return {one['best']['value']:.1f}" in told
 
 
 def test_where_there_is_no_limit_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,7 +77,7 @@ def test_where_there_is_no_limit_it_is_said(tmp_path: Path, capsys: pytest.Captu
     command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--limit", "navigation", "--json"]
     assert main(command) == 1
     said = capsys.readouterr().out
-    assert "navigation: no best possible return: " in said
+    assert "navigation: no optimal return: " in said
     assert json.loads(said.splitlines()[-1])["recordings"][0]["limits"] is None
 
 

@@ -184,8 +184,8 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     told = json.loads(json.dumps(gap.to_dict()))
     assert (told["limit"], told["gap_share"]) == (None, None)
     (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-limit"]
-    assert sentence == "no best possible return: these conditions have too few responses: 80 Hz (3)"
-    assert sentence in gap.to_text() and "best possible return on this" not in gap.to_text()
+    assert sentence == "no optimal return: these conditions have too few responses: 80 Hz (3)"
+    assert sentence in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
 def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
@@ -204,7 +204,7 @@ def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     with of[1]:
         gap = run_policies(*of, tmp_path / "simulation", episodes=1, with_controls=False)
     assert gap.session.ending.by == "plan"
-    assert "no best possible return: MemoryError: no room" in gap.to_text()
+    assert "no optimal return: MemoryError: no room" in gap.to_text()
 
 
 @pytest.mark.oracle
@@ -226,12 +226,15 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.001, 0.9, at).endswith("of the pairs of episodes or more)")
     looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, how often"
     for lived, less in ((at - 1e3, "less"), (at + 1e3, "more")):
-        told = f"; they lived 1000.0 {less} than predicted, and nothing in the session's data explains it (looked for: "
+        told = (
+            f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
+            "(looked for: "
+        )
         assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, lived)
     uncertain = replace(gap, rows=(replace(policies, lived=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
-        f"; that they lived 20.0 less than predicted is within what the recording's {gap.responses} responses and 10 "
-        "episodes can tell"
+        f"; their measured return is 20.0 less than predicted, within what the recording's {gap.responses} responses "
+        "and 10 episodes can tell"
     )
     reasons = (Finding("a", "note", "it rained"), Finding("b", "note", "it snowed"))
     explained = replace(gap, rows=(replace(policies, lived=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
@@ -296,9 +299,9 @@ def test_what_was_not_lived_is_named(tmp_path: Path, series: list[Responses]) ->
     policies, *others = gap.rows
     none = np.empty(0)
     no_controls = replace(gap, rows=(policies, *(replace(row, lived=none, beside=None) for row in others)))
-    assert no_controls.verdict().startswith("no control was lived to its end")
+    assert no_controls.verdict().startswith("no control ran to its end")
     no_policy = replace(gap, rows=(replace(policies, lived=none), *(replace(row, beside=None) for row in others)))
-    assert no_policy.verdict().startswith("no episode of a policy was lived to its end")
+    assert no_policy.verdict().startswith("no episode of a policy ran to its end")
 
 
 @pytest.mark.oracle

@@ -113,7 +113,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "memory": ({"rate_hz": remembering}, "the culture remembers: after a response that passes the median"),
     "answers": (
         {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
-        "responses pass P50 otherwise than predicted: 80 Hz in 0.",
+        "responses pass P50 more or less often than predicted: 80 Hz in 0.",
     ),
 }
 

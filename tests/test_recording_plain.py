@@ -258,7 +258,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
         {"stimulus_electrodes": np.zeros((3, 2))},
         r"stimulus_electrodes: .* got \(3, 2\)",
     ),
-    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: expected, to tell which 5"),
+    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: expected, to know which 5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),

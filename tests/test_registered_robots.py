@@ -112,7 +112,7 @@ def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path)
     evaluation = evaluate(loaded, timeline_of(), episodes=5, limit_resolution=1.0)
     assert evaluation.robot == "rover" and evaluation.names == tuple(trained)
     assert "rover has no method `value_grid`" in (evaluation.no_limit or "")
-    assert "no rule made by hand among the controls: rover has no method `heuristic`" in evaluation.to_text()
+    assert "no heuristic policy among the controls: rover has no method `heuristic`" in evaluation.to_text()
 
 
 @pytest.mark.oracle
@@ -128,14 +128,14 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
     assert told["robot"] == "rover" and told["limit"] is None and "value_grid" in told["no_limit"]
-    assert "no rule made by hand among the controls: rover has no method `heuristic`" in said
+    assert "no heuristic policy among the controls: rover has no method `heuristic`" in said
     forget()
     assert main(["run", *asked, "--culture", "replay"]) == 0
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
     assert "made by hand" not in {row["name"] for row in told["rows"]}
     assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
-    assert "no best possible return: rover has no method `value_grid`" in said
+    assert "no optimal return: rover has no method `value_grid`" in said
 
 
 @pytest.mark.oracle
@@ -240,7 +240,7 @@ def test_robots_are_listed_with_what_each_can_do(
     assert list(told["robots"]) == ["cartpole", "navigation", "rover"]
     assert told["robots"]["cartpole"]["can"] == ["heuristic", "value_grid", "draw", "draw_paths"]
     assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
-    assert "  no rule made by hand among the controls: rover has no method `heuristic`" in said
+    assert "  no heuristic policy among the controls: rover has no method `heuristic`" in said
     assert "ModuleNotFoundError" in told["unusable"]["tank"] and "tank cannot be used: " in said
     quantities = property(lambda self: ("x",))
     monkeypatch.setattr(type(robot_named("rover")), "quantities", quantities)

@@ -55,9 +55,9 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     assert outcome_of(compare(np.arange(4.0), np.arange(4.0) + 100)) == TOO_FEW
     assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
     words = _as_in_paper([replace(ROW, as_in_paper=each) for each in ("yes", "cannot tell", "cannot tell")])
-    assert words.startswith("1 of 3 comparisons") and "Of 2 it cannot be told" in words
+    assert words.startswith("1 of 3 comparisons") and "For 2 there are too few policies" in words
     assert "otherwise" not in words
-    assert "cannot be told" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
+    assert "is not known, with so few policies" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
 
 
 def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
@@ -268,14 +268,14 @@ def test_every_line_of_a_figure_is_in_its_legend() -> None:
     means = np.array([1.0, 2.0, 3.0])
     groups = Group("control", means), Group("1 threshold", means + 5, 0.0, 9.0, 0.75)
     figure = draw_comparisons([Pair("at 0 min", *groups, 0.1, 0.0)], "cartpole")
-    assert legend(figure) == {"random actions", "best possible return"}
+    assert legend(figure) == {"random actions", "optimal return"}
     labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
     assert labels == ["control\n", "1\nthreshold\nscore 0.75"]
     controls = Controls(
         "1-threshold", (("trained: a", 5.0, 0.1), ("trained: b", 4.0, 0.1), ("silent", 1.0, None)), 2, 0.0, 9.0
     )
     assert legend(draw_controls([controls], "cartpole")) == {
-        "trained", "control", "random actions", "best possible return",
+        "trained", "control", "random actions", "optimal return",
     }  # fmt: skip
 
 
@@ -283,7 +283,7 @@ def test_the_limit_steps_with_the_simulator_in_use() -> None:
     limit = np.array([1.0, 1.0, 7.0])
     curve = LearningCurve("a", np.array([1000.0, 2000.0, 3000.0]), np.zeros((2, 3)), None, limit)
     figure = draw_learning_curves([curve], "cartpole")
-    (line,) = [line for line in figure.axes[0].lines if line.get_label() == "best possible return"]
+    (line,) = [line for line in figure.axes[0].lines if line.get_label() == "optimal return"]
     assert line.get_drawstyle() == "steps-pre"
     assert np.asarray(line.get_xdata()).tolist() == [0, 1, 2, 3]
     assert np.asarray(line.get_ydata()).tolist() == [1, 1, 1, 7]
@@ -299,8 +299,8 @@ def test_limits_over_time_are_said_to_be_rough_and_no_condition_is_lost_unsaid()
     figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
     said = legend(figure)
     assert {
-        "best possible return, rough grid",
-        "best possible return, fine grid",
+        "optimal return, rough grid",
+        "optimal return, fine grid",
         "random actions",
         "linear",
         "c5",

@@ -282,7 +282,7 @@ def test_what_recordings_do_not_tell_is_refused_before_a_culture_is_opened(
     policy = over(tmp_path / "from elsewhere", "pattern")
     assert run(tmp_path / "session", policy, tmp_path / "from elsewhere") == 1
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "condition pattern 0" in line]
-    assert f"expected recordings that tell the {lacks.removesuffix('_hz')} of its pulses" in said
+    assert f"expected recordings that state the {lacks.removesuffix('_hz')} of its pulses" in said
     assert not (tmp_path / "session").exists()
 
 

@@ -552,7 +552,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
             assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
         assert f'href="figures/{stem}.svg"' in page
     assert page.count("<img ") == page.count("data:image/png;base64,") == len(expected)
-    tables = ("Comparisons", "Every condition", "Best possible returns", "Controllability of every recording")
+    tables = ("Comparisons", "Every condition", "Optimal returns", "Controllability of every recording")
     for title in (*tables, "Controls"):
         assert f"<caption>{title}</caption>" in page
     assert "<dt>Pole mass</dt>" not in page, "there is no cartpole in this study"

@@ -194,7 +194,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
         assert not np.allclose(returns, expected["turned", at_min])
 
 
-# --- the best possible returns --------------------------------------------------------------------------------------
+# --- the optimal returns --------------------------------------------------------------------------------------
 
 FEW = Study(
     culture=Source(kind="made-up", sessions=2, interval_min=140, presentations=40, channels=32),

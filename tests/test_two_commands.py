@@ -218,7 +218,7 @@ def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy
 def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
     table = evaluate(baseline, None, episodes=40, limit_resolution=0.5)
     assert [row.name for row in table.rows] == ["policies", "random", "made by hand"]
-    assert table.no_limit is not None and "expected one command for a best possible return, got 2" in table.no_limit
+    assert table.no_limit is not None and "expected one command for an optimal return, got 2" in table.no_limit
     # The rule by hand is the robot's own, for any commands can be given.
     wheels = Wheels(episode_limit=8)
     state = wheels.reset(jax.random.key(4))
@@ -369,7 +369,7 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
     assert "5 Hz: left 0." in capsys.readouterr().out
     asked = ["--recordings", "recordings", "--episodes", "2"]
     assert main(["evaluate", *asked, "--limit"]) == 0
-    assert "expected one command for a best possible return" in capsys.readouterr().out
+    assert "expected one command for an optimal return" in capsys.readouterr().out
     assert main(["run", *asked, "--culture", "replay"]) == 0
     assert main(["live", "my_wheels:Wheels"]) == 1
     assert "a live run reads all channels as one" in capsys.readouterr().err

@@ -58,7 +58,7 @@ class Convert:
     threshold: float = 5.0
     """Depth of a spike, in standard deviations of its channel's noise"""
     dead_time_ms: float = 1.0
-    """Of two troughs within it, the deeper one is the spike"""
+    """Of two negative peaks within it, the deeper one is the spike"""
     blank_ms: tuple[float, float] = (0.5, 1.5)
     """From before to after each stimulus in which nothing is looked for"""
     json: bool = False

@@ -100,7 +100,7 @@ class Inspect(Responding):
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.limit is not None:
-                progress.update(steps * number, total, f"{file.name}, best possible return")
+                progress.update(steps * number, total, f"{file.name}, optimal return")
                 inspected[-1]["limits"] = _limits(self.limit, inspection.responses)
             if self.out is not None:
                 progress.update(steps * number + 1, total, f"{file.name}, figures")
@@ -155,7 +155,7 @@ def _limits(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
     try:
         found = prospects(responses, robot_named(robot))
     except (InvalidArgument, UnusableData) as error:
-        print(f"{robot}: no best possible return: {error}\n")
+        print(f"{robot}: no optimal return: {error}\n")
         return None
     for prospect in found:
         print(prospect.to_text())

@@ -35,7 +35,7 @@ class Live(Stimulating):
     order: Literal["mixed", "blocked"] = "mixed"
     """How recordings are presented; mixed is how a closed loop presents"""
     pulses: int = 1
-    """Pulses a presentation, the last one read"""
+    """Pulses per trial, the last one read"""
     presentations: int = 500
     """Of each frequency in a recording"""
     interval_min: float = 10.0
@@ -51,8 +51,8 @@ class Live(Stimulating):
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are held from the first recording"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """memory: draw a response that was measured after a like past, the default but for recordings in blocks; histogram:
-    the paper's; empirical: draw any measured value"""
+    """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
+    histogram: the paper's; empirical: draw any measured value"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
     seed: int = 1

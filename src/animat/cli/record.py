@@ -41,7 +41,7 @@ class Record:
     order: Literal["blocked", "mixed"] | None = None
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
-    """Pulses a presentation, the last one read; default: 1"""
+    """Pulses per trial, the last one read; default: 1"""
     presentations: int | None = None
     """Presentations at each frequency; default: 500, with --paper 100"""
     places: str | None = None

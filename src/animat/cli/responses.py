@@ -35,14 +35,14 @@ class Fitting(Responding):
     """How a neuron simulator is made of responses."""
 
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """memory: draw a response that was measured after a like past, the default but for recordings in blocks; histogram:
-    the paper's; empirical: draw any measured value"""
+    """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
+    histogram: the paper's; empirical: draw any measured value"""
     bins: int | None = None
     """Bins of a histogram; default: 20"""
     range_hz: float | None = None
     """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
     allow: tuple[str, ...] = ()
-    """Findings to go on in spite of, by name, such as dead-window"""
+    """Findings to allow, by name, such as dead-window"""
 
     def timeline(
         self, recordings: Sequence[Path], trained: Policy | None = None, readouts: str | Readouts | None = None

@@ -54,7 +54,7 @@ class Run(Stimulating):
     controls: Literal["all", "random"] = "all"
     """all: random, constant, silent, shuffled and made by hand; random: only that one"""
     pulses: int | None = None
-    """Pulses a presentation; default: as the policies' recordings had"""
+    """Pulses per trial; default: as the policies' recordings had"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
     """That predicts, as for animat train; default: as the policies were trained"""
     bins: int | None = None
@@ -64,7 +64,7 @@ class Run(Stimulating):
     burst_threshold: float | None = None
     """Share of active channels above which a response is a burst; 1: none is; default: as the policies were trained"""
     allow: tuple[str, ...] = ()
-    """Findings on the recordings to go on in spite of, by name"""
+    """Findings on the recordings to allow, by name"""
     real_time: bool = False
     """Hold a simulated culture back to real time; a living one always runs in it"""
     drawn: bool = False

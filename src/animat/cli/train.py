@@ -105,7 +105,7 @@ class Train(Fitting):
             raise UnusableData(
                 "--conditions: expected two or more for an agent to choose from, got one "
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
-                "(to go on in spite of it: --allow one-condition)"
+                "(to allow it: --allow one-condition)"
             )
         was_finished = is_finished(training, self.out)
         if timeline is not None:
@@ -180,7 +180,7 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
         if isinstance(simulator, MemorySimulator):
             decay, weight, reach = memory = simulator.memory
             told = (
-                f"{decay:.2g} of the past is left by each presentation, which weighs {weight:.2g} beside its answer; "
-                f"one of the n^{reach:.2g} responses with the nearest pasts is drawn"
+                f"{decay:.2g} of the history state is left by each trial, which weighs {weight:.2g} beside its answer; "
+                f"one of the n^{reach:.2g} responses with the nearest history states is drawn"
             )
             yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

@@ -141,7 +141,7 @@ def controls(
     Args:
         robot: that is driven.
         labels: of the conditions, in the order of their index.
-        means: the mean command (or commands) of each condition, for the rule made by hand; None: without that control.
+        means: the mean command (or commands) of each condition, for the heuristic policy; None: without that control.
         policies: by name, who act in turn under the silent and the shuffled control; without any these two are left
             out.
     """

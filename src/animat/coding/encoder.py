@@ -40,8 +40,8 @@ class Encoder:
         for condition in self.conditions:
             if not condition.frequencies_hz:
                 raise UnusableData(
-                    f"condition {condition.label}: expected recordings that tell the frequency of its pulses, at which "
-                    "a closed loop presents it, got none; sort the stimuli by their intervals too: --conditions "
+                    f"condition {condition.label}: expected recordings that state the frequency of its pulses, at "
+                    "which a closed loop presents it, got none; sort the stimuli by their intervals too: --conditions "
                     "'interval:5,10 x electrode'"
                 )
             if not all(SLOWEST_HZ <= each <= FASTEST_HZ for each in condition.frequencies_hz):
@@ -51,8 +51,8 @@ class Encoder:
                 )
             if condition.electrodes == ():
                 raise UnusableData(
-                    f"condition {condition.label}: expected recordings that tell the electrodes of its pulses, through "
-                    "which a closed loop presents it, got none; train on conditions by frequency or interval"
+                    f"condition {condition.label}: expected recordings that state the electrodes of its pulses, "
+                    "through which a closed loop presents it, got none; train on conditions by frequency or interval"
                 )
 
     @property

@@ -181,7 +181,7 @@ class Culture(Openable):
         """
         stimuli, until_ms = plain_stimuli(stimuli), number("until_ms", until_ms)
         if not stimuli:
-            raise InvalidArgument("stimuli: expected at least one in a presentation, got none")
+            raise InvalidArgument("stimuli: expected at least one in a trial, got none")
         start_min = self.now_s / 60
         observed = self.deliver(stimuli, stimuli[-1].time_s + until_ms * 1e-3)
         return presented(

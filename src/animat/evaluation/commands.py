@@ -159,8 +159,8 @@ def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) 
         return 1
     if not isinstance(simulator, MemorySimulator):
         raise InvalidArgument(
-            f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: which pasts "
-            "it comes through is not known, and the best possible return is not known without"
+            f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: which "
+            "history states it comes through is not known, and the optimal return is not known without"
         )
     return CLASSES
 

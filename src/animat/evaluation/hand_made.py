@@ -1,4 +1,4 @@
-"""A rule made by hand in place of a trained policy: is learning needed, or do the robot and the mapping do it all?"""
+"""A heuristic policy in place of a trained one: is learning needed, or do the robot and the mapping do it all?"""
 
 from __future__ import annotations
 

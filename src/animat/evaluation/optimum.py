@@ -1,4 +1,4 @@
-"""The best possible return: what no controller can beat, with these neurons, this mapping and this robot."""
+"""The optimal return: what no controller can beat, with these neurons, this mapping and this robot."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _TABLES_AT_ONCE_MIB = 400
 
 @dataclass(frozen=True)
 class Optimum:
-    """The best possible mean return of any controller, and how well it is known.
+    """The optimal mean return of any controller, and how well it is known.
 
     Attributes:
         value: by dynamic programming, of a controller that knows the time left, and where neurons remember it the class
@@ -78,7 +78,7 @@ class Optimum:
 
     def to_text(self) -> str:
         """In a line: the value and how well it is known."""
-        text = f"best possible return {self.value:.1f}"
+        text = f"optimal return {self.value:.1f}"
         if self.interval is not None:
             text += (
                 f", {100 * self.interval.confidence:g} % interval {self.interval.low:.1f} to {self.interval.high:.1f}"
@@ -109,7 +109,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
         return ()  # Neither has NaN, where the controller was not run, anything to tell.
     told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± "
     if apart > 0:
-        told += f"{standard_error:.2f} part: the best possible return lies between the two"
+        told += f"{standard_error:.2f} part: the optimal return lies between the two"
     else:
         told += (
             f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution (or the "
@@ -119,7 +119,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
 
 
 def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
-    """The best possible return in one environment; arguments, errors and method as in `best_returns`."""
+    """The optimal return in one environment; arguments, errors and method as in `best_returns`."""
     return best_returns([(environment, simulator)], **options)[0]
 
 
@@ -132,7 +132,7 @@ def best_returns(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> tuple[Optimum, ...]:
-    """The best possible mean return of any controller, for several mappings or simulators of one robot at once.
+    """The optimal mean return of any controller, for several mappings or simulators of one robot at once.
 
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 

@@ -1,4 +1,4 @@
-"""What a culture could do at a task, before any training: the best possible return beside that of random stimuli."""
+"""What a culture could do at a task, before any training: the optimal return beside that of random stimuli."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Prospect:
         robot, mapping: their names.
         random: mean return of random stimuli.
         random_standard_error: of that.
-        best: the best possible return of any controller.
+        best: the optimal return of any controller.
     """
 
     robot: str

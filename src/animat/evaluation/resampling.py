@@ -1,4 +1,4 @@
-"""How well responses tell the best possible return: which conditions have enough, and what redrawing them changes."""
+"""How well responses tell the optimal return: which conditions have enough, and what redrawing them changes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ a command acts smoothly and never decides whether an episode ends, where the qua
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """What counts for the best possible return at a recording: the conditions with enough responses, alone.
+    """What counts for the optimal return at a recording: the conditions with enough responses, alone.
 
     Attributes:
         environment: that chooses from these conditions.
@@ -89,7 +89,7 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     """Responses to the conditions with 30 or more that are no bursts, and the labels of the other conditions.
 
     The best of several values is the luckiest of them, so a condition of three responses promises what is not there:
-    from 30 on, nine of ten intervals hold the true optimum, at 10 three of four (docs/evaluation.md).
+    from 30 on, nine of ten intervals hold the true optimum, at 10 three of four (docs/evidence/optimal-return.md).
 
     Raises:
         UnusableData: where no condition has as many.
@@ -128,7 +128,7 @@ def with_intervals(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> tuple[Optimum, ...]:
-    """Best possible returns with intervals for those that the distributions of all responses would give.
+    """Optimal returns with intervals for those that the distributions of all responses would give.
 
         low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
 

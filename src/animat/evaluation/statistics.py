@@ -200,7 +200,7 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
 
 
 def normalised_score(policy: float, random: float, limit: float) -> float:
-    """How far a policy has come from a random one to the best possible: (policy - random) / (limit - random).
+    """How far a policy has come from a random one to the optimal return: (policy - random) / (limit - random).
 
     0 is as good as random and 1 the limit (`animat.evaluation.optimum`), which a measured mean can pass by chance.
 

@@ -1,4 +1,4 @@
-"""Policies beside the controls that ask whether it is the culture that does the work, and the best possible return."""
+"""Policies beside the controls that ask whether it is the culture that does the work, and the optimal return."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Evaluation:
         names: the policies, in the order of the first row's actors.
         rows: the policies first, then the controls.
         findings: where the policies' training and this simulator differ, and where the limit is not well known.
-        limit: the best possible return of any controller; None where it was not asked for, or is not known.
+        limit: the optimal return of any controller; None where it was not asked for, or is not known.
         no_limit: why it is not known, though it was asked for.
         held_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move along.
     """
@@ -174,15 +174,15 @@ class Evaluation:
 
     def _limit_lines(self) -> list[str]:
         if self.no_limit is not None:
-            return [f"  no best possible return: {self.no_limit}"]
+            return [f"  no optimal return: {self.no_limit}"]
         if self.limit is None:
             return []
         if self.limit.left_out:
-            meaning = "no score, as the best possible return is without conditions that the rows act on too"
+            meaning = "no score, as the optimal return is without conditions that the rows act on too"
         elif not self.rows[0].changed and self.score(self.rows[0]) is None:
-            meaning = "no score, as the best possible return is not above that of random actions"
+            meaning = "no score, as the optimal return is not above that of random actions"
         else:
-            meaning = "score: (mean return - random) / (best possible return - random)"
+            meaning = "score: (mean return - random) / (optimal return - random)"
             changed = [row.name for row in self.rows if row.changed]
             if changed:
                 meaning += f"; none for {' and '.join(changed)}, whose limit is another"
@@ -215,7 +215,7 @@ def evaluate(
         greedy: whether the most probable action is taken, or one drawn from the policy as in training.
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
         controls: names of those that are run beside the policies (`animat.evaluation.controls`); None: all.
-        limit_resolution: of the grid for the best possible return in the same environment (`best_returns`; a study's is
+        limit_resolution: of the grid for the optimal return in the same environment (`best_returns`; a study's is
             1), which takes seconds; None: it is not computed.
         progress: told after the policies and each control, and before the limit.
 
@@ -272,7 +272,7 @@ def evaluate(
     limit, no_limit = None, None
     if limit_resolution is not None:
         if progress is not None:
-            progress.update(len(rows), steps, "best possible return")
+            progress.update(len(rows), steps, "optimal return")
         try:
             limit = _limit(environment, simulator, timeline, minute, held_from_min is not None, limit_resolution, seed)
         except (InvalidArgument, UnusableData) as error:
@@ -299,7 +299,7 @@ def _limit(
     resolution: float,
     seed: int,
 ) -> Optimum:
-    """The best possible return; with its interval, without conditions of few responses, where responses are known."""
+    """The optimal return; with its interval, without conditions of few responses, where responses are known."""
     environment = unwrapped(environment)
     if not (isinstance(environment, Animat) and simulator is not None and timeline and minute is not None):
         return best_return(environment, simulator, resolution=resolution, seed=seed)

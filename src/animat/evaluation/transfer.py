@@ -35,7 +35,7 @@ def other_presentation(recorded: Presentation | None, presented: Presentation) -
         yield Finding("other-presentation", "warning", sentence)
     if recorded.pulses != presented.pulses:
         sentence = (
-            f"the policy's recordings had {recorded.pulses} pulse(s) a presentation, the loop has {presented.pulses}; "
+            f"the policy's recordings had {recorded.pulses} pulse(s) per trial, the loop has {presented.pulses}; "
             "the response after another number of pulses is another"
         )
         yield Finding("other-presentation", "warning", sentence)

@@ -37,7 +37,7 @@ class Outlook:
 
     def __str__(self) -> str:
         if self.drifted_min is None:
-            drift = "how the culture drifts takes two recordings to tell"
+            drift = "how the culture drifts is known from two recordings on"
         else:
             likely, least = (max(0.0, each) for each in self.drifted_min)
             drift = (

@@ -189,7 +189,7 @@ def answers(evidence: Evidence) -> Finding | None:
             )
     if not told:
         return None
-    return _reason("answers", f"responses pass P50 otherwise than predicted: {', '.join(told)}", most)
+    return _reason("answers", f"responses pass P50 more or less often than predicted: {', '.join(told)}", most)
 
 
 CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {

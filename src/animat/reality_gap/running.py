@@ -44,7 +44,7 @@ from animat.training.policy import Policy, first_of_alike
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
 LIMIT_RESOLUTION = 0.5
-"""Of the grid of the best possible return: fast and rough, 0.8 of the cartpole's 200."""
+"""Of the grid of the optimal return: fast and rough, 0.8 of the cartpole's 200."""
 
 
 def run_policies(
@@ -113,7 +113,7 @@ def run_policies(
     if calibration.simulator.has_memory and loop.pulses == 1 and not loop.lead_in:
         sentence = (
             "episodes begin after a rest (--lead-in 0), and those of the simulator as after stimuli of all conditions: "
-            "what is lived will be less than predicted"
+            "the measured return will be less than predicted"
         )
         findings += (Finding("no-lead-in", "warning", sentence),)
     if follow and first.percentiles == "first":
@@ -152,7 +152,7 @@ def run_policies(
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
-        findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no best possible return: {why_not}")),)
+        findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
     predicted = predict(
         [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
         environment,
@@ -185,7 +185,7 @@ def run_policies(
         try:
             best = _wait_for(limit, progress)
         except Exception as error:
-            findings += (Finding("no-limit", "note", f"no best possible return: {in_words(error)}"),)
+            findings += (Finding("no-limit", "note", f"no optimal return: {in_words(error)}"),)
     rows = _rows(contenders, tuple(policies), predicted, session)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
@@ -238,13 +238,13 @@ def _meanwhile(compute: Callable[[], float]) -> Future[float]:
             found.set_exception(error)
 
     # A daemon: whoever stops while it computes need not wait for it.
-    threading.Thread(target=work, name="best possible return", daemon=True).start()
+    threading.Thread(target=work, name="optimal return", daemon=True).start()
     return found
 
 
 def _wait_for(limit: Future[float], progress: Progress | None) -> float:
     if progress is not None:
-        progress.update(0, 1, "best possible return")
+        progress.update(0, 1, "optimal return")
     return limit.result()
 
 

@@ -21,7 +21,7 @@ from animat.recordings.findings import Finding
 from animat.records import as_json
 
 LARGE_SHARE = 0.1
-"""Of the range from random to the best possible return: a gap that is worth a word though it may be none."""
+"""Of the range from random to the optimal return: a gap that is worth a word though it may be none."""
 _RESAMPLES = 10_000
 
 
@@ -108,7 +108,7 @@ class RealityGap:
         robot, mapping: names.
         loop: the settings of the closed loop.
         calibrated_at_min: of the recording that predicted.
-        limit: the best possible return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
+        limit: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
         session: as it was lived.
@@ -151,7 +151,7 @@ class RealityGap:
         beside, policies = self.beside_controls, self.rows[0]
         if beside is None:
             who = "no control" if len(policies.lived) else "no episode of a policy"
-            return f"{who} was lived to its end: nothing can be said of the policies beside the controls"
+            return f"{who} ran to its end: nothing can be said of the policies beside the controls"
         return str(beside) + self._on_the_gap()
 
     def _on_the_gap(self) -> str:
@@ -161,10 +161,10 @@ class RealityGap:
             if share is None or abs(share) < LARGE_SHARE or len(row.lived) < 2:
                 return ""
             return (
-                f"; that they lived {_more_or_less(row.gap.value)} than predicted is within what the recording's "
-                f"{self.responses} responses and {len(row.lived)} episodes can tell"
+                f"; their measured return is {_more_or_less(row.gap.value)} than predicted, within what the "
+                f"recording's {self.responses} responses and {len(row.lived)} episodes can tell"
             )
-        said = f"; they lived {_more_or_less(row.gap.value)} than predicted"
+        said = f"; their measured return is {_more_or_less(row.gap.value)} than predicted"
         if self.reasons:
             return f"{said}: {'; '.join(reason.sentence for reason in self.reasons)}"
         return f"{said}, and nothing in the session's data explains it (looked for: {', '.join(CHECKS)})"
@@ -204,7 +204,7 @@ class RealityGap:
             counts = [str(len(row.lived)), f"{row.pulses_per_action:.1f}"]
             cells.append([row.name, f"{told['predicted']:.1f}", anew, *lived, *counts, p, row.meaning])
         interval = "95 % interval"
-        head = ["", "predicted", interval, "lived", "gap", interval, "episodes", "pulses/action", "p", ""]
+        head = ["", "predicted", interval, "measured", "gap", interval, "episodes", "pulses/action", "p", ""]
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
             f"{self.calibrated_at_min:g} min",
@@ -214,11 +214,11 @@ class RealityGap:
             share = ""
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
-            lines.append(f"  the best possible return on this simulator is about {self.limit:.1f}{share}")
+            lines.append(f"  the optimal return on this simulator is about {self.limit:.1f}{share}")
         lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
-        lines.append(f"  p: that the policies live no other returns than this control; stimulation: {self.account}")
+        lines.append(f"  p: that the policies measure no other returns than this control; stimulation: {self.account}")
         lines.append(
             f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
             f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"

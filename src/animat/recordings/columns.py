@@ -184,7 +184,7 @@ class PlainColumns:
             return presentations
         if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
             raise UnusableData(
-                f"stimulus_presentation: expected, to tell which {self.presentation_pulses} pulses belong to one "
+                f"stimulus_presentation: expected, to know which {self.presentation_pulses} pulses belong to one "
                 "presentation; it is missing"
             )
         return np.arange(n)

@@ -57,7 +57,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield Finding(
             "presentation-unknown",
             "note",
-            "how the stimuli were presented (blocked or mixed, pulses a presentation) is not known; a closed loop "
+            "how the stimuli were presented (blocked or mixed, pulses per trial) is not known; a closed loop "
             "cannot check that it presents them in the same way",
         )
 

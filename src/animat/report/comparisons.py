@@ -23,7 +23,7 @@ class Group:
     Attributes:
         name: the condition.
         returns: each policy's mean return, shape (policies,).
-        random, limit: of random actions, and the best possible; None where not known.
+        random, limit: of random actions, and the optimal return; None where not known.
         score: the normalised score of the policies' mean; None where not known.
     """
 
@@ -57,7 +57,7 @@ def stars(p: float) -> str:
 
 
 def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
-    """A column a comparison: above with random actions (dotted) and the best possible return (dashed), below close up.
+    """A column a comparison: above with random actions (dotted) and the optimal return (dashed), below close up.
 
     Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; policies are
     points.
@@ -115,4 +115,4 @@ def _draw_references(axes: Axes, group: Group, place: int) -> None:
     if group.random is not None:
         axes.plot(ends, [group.random] * 2, color=GREY, linewidth=1.3, linestyle=":", label="random actions")
     if group.limit is not None:
-        axes.plot(ends, [group.limit] * 2, color=LIMIT, linewidth=1.3, linestyle="--", label="best possible return")
+        axes.plot(ends, [group.limit] * 2, color=LIMIT, linewidth=1.3, linestyle="--", label="optimal return")

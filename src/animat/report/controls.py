@@ -20,7 +20,7 @@ class Controls:
         title: the mapping and the minute.
         returns: name, mean return and its standard error (None: not known), the trained policies first.
         n_trained: how many of them are trained policies.
-        random, limit: of random actions, and the best possible; None where not known.
+        random, limit: of random actions, and the optimal return; None where not known.
     """
 
     title: str
@@ -47,7 +47,7 @@ def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
         axes.set_yticks([-i for i in range(len(controls.returns))], [name for name, _, _ in controls.returns])
         axes.set_ylim(-len(controls.returns) + 0.4, 0.6)
         if controls.limit is not None:
-            axes.axvline(controls.limit, color=LIMIT, linewidth=1.2, linestyle="--", label="best possible return")
+            axes.axvline(controls.limit, color=LIMIT, linewidth=1.2, linestyle="--", label="optimal return")
         if controls.random is not None:
             axes.axvline(controls.random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
         style_axes(axes, controls.title, "mean return and its standard error", "")

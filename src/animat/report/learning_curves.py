@@ -25,7 +25,7 @@ class LearningCurve:
         name: the condition.
         iterations: done at the end of each part of training, shape (parts,).
         returns: mean return of the episodes that ended in it, NaN where none did, shape (policies, parts).
-        random, limit: of random actions and the best possible with the simulator in use in each part, NaN where not
+        random, limit: of random actions and optimal with the simulator in use in each part, NaN where not
             known, shape (parts,); None where known of none.
     """
 
@@ -56,7 +56,7 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         axes.fill_between(x[some], low[some], high[some], color=BLUE, alpha=0.3, linewidth=0, label=label)
         axes.plot(x[some], mean[some], color=BLUE, linewidth=1.5, label="mean of the policies")
         for name, levels, colour, line in (
-            ("best possible return", curve.limit, LIMIT, "--"),
+            ("optimal return", curve.limit, LIMIT, "--"),
             ("random actions", curve.random, GREY, ":"),
         ):
             if levels is not None:

@@ -54,14 +54,14 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The conditions of one mapping, which share random actions and the best possible return.
+    """The conditions of one mapping, which share random actions and the optimal return.
 
     Attributes:
         title: the mapping.
         courses: with the same minutes, at most `MOST` to be drawn.
         random: of random actions at the same minutes; None where not known.
-        limit: the best possible return on a rough grid at the same minutes; None where not known.
-        fine_limit: minutes and the best possible return on a fine grid at some of them.
+        limit: the optimal return on a rough grid at the same minutes; None where not known.
+        fine_limit: minutes and the optimal return on a fine grid at some of them.
         left_out: conditions that there is no room for.
     """
 
@@ -91,10 +91,10 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
         minutes = of.courses[0].minutes
         if of.limit is not None:
-            name = "best possible return, rough grid"
+            name = "optimal return, rough grid"
             axes.plot(minutes, of.limit, color=LIMIT, linestyle="--", linewidth=1.3, label=name)
         if of.fine_limit:
-            name = "best possible return, fine grid"
+            name = "optimal return, fine grid"
             axes.plot(
                 *zip(*of.fine_limit, strict=True), color=LIMIT, linestyle="", marker="D", markersize=4, label=name
             )

@@ -17,7 +17,7 @@ CLEAR_VALLEY, FAR_VALLEY, FAR = 0.8, 0.5, 8.0
 """Between two groups; between two whose means are this many standard deviations of the lower group apart.
 
 Of samples of 60 to 1,500 responses from 24 distributions of one peak, 2 to 3 % pass for two groups, nearly all of them
-by the long tail of a lognormal one (docs/responses.md)."""
+by the long tail of a lognormal one (docs/evidence/responses.md)."""
 
 
 @dataclass(frozen=True, eq=False)

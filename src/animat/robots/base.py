@@ -69,10 +69,10 @@ class Robot(abc.ABC, Generic[State]):
 
     Methods that may be missing, and what needs them says so (`animat.robots.capabilities`):
 
-        heuristic(observation) -> command                              a rule made by hand, in JAX, of one observation
+        heuristic(observation) -> command                              a heuristic policy, in JAX, of one observation
         draw(observation, command, earlier, height_px) -> picture      uint8, shape (height, width, 3)
         draw_paths(axes, paths)                                        whole episodes on Matplotlib's axes
-        value_grid() -> animat.robots.grid.Grid                        for the best possible return
+        value_grid() -> animat.robots.grid.Grid                        for the optimal return
     """
 
     name: ClassVar[str]

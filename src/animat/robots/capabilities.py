@@ -9,8 +9,8 @@ from animat.errors import InvalidArgument
 from animat.robots.base import Robot
 
 WITHOUT = {
-    "heuristic": "no rule made by hand among the controls",
-    "value_grid": "no best possible return",
+    "heuristic": "no heuristic policy among the controls",
+    "value_grid": "no optimal return",
     "draw": "no pictures of the robot",
     "draw_paths": "no figure of paths",
 }

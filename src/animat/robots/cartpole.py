@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from animat.robots.grid import Grid
 
 FORESIGHT_S = 0.1
-"""The rule made by hand goes by where the pole will lean so much later, at the speed it falls with now."""
+"""The heuristic goes by where the pole will lean so much later, at the speed it falls with now."""
 
 
 class CartpoleState(NamedTuple):
@@ -179,7 +179,7 @@ class Cartpole(Robot[CartpoleState]):
         return 2.0 * (observation[2] + FORESIGHT_S * observation[3] > 0) - 1.0
 
     def value_grid(self) -> Grid:
-        """The grid that was measured to suit it (see docs/evaluation.md).
+        """The grid that was measured to suit it (see docs/evidence/optimal-return.md).
 
         Position and angle are those after the next iteration, which are already decided: a state in which one of them
         lies beyond its limit is lost, and the ends of the axes are where that begins. With l half the pole's length, a

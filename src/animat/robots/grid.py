@@ -194,7 +194,7 @@ def grid_for(robot: Robot[Any]) -> Grid:
         InvalidArgument: for a robot that has none, has none with its parameters, or takes several commands.
     """
     if robot.n_commands > 1:
-        raise InvalidArgument(f"{robot.name}: expected one command for a best possible return, got {robot.n_commands}")
+        raise InvalidArgument(f"{robot.name}: expected one command for an optimal return, got {robot.n_commands}")
     make = capability(robot, "value_grid")
     try:
         grid = make()

@@ -196,7 +196,7 @@ class Navigation(Robot[NavigationState]):
         return 2.0 * (right > 0) - 1.0
 
     def value_grid(self) -> Grid:
-        """The grid that was measured to suit it (see docs/evaluation.md).
+        """The grid that was measured to suit it (see docs/evidence/optimal-return.md).
 
         A hundred headings: turns of u pi/10 with u a multiple of 0.2 lead from one of them to another exactly.
         """

@@ -41,7 +41,7 @@ ROBOT: dict[str, tuple[str, str]] = {
     "learning": (
         "learning curves",
         "Return of the episodes that ended in each part of training: every policy, their mean and its 95 % bootstrap "
-        "interval; actions are drawn. Lines: random actions and the best possible return with the simulator in use, "
+        "interval; actions are drawn. Lines: random actions and the optimal return with the simulator in use, "
         "which steps on with it (from the second recording on: on a rough grid). A control has no such return: "
         "whatever it chooses is as good as random.",
     ),
@@ -49,12 +49,12 @@ ROBOT: dict[str, tuple[str, str]] = {
         "comparisons",
         "Every point is a policy's mean return. Boxes: quartiles and median. * p < 0.05, ** p < 0.01, *** p < 0.001, "
         "two-sided Mann-Whitney U, normal approximation, corrected by Holm as in the table. Under each condition: "
-        "(mean − random) / (best possible − random).",
+        "(mean − random) / (optimal − random).",
     ),
     "over-time": (
         "at every recording",
-        "The same policies on the simulator of each recording: median and quartiles over policies, with the best "
-        "possible return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
+        "The same policies on the simulator of each recording: median and quartiles over policies, with the "
+        "optimal return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
         "falls faster is the policy's. At every recording that return is on a rough grid, which can lie some below "
         "the fine one, and is left out for mappings without steps, such as `linear`.",
     ),

@@ -13,7 +13,7 @@ from animat.studies.tabulating import AIM, LEVEL
 _CULTURES = {
     "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
     "to the paper's results. How large its responses are and how they tire differ from the paper's.",
-    "made-up": "Here responses are made up: drawn from distributions that were written down, for trials.",
+    "made-up": "Here responses are synthetic: drawn from distributions that were written down, for trials.",
     "files": "Here recordings at hand are used.",
 }
 
@@ -53,7 +53,7 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
         yield (
             "Memory",
             "The paper's histogram answers the same whatever was before. Here one of the measured responses that had a "
-            "past like the present one is drawn, so what a culture remembers is in it.",
+            "similar history is drawn, so what a culture remembers is in it.",
         )
     else:
         if simulators.range_hz is None:
@@ -155,15 +155,15 @@ def explain(row: ComparedReturns) -> str:
     error_second = row.limit_error_second or 0.0
     if second - random <= error_second:
         return (
-            f"The best possible return for {row.second}, {second:.1f}, is not above that of random actions: "
+            f"The optimal return for {row.second}, {second:.1f}, is not above that of random actions: "
             "there is nothing to learn."
         )
-    limits = f"The best possible return is {second:.1f} for {row.second}"
+    limits = f"The optimal return is {second:.1f} for {row.second}"
     if first is None:
         # A control has no limit of its own: whatever it chooses, another condition is delivered.
         limits += f"; {row.first} cannot do better than random actions, {random:.1f}"
     else:
-        limits = f"The best possible return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
+        limits = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
         error = (row.limit_error_first or 0.0) + error_second
         if first - second > error:
             return f"{limits}: with these responses the order of the limits is itself the other way round."

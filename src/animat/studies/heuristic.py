@@ -1,4 +1,4 @@
-"""A study's policies beside the rule made by hand: whether learning did more than steering by a formula."""
+"""A study's policies beside the heuristic policy: whether learning did more than steering by a formula."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def beside_heuristic(study: Study, table: DataFrame, body: Body) -> Iterator[Bes
 def not_outperforming(results: Results) -> list[str]:
     """A sentence for each row whose policies do not outperform the rule."""
     return [
-        f"{row.robot}, {row.condition}, at {row.at_min:g} min: the policies do not outperform the rule made by hand "
+        f"{row.robot}, {row.condition}, at {row.at_min:g} min: the policies do not outperform the heuristic policy "
         f"({row.mean_return:.1f} against {row.heuristic:.1f}; p = {row.p:.2g})"
         for row in results.heuristic
         if row.outcome == NOT

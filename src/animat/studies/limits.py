@@ -1,4 +1,4 @@
-"""The best possible returns as jobs: at the minutes of the comparisons, and roughly at every recording."""
+"""The optimal returns as jobs: at the minutes of the comparisons, and roughly at every recording."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def left_out(study: Study) -> list[str]:
     for robot in dict.fromkeys(body.robot() for body in study.robots):
         lacks = lacking(robot)
         if (why_not := no_grid(robot)) is not None:
-            lacks.setdefault("value_grid", f"no best possible return: {why_not}")
+            lacks.setdefault("value_grid", f"no optimal return: {why_not}")
         sentences += lacks.values()
     return sentences
 
@@ -63,7 +63,7 @@ def left_out(study: Study) -> list[str]:
 @final
 @dataclass(frozen=True)
 class FindLimits(StudyTask):
-    """The best possible return on a robot for every mapping of the study, of conditions with enough responses.
+    """The optimal return on a robot for every mapping of the study, of conditions with enough responses.
 
     Of a robot without a grid the table is empty.
 

@@ -51,7 +51,7 @@ def controls_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
 
 
 def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:
-    """The best possible returns on a robot."""
+    """The optimal returns on a robot."""
     return folder / "limits" / f"{robot}-{what}.json"
 
 

@@ -114,10 +114,10 @@ def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
     """How many of the paper's comparisons came out as there; what cannot be told is neither yes nor no."""
     told = Counter(row.as_in_paper for row in rows)
     if told["cannot tell"] == len(rows):
-        return f"Whether the {len(rows)} comparisons come out as in the paper cannot be told, with as few policies."
+        return f"Whether the {len(rows)} comparisons come out as in the paper is not known, with so few policies."
     words = f"{told['yes']} of {len(rows)} comparisons came out as in the paper: the same one better, at p < {LEVEL:g}."
     if told["cannot tell"]:
-        words += f" Of {told['cannot tell']} it cannot be told, with as few policies."
+        words += f" For {told['cannot tell']} there are too few policies."
     if told["no"]:
         words += f" {told['no']} came out otherwise: highlighted, and explained under Differences from the paper."
     return words
@@ -269,4 +269,4 @@ def _noticed(results: Results) -> Section:
     table: tuple[Any, ...] = (
         (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()
     )
-    return Section("What was noticed", (said,), tables=table)
+    return Section("Findings", (said,), tables=table)

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Limit:
-    """The best possible return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
+    """The optimal return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
 
     Attributes:
         at_min: the recording that answers.
@@ -131,7 +131,7 @@ class ControlReturns:
 
 @dataclass(frozen=True)
 class BesideHeuristic:
-    """Trained policies beside the rule made by hand: mean returns, Mann-Whitney over episodes, share of pairs won."""
+    """Trained policies beside the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
 
     robot: str
     condition: str

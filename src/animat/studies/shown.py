@@ -22,7 +22,7 @@ _MOST_LABELS = 12
 _MOST_ROWS = 40
 
 _SCORE_NOTE = (
-    "Limit: the best possible return of any controller with the same neurons, mapping and robot, by dynamic "
+    "Limit: the optimal return of any controller with the same neurons, mapping and robot, by dynamic "
     "programming. Score: (mean − random) / (limit − random); 0 is as good as random actions, 1 the limit, which "
     "chance can pass. A control, whose delivery is drawn at random, has no limit: whatever it chooses is as good as "
     "random."
@@ -107,7 +107,7 @@ def scores_shown(rows: Sequence[Score]) -> Table:
 
 
 def limits_shown(limits: Sequence[Limit]) -> Table:
-    """The best possible returns as brackets, with their intervals; what was left out of them is said."""
+    """The optimal returns as brackets, with their intervals; what was left out of them is said."""
     columns: Columns = [
         ("robot", "robot"),
         ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
@@ -127,14 +127,15 @@ def limits_shown(limits: Sequence[Limit]) -> Table:
             "which would promise too much: no score is against these, as policies act on all conditions."
         )
     return Table(
-        "Best possible returns",
+        "Optimal returns",
         *_columns(limits, columns),
-        note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses tell "
-        "the value, redrawn 39 times; for threshold mappings, where a condition is evaluated. Run: the mean return of "
-        "the controller that takes the best actions, on the robot itself, ± its standard error: a return that can be "
-        "had. The best possible return lies between the two; scores keep to the value, the upper end. Highlighted: "
-        "they part by more than 3 standard errors and the grid's error. Without clock: the same controller if it "
-        "does not know the time left, as policies do not. On a rough grid at every recording: limits/." + left_out,
+        note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses "
+        "determine the value, bootstrapped 39 times; for threshold mappings, where a condition is evaluated. "
+        "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its "
+        "standard error: a return that can be had. The optimal return lies between the two; scores keep to "
+        "the value, the upper end. Highlighted: they part by more than 3 standard errors and the grid's "
+        "error. Without clock: the same controller if it does not know the time left, as policies do not. On "
+        "a rough grid at every recording: limits/." + left_out,
         beside="tables/limits.csv",
         marked=tuple(i for i, row in enumerate(limits) if row.findings()),
     )
@@ -176,7 +177,7 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
     )
     if kinds:
         mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)
-        note += f" Limit: the best possible return with {mapping} on a rough grid."
+        note += f" Limit: the optimal return with {mapping} on a rough grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."
     return Table(
@@ -227,9 +228,9 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
 
 
 def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
-    """Trained policies beside the rule made by hand, episode by episode."""
+    """Trained policies beside the heuristic policy, episode by episode."""
     return Table(
-        "Policies beside the rule made by hand",
+        "Policies beside the heuristic policy",
         *_columns(
             rows,
             [
@@ -237,14 +238,14 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
                 ("condition", "condition"),
                 ("at (min)", "at_min"),
                 ("policies", "mean_return"),
-                ("made by hand", "heuristic"),
+                ("heuristic", "heuristic"),
                 ("p", "p"),
                 ("pairs won", "wins"),
                 ("the policies", "outcome"),
             ],
         ),
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
-        "return is larger, ties half. Highlighted: learning brought no more than the rule did.",
+        "return is larger, ties half. Highlighted: learning brought no more than the heuristic policy did.",
         beside="tables/heuristic.csv",
         marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
     )

@@ -48,7 +48,7 @@ class Fit(StudyTask):
             raise UnusableData(
                 "simulators.conditions: expected two or more for an agent to choose from, got one "
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
-                '(to go on in spite of it: simulators.allow = ["one-condition"])'
+                '(to allow it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)

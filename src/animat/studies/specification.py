@@ -23,7 +23,7 @@ from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 MOST_TRAINED = 20_000
 """Policies of all conditions on all robots: each is a file, and five are a job."""
 FINEST_RESOLUTION = 2.0
-"""Of the best possible return's grid: the cartpole's tables are of 2 GiB there, and grow with its fourth power."""
+"""Of the optimal return's grid: the cartpole's tables are of 2 GiB there, and grow with its fourth power."""
 
 
 def _name(given: str) -> str:
@@ -95,7 +95,7 @@ class Body:
             where to import it from, `my_package.robots:Rover`, which is filled in for robots that are not ours.
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
-        limit_resolution: of its best possible return, in place of the study's.
+        limit_resolution: of its optimal return, in place of the study's.
     """
 
     name: Name
@@ -168,7 +168,7 @@ class StudyCondition:
 
     @property
     def has_steps(self) -> bool:
-        """Whether its mapping gives a few commands only, with which best possible returns are quick."""
+        """Whether its mapping gives a few commands only, with which optimal returns are quick."""
         return self.through_neurons and isinstance(mapping_named(self.mapping), Thresholds)
 
     @property
@@ -222,7 +222,7 @@ class Study:
         episodes: of each policy where no comparison says otherwise, and of controls.
         episodes_over_time: of each policy at every recording.
         actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
-        limit_resolution: steps of the grid of the best possible return, as a multiple; 0.6 is fast and rough.
+        limit_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
         limit_episodes: episodes in which that controller's return is checked.
         algorithm: settings of `animat.training.settings.SAC` in place of its defaults.
         paper: whether the paper's own figures are printed beside comparisons of the same name and robot.

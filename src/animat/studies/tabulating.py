@@ -124,7 +124,7 @@ def _controllability(timeline: SimulatorTimeline) -> Iterator[tuple[Any, ...]]:
 
 
 class References:
-    """Random policies and best possible returns on a robot, for every mapping and minute.
+    """Random policies and optimal returns on a robot, for every mapping and minute.
 
     Args:
         table: of the robot's episodes.
@@ -146,7 +146,7 @@ class References:
         return self._of(self._random, condition, at_min)
 
     def limit(self, condition: StudyCondition, at_min: float) -> Limit | None:
-        """The best possible return and how well it is known.
+        """The optimal return and how well it is known.
 
         None for a control, which can do nothing, and where conditions with few responses were left out of it.
         """
@@ -242,7 +242,7 @@ def outcome_of(told: Comparison) -> str:
 
 
 def _limit_error(limit: Limit | None) -> float | None:
-    """How far the best possible return may lie from its value: by the grid, or down to the controller's return."""
+    """How far the optimal return may lie from its value: by the grid, or down to the controller's return."""
     if limit is None or limit.grid_error is None:
         return None
     return max(limit.grid_error, *(abs(each.value or 0.0) for each in limit.findings()), 0.0)

@@ -214,7 +214,7 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
             if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, len(leaves[0]), 3):
                 raise InvalidFile(
                     f"{path}: expected a checkpoint as this animat writes it, of {len(leaves[0])} policies together, "
-                    f"got another's (one of before grouped 2 to 5 otherwise); to begin these anew: rm '{path}'"
+                    f"got another's (a former version grouped 2 to 5 otherwise); to begin these anew: rm '{path}'"
                 )
             read = [jnp.asarray(array) for array in kept]
     except InvalidFile:

@@ -210,8 +210,8 @@ def _findings(
     noise_uv: Float32[np.ndarray, " channels"], n_stimuli: int, saturation: np.ndarray, settings: Detection
 ) -> Iterator[Finding]:
     n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
-    yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are troughs of "
-                  f"{settings.threshold:g} times it and more", middle)  # fmt: skip
+    yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
+                  f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
     dead = int(np.count_nonzero(is_dead(noise_uv)))
     if dead:
         yield Finding(

@@ -25,7 +25,8 @@ MANY_BURSTS = 0.25
 SMALL_DIFFERENCE = 0.1
 """Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
 LITTLE_DIFFERENCE = 0.2
-"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200 (docs/evaluation)."""
+"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200
+(docs/evidence/optimal-return.md)."""
 
 _WINDOW_PARTS = 8
 
@@ -80,7 +81,7 @@ def findings_without_times(
         Finding(
             "spike-times-unknown",
             "warning",
-            "the table has no times of spikes, so it cannot be told whether its window holds the response, an artefact "
+            "the table has no times of spikes, so it is not known whether its window holds the response, an artefact "
             "or a blank, nor how the culture fires without stimuli",
         ),
         *_without_times(responses, bursts),
@@ -321,7 +322,7 @@ def _difference(responses: Responses) -> Iterator[Finding]:
             "little-difference",
             "warning",
             f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
-            "a robot can hardly be steered: --limit cartpole tells how far; stimulate in ways that differ more",
+            "a robot can hardly be steered: --limit cartpole computes how far; stimulate in ways that differ more",
             spread,
         )
     else:
