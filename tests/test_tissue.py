@@ -405,6 +405,23 @@ def test_the_conduction_of_a_stimulated_axon_follows_its_load() -> None:
     assert np.all(tissue._state.load[1:] == 0.0)
 
 
+@pytest.mark.parametrize("output_loss", [0.0, 0.5, 1.0])
+def test_a_neuron_sends_as_much_less_as_its_axon_fails_to_conduct(output_loss: float) -> None:
+    parameters = dataclasses.replace(SILENT, drift_share=0.0, output_loss=output_loss)
+    inhibitory = parameters.n_excitatory
+    sent = []
+    for missing in (0.0, 0.4):
+        tissue = Tissue(1, parameters)
+        # Driven just now, by next to nothing: what is missing has had no time to change.
+        tissue._state.missing[:], tissue._state.load[:], tissue._state.last_driven[:] = missing, 1e-9, tissue._step
+        spike(tissue, 0)
+        spike(tissue, inhibitory)
+        sent.append((tissue._state.arriving_ampa.sum(), tissue._state.arriving_gaba.sum()))
+    (excited, inhibited), (excited_less, inhibited_as_much) = sent
+    assert excited_less == pytest.approx((1 - 0.4 * output_loss) * excited, rel=1e-3)
+    assert inhibited_as_much == inhibited > 0
+
+
 def test_kicks_near_the_electrode_need_no_axon() -> None:
     tissue = Tissue(1, SILENT)
     tissue._state.missing[:] = 1.0

@@ -42,6 +42,7 @@ class Constants(NamedTuple):
     scaling_rest: float
     scaling_recovery_s: float
     load_gain: float
+    output_loss: float
     load_s: float
     conduction_s: float
     n_excitatory: int

@@ -183,16 +183,22 @@ def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: floa
 
 
 @inlined
-def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: int) -> bool:
-    """Whether neuron i's stimulated axon brings its spike to the soma: what is missing follows the load, slowly."""
+def missing_of(constants: Constants, state: State, i: int, step: int) -> float:
+    """The share of spikes that neuron i's stimulated axon fails to conduct: it follows the load, slowly."""
     since_s = (step - state.last_driven[i]) * constants.step_s
     load_kept, missing_kept = math.exp(-since_s / constants.load_s), math.exp(-since_s / constants.conduction_s)
     follows = constants.load_s / (constants.load_s - constants.conduction_s)
-    missing = state.missing[i] * missing_kept + follows * state.load[i] * (load_kept - missing_kept)
+    return state.missing[i] * missing_kept + follows * state.load[i] * (load_kept - missing_kept)
+
+
+@inlined
+def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: int) -> bool:
+    """Whether neuron i's stimulated axon brings its spike to the soma, which loads the axon."""
+    missing = missing_of(constants, state, i, step)
     if uniform(mixed(wiring.axon_key[i], step)) < missing:
         return False
+    load = state.load[i] * math.exp(-(step - state.last_driven[i]) * constants.step_s / constants.load_s)
     state.last_driven[i], state.missing[i] = step, missing
-    load = state.load[i] * load_kept
     state.load[i] = load + constants.load_gain * (1.0 - load)
     return True
 
@@ -211,6 +217,8 @@ def fire(
         state.last_scaled[0] = step
         scaling = recovered(state.scaling[0], constants.scaling_rest, since_s, constants.scaling_recovery_s)
         strength = scaling * gain
+        if state.load[i] > 0.0:
+            strength *= 1.0 - constants.output_loss * missing_of(constants, state, i, step)
         state.scaling[0] = scaling * (1.0 - constants.scaling_loss)
     available = recovered(state.available[i], 1.0, elapsed_s, constants.availability_s)
     state.available[i] = available * (1.0 - constants.availability_loss)

@@ -7,7 +7,7 @@ from math import isfinite
 
 from animat.errors import InvalidArgument
 
-REVISION = 3
+REVISION = 4
 """Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
 before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
 another revision are then refused, in place of being gone on with as if they were of this tissue."""
@@ -66,12 +66,12 @@ class TissueParameters:
     refractory_e_ms: float = 3.0
     refractory_i_ms: float = 2.0
     """[L] Absolute refractory periods."""
-    hyperpolarisation: float = 0.00175
+    hyperpolarisation: float = 0.0023
     """[C] Added to the potassium conductance by each spike."""
     hyperpolarisation_ms: float = 25000.0
     """[L] Its time constant: after a train the sodium pump hyperpolarises for about 20 s (Gulledge et al. 2013,
     doi 10.1523/JNEUROSCI.0220-13.2013)."""
-    adaptation_mv: float = 0.7
+    adaptation_mv: float = 0.37
     """[C] Added to the threshold by each spike."""
     adaptation_ms: float = 126.0
     """[C] Its time constant."""
@@ -85,14 +85,14 @@ class TissueParameters:
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
     nmda_saturation: float = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
-    e_to_e: ShortTerm = ShortTerm(0.12, 1000.0, 220.0)
+    e_to_e: ShortTerm = ShortTerm(0.12, 1050.0, 220.0)
     e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
     i_to_any: ShortTerm = ShortTerm(0.137, 665.0)
     """[C] within [L]: short-term plasticity."""
     weight_ee: float = 0.5505
     weight_ei: float = 0.9483
-    weight_ie: float = 0.3593
-    weight_ii: float = 0.7774
+    weight_ie: float = 0.302
+    weight_ii: float = 0.94
     """[C] Mean weights, from the first letter to the second."""
     weight_sigma: float = 0.5
     """[C] Sigma of the log-normal weights."""
@@ -124,7 +124,7 @@ class TissueParameters:
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
     """[C] Its time constant."""
-    shared_noise_mv: float = 0.562
+    shared_noise_mv: float = 0.6
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
     shared_noise_ms: float = 575.0
     """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
@@ -137,7 +137,7 @@ class TissueParameters:
     """[C] Sigma of its log-normal spread over neurons (median 1)."""
     kick_reach_um: float = 40.0
     """[C] The kick falls as 1 / (1 + (distance / reach)^2)."""
-    axons_per_electrode: float = 14.21
+    axons_per_electrode: float = 16.0
     """[C] Expected number of neurons that an electrode drives through their axons."""
     axon_reach_um: float = 500.0
     """[C] Their probability falls as exp(-distance / reach)."""
@@ -169,6 +169,9 @@ class TissueParameters:
     """[C] Time constant with which the load leaves."""
     conduction_min: float = 90.0
     """[C] Time constant with which the share of such spikes that fail follows it (Grubb & Burrone 2010: hours)."""
+    output_loss: float = 1.0
+    """[C] Share of an excitatory neuron's output that is lost as its axon's conduction is: 1, all that its axon fails to
+    conduct in one direction it fails to conduct in the other."""
     drift_share: float = 0.03
     drift_min: float = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""

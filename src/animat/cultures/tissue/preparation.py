@@ -65,6 +65,7 @@ def prepare_constants(parameters: TissueParameters) -> Constants:
         scaling_rest=parameters.scaling_rest,
         scaling_recovery_s=parameters.scaling_min * 60,
         load_gain=parameters.load_gain,
+        output_loss=parameters.output_loss,
         load_s=parameters.load_min * 60,
         conduction_s=parameters.conduction_min * 60,
         n_excitatory=parameters.n_excitatory,
