@@ -109,17 +109,11 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     """
     animat = unwrapped(environment)
     if not isinstance(animat, Animat):
-        actions: np.ndarray
-        if environment.n_actions is None:
-            actions = np.linspace(-1.0, 1.0, CONTINUOUS_ACTIONS).astype(np.float32)
-        else:
-            actions = np.arange(environment.n_actions)
-        start, nothing_random = environment.reset(jax.random.key(0)), jnp.zeros(environment.noise_size)
-        after = jax.vmap(environment.advance, (None, None, 0, None))(
-            nothing_random, start, jnp.asarray(actions), simulator
-        )
-        leads_to = np.asarray(after.info["command"], np.float64)
-        return Commands(actions, leads_to[:, None], np.ones((len(actions), 1)))
+        n, start = environment.n_actions, environment.reset(jax.random.key(0))
+        actions = jnp.arange(n) if n is not None else jnp.asarray(np.linspace(-1, 1, CONTINUOUS_ACTIONS), jnp.float32)
+        step = jax.vmap(environment.advance, (None, None, 0, None))
+        leads_to = step(jnp.zeros(environment.noise_size), start, actions, simulator).info["command"]
+        return Commands(np.asarray(actions), np.asarray(leads_to, np.float64)[:, None], np.ones((len(actions), 1)))
     if simulator is None:
         raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
     if isinstance(animat.mapping, Thresholds):
