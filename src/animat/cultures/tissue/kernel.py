@@ -188,7 +188,7 @@ def missing_of(constants: Constants, state: State, i: int, step: int) -> float:
     since_s = (step - state.last_driven[i]) * constants.step_s
     load_kept, missing_kept = math.exp(-since_s / constants.load_s), math.exp(-since_s / constants.conduction_s)
     follows = constants.load_s / (constants.load_s - constants.conduction_s)
-    return state.missing[i] * missing_kept + follows * state.load[i] * (load_kept - missing_kept)
+    return float(state.missing[i] * missing_kept + follows * state.load[i] * (load_kept - missing_kept))
 
 
 @inlined

@@ -170,8 +170,7 @@ class TissueParameters:
     conduction_min: float = 90.0
     """[C] Time constant with which the share of such spikes that fail follows it (Grubb & Burrone 2010: hours)."""
     output_loss: float = 1.0
-    """[C] Share of an excitatory neuron's output that is lost as its axon's conduction is: 1, all that its axon fails to
-    conduct in one direction it fails to conduct in the other."""
+    """[C] How much of what an excitatory neuron's axon fails to conduct is missing in its output too; 1: all of it."""
     drift_share: float = 0.03
     drift_min: float = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""
