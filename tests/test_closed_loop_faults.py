@@ -597,7 +597,8 @@ def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again
         raise UnusableData("dead-window: nothing is answered")
 
     policy_of(0).save(tmp_path / "p0.safetensors")
-    given = ["run", str(tmp_path / "p0.safetensors"), "--episodes", "1", "--out", str(tmp_path / "session")]
+    given = ["run", str(tmp_path / "p0.safetensors"), "--episodes", "1", "--controls", "random"]
+    given += ["--out", str(tmp_path / "session")]
     monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
     with monkeypatch.context() as patched:
         patched.setattr("animat.responses.series.extract_series", dead)

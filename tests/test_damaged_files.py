@@ -38,7 +38,11 @@ def damage(kind: str, seed: int, count: int, folder: Path) -> None:
     print(done.stdout)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+# Those that rigs write are read by the same library in the same process as one of ours.
+RIGS = ("other-nwb", "maxwell", "old-maxwell")
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.oracle] * (k in RIGS)) for k in KINDS])
 def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 1, 100, tmp_path)
 

@@ -342,6 +342,7 @@ def test_where_there_is_no_limit_or_no_score_a_line_says_so() -> None:
     assert "no score, as the optimal return is not above" in nothing_to_learn.to_text()
 
 
+@pytest.mark.oracle
 def test_shuffling_makes_every_policy_a_random_one() -> None:
     timeline = timeline_of()
     evaluation = evaluate({"a": policy_of(timeline)}, timeline, episodes=3_000)
@@ -392,5 +393,5 @@ def test_another_presentation_or_window_is_said() -> None:
             ),
         ]
     )
-    evaluation = evaluate({"a": policy_of(timeline)}, other, episodes=2)
+    evaluation = evaluate({"a": policy_of(timeline)}, other, episodes=50)
     assert [finding.name for finding in evaluation.findings] == ["other-window", "other-presentation"]

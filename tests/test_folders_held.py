@@ -28,8 +28,8 @@ def command(name: str, folder: Path) -> list[str]:
     """A command that opens a culture for the folder `out`."""
     policy_of(0).save(folder / "p0.safetensors")
     made_up = folder / "made-up.nwb"
-    if not made_up.exists():
-        write_nwb(make_up_recording(1, channels=32), made_up)
+    if name in ("record replay", "run on recordings"):
+        write_nwb(make_up_recording(1, patterns=40, channels=32), made_up)
     return {
         "record made-up": ["record", "--culture", "made-up", "--sessions", "1"],
         "record cl1": ["record", "--culture", "cl1"],

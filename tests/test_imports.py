@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -58,6 +59,7 @@ FILES = {
 """Every module of the package by its name."""
 
 
+@cache
 def imports_of(name: str) -> set[str]:
     """The modules of animat that a module imports: at its top, late, or for types only."""
     found = set()
@@ -71,9 +73,6 @@ def imports_of(name: str) -> set[str]:
     return found & FILES.keys() - {name}
 
 
-IMPORTS = {name: imports_of(name) for name in FILES}
-
-
 def room_of(name: str) -> str:
     return name.split(".")[1]
 
@@ -83,12 +82,12 @@ def room_of(name: str) -> str:
 def test_no_import_runs_back_up_the_story(name: str) -> None:
     room = room_of(name)
     before = () if room in GROUND else STORY[: STORY.index(room)]
-    assert {room_of(imported) for imported in IMPORTS[name]} <= {*GROUND, *before, room}
+    assert {room_of(imported) for imported in imports_of(name)} <= {*GROUND, *before, room}
 
 
 def test_no_two_files_import_each_other() -> None:
     try:
-        TopologicalSorter(IMPORTS).prepare()
+        TopologicalSorter({name: imports_of(name) for name in FILES}).prepare()
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
 

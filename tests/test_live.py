@@ -337,6 +337,7 @@ def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
     assert "ended before its time (the culture raised DeviceFailed: gone)" in (what_stands(tmp_path / "live") or "")
 
 
+@pytest.mark.oracle
 def test_policies_are_kept_while_they_are_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("animat.live.trainers.KEEP_S", 0.0)
 

@@ -367,7 +367,7 @@ def persistent(n: int = 10) -> MemorySimulator:
     )
 
 
-@pytest.mark.parametrize("limit", [1, 2, 5, 60])
+@pytest.mark.parametrize("limit", [2, 60, *(pytest.param(limit, marks=pytest.mark.oracle) for limit in (1, 5))])
 def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
     """Up and down stairs with a coin that remembers, folded back by hand over step and last toss."""
     heads = np.array([[0.2, 0.5], [0.5, 0.8]])  # after tails and heads, of each action
@@ -440,7 +440,9 @@ def test_the_limit_of_a_simulator_of_ones_own_that_remembers_is_refused() -> Non
         best_return(Animat(Stairs(), Thresholds(1), 5), own, grid=STEPS, episodes=0)
 
 
-@pytest.mark.parametrize("mapping", [Thresholds(1), pytest.param(Thresholds(9), marks=pytest.mark.oracle), Linear()])
+@pytest.mark.parametrize(
+    "mapping", [Thresholds(1), *(pytest.param(other, marks=pytest.mark.oracle) for other in (Thresholds(9), Linear()))]
+)
 def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory(mapping: Any) -> None:
     responses = independent(0)
     simulator, plain = fit_memory(responses), fit_empirical(responses)

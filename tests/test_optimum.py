@@ -94,7 +94,7 @@ def test_the_best_of_many_conditions_is_found() -> None:
 @pytest.mark.parametrize(("limit", "truth"), [(1, 0.0), (2, 0.36), (3, 0.36), (4, 0.36 + 2 * 0.24 * 0.36)])
 def test_short_horizons_by_hand(limit: int, truth: float) -> None:
     """Two up, or one down on the way: p p, then (p q + q p) p p more."""
-    found = best_return(Animat(Stairs(limit), Thresholds(1), 2), coins(3, 6), grid=STEPS, episodes=2)
+    found = best_return(Animat(Stairs(limit), Thresholds(1), 2), coins(3, 6), grid=STEPS, episodes=0)
     assert found.value == pytest.approx(truth, abs=1e-5)
 
 
@@ -151,7 +151,7 @@ def test_navigation_tried_to_the_end() -> None:
 
 def test_navigation_with_ten_levels_tried_to_the_end() -> None:
     environment = Animat(Navigation(episode_limit=4), Thresholds(9), 5)
-    found = best_return(environment, SIMULATOR, resolution=0.5, episodes=2)
+    found = best_return(environment, SIMULATOR, resolution=0.5, episodes=0)
     assert found.value == pytest.approx(expectimax(environment, SIMULATOR), abs=0.003)
 
 
@@ -172,7 +172,7 @@ def test_cartpole_tried_to_the_end() -> None:
 def test_where_nothing_can_be_chosen_the_limit_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
     """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
     environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
-    found = best_return(environment, SIMULATOR, resolution=resolution, episodes=2)
+    found = best_return(environment, SIMULATOR, resolution=resolution, episodes=0)
     returns = roll_out(environment, SIMULATOR, Uniform(), 1, episodes=8000, seed=5).returns
     error = float(returns.std() / math.sqrt(returns.size))
     assert abs(found.value - returns.mean()) < 4 * error + found.grid_error
@@ -190,11 +190,11 @@ def test_more_separated_conditions_allow_more() -> None:
     robot = Navigation()
     means = [[42.0 + spread * (i - 2) for i in range(5)] for spread in (0.0, 3.0, 6.0, 9.0)]
     cases = [(Animat(robot, Thresholds(1), 5), made_up_simulator(m)) for m in means]
-    found = best_returns(cases, resolution=0.5, episodes=2)
+    found = best_returns(cases, resolution=0.5, episodes=0)
     values = [optimum.value for optimum in found]
     assert values == sorted(values)
     assert values[-1] - values[0] > 20
-    one = best_return(*cases[2], resolution=0.5, episodes=2)
+    one = best_return(*cases[2], resolution=0.5, episodes=0)
     assert one.value == pytest.approx(values[2], abs=0.01)
 
 

@@ -175,7 +175,7 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
     assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
 
 
-@pytest.mark.parametrize("scale", [1e-12, 1e-7, 1e7, 1e12])
+@pytest.mark.parametrize("scale", [1e-12, 1e12, *(pytest.param(x, marks=pytest.mark.oracle) for x in (1e-7, 1e7))])
 def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
     # In the unit that the robot is observed in, it moves as far as the scale says.
     robot = slider(quantities=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale]))

@@ -27,11 +27,17 @@ PATTERNS = np.arange(500).reshape(100, 5)
 MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)
 
 
+@pytest.fixture(scope="module")
+def made_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("made-up") / "made-up.nwb"
+    write_nwb(make_up_recording(1, patterns=6, channels=16), file)
+    return file
+
+
 @pytest.fixture
-def replayed(tmp_path: Path) -> list[str]:
+def replayed(made_up: Path, tmp_path: Path) -> list[str]:
     """The command that records a replay of a made-up recording, as far as the protocol."""
-    write_nwb(make_up_recording(1, patterns=6, channels=16), tmp_path / "made-up.nwb")
-    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(tmp_path / "made-up.nwb"), "--out",
+    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(made_up), "--out",
             str(tmp_path / "out")]  # fmt: skip
 
 

@@ -161,13 +161,13 @@ def test_data_of_another_form_are_refused(data: object) -> None:
 )
 def test_no_return_is_outside_of_its_range(robot: Robot) -> None:
     low, high = robot.return_range
-    for seed in range(60):
-        key, total = jax.random.key(seed), 0.0
-        state = robot.reset(key)
-        for iteration in range(min(robot.episode_limit, 40)):
-            u = jnp.float32(1.0 if seed % 3 == 0 else np.sin(seed * iteration))
-            state, reward, terminated = robot.step(jax.random.fold_in(key, iteration), state, u)
-            total += float(reward)
-            if terminated:
-                break
-        assert low - 1e-4 <= total <= high + 1e-4
+    seeds = np.arange(60)
+    keys = jax.vmap(jax.random.key)(seeds)
+    state, total, going = jax.vmap(robot.reset)(keys), np.zeros(60), np.ones(60, bool)
+    step = jax.jit(jax.vmap(lambda key, n, state, u: robot.step(jax.random.fold_in(key, n), state, u), (0, None, 0, 0)))
+    for iteration in range(min(robot.episode_limit, 40)):
+        u = np.where(seeds % 3 == 0, 1.0, np.sin(seeds * iteration)).astype(np.float32)
+        state, reward, terminated = step(keys, iteration, state, u)
+        total += np.where(going, reward, 0.0)
+        going &= ~np.asarray(terminated)
+    assert np.all((low - 1e-4 <= total) & (total <= high + 1e-4))

@@ -52,9 +52,13 @@ def of_halves(
 
 def drawn(simulator: NeuronSimulator, n: int = 4000) -> np.ndarray:
     """Responses at evenly spaced uniforms, shape (conditions, n, readouts)."""
-    uniforms = (jnp.arange(n, dtype=jnp.float32) + 0.5) / n
+    return np.asarray(_quantiles(simulator, (np.arange(n, dtype=np.float32) + 0.5) / n))
+
+
+@jax.jit
+def _quantiles(simulator: NeuronSimulator, uniforms: jax.Array) -> jax.Array:
     of_condition = jax.vmap(simulator.quantile, (None, 0))
-    return np.asarray(jax.vmap(of_condition, (0, None))(jnp.arange(simulator.n_conditions), uniforms))
+    return jax.vmap(of_condition, (0, None))(jnp.arange(simulator.n_conditions), uniforms)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -168,8 +172,9 @@ def test_mean_commands_are_those_of_many_draws() -> None:
     simulator = fit_simulator(of_halves(), kind="histogram")
     actions, means = mean_commands(Animat(Wheels(), Thresholds(9), 3), simulator)
     keys = jax.random.split(jax.random.key(0), 4000)
+    sample = jax.jit(jax.vmap(simulator.sample, (0, None)))
     for c in actions:
-        x = jax.vmap(simulator.sample, (0, None))(keys, jnp.int32(c))
+        x = sample(keys, jnp.int32(c))
         u: Any = decoded(Thresholds(9), x, simulator.percentiles)
         np.testing.assert_allclose(means[c], u.mean(axis=0), atol=0.05)
 

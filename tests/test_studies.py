@@ -68,9 +68,10 @@ CONTROLS = [condition.name for condition in read_study(TINY).conditions if condi
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny study, run through the command line with two workers."""
+    """A tiny study, run in this process, where its programs are compiled once."""
     folder = tmp_path_factory.mktemp("studies") / "tiny"
-    assert main(["study", str(TINY), "--out", str(folder), "--workers", "2"]) == 0
+    with ThreadPoolExecutor(1) as executor:
+        run_study(read_study(TINY), folder, base=TINY.parent, executor=executor)
     return folder
 
 
@@ -144,13 +145,16 @@ def test_a_finished_folder_is_left_alone_and_said_to_be_so(finished: Path, capsy
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
 
 
-def test_what_is_lost_or_damaged_is_made_again(finished: Path, tmp_path: Path) -> None:
+def test_what_is_lost_or_damaged_is_made_again_by_workers(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "damaged"
     shutil.copytree(finished, folder)
     (folder / "policies/navigation/1-threshold/p1.safetensors").write_bytes(b"damaged")
     (folder / "tables/scores.csv").unlink()
-    ran = run_study(read_study(TINY), folder, base=TINY.parent, workers=1)
-    assert set(ran.done_now) == {"train/navigation/1-threshold/p0", "tables"}
+    assert main(["study", str(TINY), "--out", str(folder), "--workers", "2", "--json"]) == 0
+    done_now = json.loads(capsys.readouterr().out.splitlines()[-1])["done_now_cpu_s"]
+    assert set(done_now) == {"train/navigation/1-threshold/p0", "tables"}
     assert files(folder) == files(finished)
 
 

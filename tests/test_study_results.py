@@ -150,7 +150,7 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
 # --- who answers ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("delivery", ["chosen", "shuffled"])
+@pytest.mark.parametrize("delivery", [pytest.param("chosen", marks=pytest.mark.oracle), "shuffled"])
 def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(tmp_path: Path, delivery: Any) -> None:
     condition = StudyCondition("control", delivery=delivery, trained=False)
     study = Study(

@@ -64,23 +64,17 @@ class Kept:
         self.told.append((done, total))
 
 
-def test_the_same_seed_gives_the_same_bits_with_any_number_of_workers(tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_stays_open(tmp_path: Path) -> None:
     six = replace(SHORT, policies=6, iterations=2_000)
     progress = Kept()
-    train(six, timeline_of(), tmp_path / "one", workers=1, progress=progress)
-    train(six, timeline_of(), tmp_path / "two", workers=2)
-    assert list(bits(tmp_path / "one")) == [f"p{i}.safetensors" for i in range(6)]
-    assert bits(tmp_path / "one") == bits(tmp_path / "two")
-    assert progress.told[-1] == (6 * CHUNKS, 6 * CHUNKS)
-    assert not (tmp_path / "one" / ".unfinished").exists()
-
-
-def test_it_runs_on_another_executor_which_stays_open(tmp_path: Path) -> None:
-    six = replace(SHORT, policies=6, iterations=500)
+    train(six, timeline_of(), tmp_path / "two", workers=2, progress=progress)
     with ThreadPoolExecutor(2) as executor:
         lent = train(six, timeline_of(), tmp_path / "lent", executor=executor)
         assert executor.submit(len, lent).result() == 6
-    assert not (tmp_path / "lent" / ".unfinished").exists()
+    assert list(bits(tmp_path / "two")) == [f"p{i}.safetensors" for i in range(6)]
+    assert bits(tmp_path / "two") == bits(tmp_path / "lent")
+    assert progress.told[-1] == (6 * CHUNKS, 6 * CHUNKS)
+    assert not any((tmp_path / name / ".unfinished").exists() for name in ("two", "lent"))
     alone = train(six, timeline_of(), None)
     for name, policy in lent.items():
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
@@ -106,7 +100,7 @@ train(SHORT, timeline_of(), Path(sys.argv[1]), checkpoint_s=0.0)
 
 @pytest.mark.oracle
 def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_path: Path) -> None:
-    train(SHORT, timeline_of(), tmp_path / "undisturbed")
+    train(SHORT, timeline_of(), tmp_path / "undisturbed", workers=1)
     folder = tmp_path / "killed"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     checkpoint = folder / ".unfinished" / "from-p0.npz"

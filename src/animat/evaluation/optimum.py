@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -215,6 +216,13 @@ def rough_values(
     return programme.run(None, seed), programme.bounds
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, action: Any, simulator: Any) -> Any:
+    """An iteration of every episode; of the module, so that it is compiled once, with the clock and without."""
+    uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
+    return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
+
+
 def _mean_with_error(returns: Float64[np.ndarray, " episodes"] | None) -> tuple[float, float]:
     if returns is None:
         return math.nan, math.nan
@@ -314,11 +322,6 @@ class _Programme:
         outcomes, actions = self._outcomes[case], self._actions[case]
         pairs = np.repeat(outcomes.pairs[None], len(outcomes.weights), axis=0)
 
-        @jax.jit
-        def step(key: Any, state: Any, action: Any, simulator: Any) -> Any:
-            uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
-            return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
-
         first, others = jax.random.split(jax.random.key(seed))
         state = jax.vmap(environment.reset)(jax.random.split(first, episodes))
         returns = np.zeros(episodes)
@@ -342,7 +345,7 @@ class _Programme:
                 chosen,
             )
             action = actions[np.minimum(chosen, len(actions) - 1)]
-            state = step(key, state, action, simulator)
+            state = _step(environment, episodes, key, state, action, simulator)
             returns += np.where(going, np.asarray(state.reward, np.float64), 0.0)
             going &= ~np.asarray(state.ended.terminated)
             if not going.any():
