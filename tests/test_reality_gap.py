@@ -39,7 +39,7 @@ from animat.reality_gap import Calibration, RealityGap, check_policies, run_poli
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import RecordedCulture, Recording
@@ -262,7 +262,7 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
 
 def test_what_policies_were_answered_is_as_the_log_and_the_followed_median_have_it(without_controls: Ran) -> None:
     gap, policies, told = without_controls
-    assert told == [str(gap.outlook)]
+    assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
     assert gap.loop.following is not None
     following, p50_hz, passed = Following(gap.loop.following), gap.loop.percentiles[5], []
     ticks, episode = [tick for tick in gap.session.ticks if tick.contender in policies], -1

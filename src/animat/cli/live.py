@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import say_findings
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
 from animat.writing import alone_in
@@ -143,7 +142,6 @@ class Live(Stimulating):
                 f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
                 f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
             )
-        say_findings(lived.gap.findings)
         print(lived.gap.to_text())
         expect_no_fault(lived.gap.session, self.out)
 

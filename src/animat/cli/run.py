@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import fit_as, policies_for, say_findings
+from animat.cli.responses import fit_as, policies_for
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
 from animat.writing import alone_in
@@ -145,7 +145,6 @@ class Run(Stimulating):
         return gap.to_dict()
 
     def _tell(self, gap: RealityGap) -> None:
-        say_findings(gap.findings)
         print(gap.to_text())
         if gap.session.recording_file.is_file():
             print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")

@@ -35,7 +35,7 @@ from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import Predicted, predict, together
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.table import RealityGap, Row
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, warnings_once
 from animat.responses.condition import other_stimulus
 from animat.robots.capabilities import lacking
 from animat.robots.grid import grid_for, no_grid
@@ -86,7 +86,7 @@ def run_policies(
         pulses: of a presentation; None: as in the policies' recordings.
         account: of a stimulation budget.
         progress: told after each episode.
-        tell: is given one line before the session, on how long it will and can be.
+        tell: is given lines before the session: the warnings, and how long it will and can be.
         noticed: findings to be told beside those made here.
         settings: other attributes of `Loop`.
 
@@ -174,7 +174,11 @@ def run_policies(
         for n, each in zip(of_each, contenders, strict=True)
     ]
     ahead = outlook(loop, calibration, plan, account, culture.now_s / 60)
+    findings = (*noticed, *findings, *calibration.findings)
     if tell is not None:
+        # Before the first pulse: whoever stands at the rig may think better of it.
+        for sentence in warnings_once(findings):
+            tell(f"warning: {sentence}")
         tell(str(ahead))
     session = run_session(
         culture, loop, contenders, folder, episodes=of_each, seed=seed, account=account, progress=progress
@@ -202,7 +206,7 @@ def run_policies(
         rows,
         session,
         account,
-        (*noticed, *findings, *calibration.findings),
+        findings,
         sum(map(len, calibration.responses_hz)),
         ahead,
         found,
