@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import PRNGKeyArray
 from scipy.optimize import brentq
 
 from animat.coding.mapping import mapping_named
@@ -39,8 +40,26 @@ from sac_toys import Follower, FollowerOfTwo, Payer
 SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)
 DISCRETE = (-1.0, 1.0)
 
-start = jax.jit(begin, static_argnums=(0, 1))
-chunk = jax.jit(train_chunk, static_argnums=(0, 1))
+compiled_begin = jax.jit(begin, static_argnums=(0, 1))
+compiled_chunk = jax.jit(train_chunk, static_argnums=(0, 1))
+
+
+def start(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
+    learner: Learner = compiled_begin(EpisodeLimit(environment), settings, key)
+    return learner
+
+
+def chunk(
+    environment: Environment[Any],
+    settings: SAC,
+    learner: Learner,
+    simulator: NeuronSimulator | None,
+    first_round: int,
+    last_round: int,
+) -> tuple[Learner, Finished]:
+    rounds = jnp.int32(first_round), jnp.int32(last_round)
+    trained: tuple[Learner, Finished] = compiled_chunk(EpisodeLimit(environment), settings, learner, simulator, *rounds)
+    return trained
 
 
 def trained_for(
@@ -52,12 +71,8 @@ def trained_for(
     simulator: NeuronSimulator | None = None,
     learner: Learner | None = None,
 ) -> tuple[Learner, Finished]:
-    environment = EpisodeLimit(environment)
     learner = start(environment, settings, jax.random.key(seed)) if learner is None else learner
-    trained: tuple[Learner, Finished] = chunk(
-        environment, settings, learner, simulator, jnp.int32(0), jnp.int32(rounds)
-    )
-    return trained
+    return chunk(environment, settings, learner, simulator, 0, rounds)
 
 
 # --- the replay -----------------------------------------------------------------------------------------------------
@@ -283,7 +298,7 @@ def test_chunks_of_any_size_end_in_the_same_bits() -> None:
     whole, of_whole = trained_for(environment, SMALL, 40, seed=6, simulator=simulator)
     pieces, episodes = start(environment, SMALL, jax.random.key(6)), 0.0
     for first, last in ((0, 7), (7, 7), (7, 33), (33, 40)):
-        pieces, finished = chunk(environment, SMALL, pieces, simulator, jnp.int32(first), jnp.int32(last))
+        pieces, finished = chunk(environment, SMALL, pieces, simulator, first, last)
         episodes += float(finished.episodes)
     for leaf, other in zip(*map(jax.tree.leaves, (whole, pieces)), strict=True):
         assert jnp.array_equal(leaf, other)
@@ -293,7 +308,7 @@ def test_chunks_of_any_size_end_in_the_same_bits() -> None:
 def test_another_simulator_is_data_and_compiles_nothing() -> None:
     environment, simulator = animat()
     learner, _ = trained_for(environment, SMALL, 2, seed=7, simulator=simulator)
-    compiled = chunk._cache_size()  # type: ignore[attr-defined]
+    compiled = compiled_chunk._cache_size()  # type: ignore[attr-defined]
     other = made_up_simulator((50, 40, 30, 20, 10))
-    chunk(environment, SMALL, learner, other, jnp.int32(2), jnp.int32(3))
-    assert chunk._cache_size() == compiled  # type: ignore[attr-defined]
+    chunk(environment, SMALL, learner, other, 2, 3)
+    assert compiled_chunk._cache_size() == compiled  # type: ignore[attr-defined]
