@@ -218,7 +218,7 @@ class RealityGap:
         lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
-        lines.append(f"  p: that the policies measure no other returns than this control; stimulation: {self.account}")
+        lines.append(f"  p: that the policies' returns are no other than this control's; stimulation: {self.account}")
         lines.append(
             f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
             f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"
