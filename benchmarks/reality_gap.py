@@ -1,4 +1,4 @@
-"""The headline table: predicted against lived return by how recordings and loop present, over cultures and both robots.
+"""The headline table: predicted against measured return by recordings and presentation, over cultures and both robots.
 
     python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation]
         [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
@@ -36,10 +36,10 @@ COLUMNS = (
     "simulator",
     "mapping",
     "percentiles",
-    "random: predicted, lived",
+    "random: predicted, measured",
     "limit",
     "predicted, 95 %",
-    "lived",
+    "measured",
     "gap, 95 %",
     "of the range",
     "pulses/action",
@@ -139,7 +139,7 @@ def main() -> None:
                     run = ["run", policies, "--recordings", recordings, "--out", str(free(folder / thresholds))]
                     run += running_options(way, thresholds, options.episodes, controls=options.controls)
                     table.write_text(json.dumps(ran(run)) + "\n")
-                lines.append(told(seed, way, thresholds, json.loads(table.read_text())))
+                lines.append(told(seed, way, thresholds, read_table(table)))
                 print(lines[-1], flush=True)
     print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
     print("\n".join(lines))
@@ -183,12 +183,26 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
                 pulse=pulse,
                 patterns=protocol.patterns,
             )
-        lived = gap.to_dict()
-        if lived["session"]["ended_by"] != "plan":
-            print(f"{folder}: no row: {lived['session']['ended']}", file=sys.stderr)
+        outcome = gap.to_dict()
+        if outcome["session"]["ended_by"] != "plan":
+            print(f"{folder}: no row: {outcome['session']['ended']}", file=sys.stderr)
             return None
-        table.write_text(json.dumps(lived) + "\n")
-    return told(seed, way, "follow", json.loads(table.read_text()))
+        table.write_text(json.dumps(outcome) + "\n")
+    return told(seed, way, "follow", read_table(table))
+
+
+FORMER = {"lived": "measured"}
+"""Keys as tables of before have them."""
+
+
+def read_table(file: Path) -> dict[str, Any]:
+    """What a run came to."""
+    found: dict[str, Any] = json.loads(file.read_text(), object_hook=_renamed)
+    return found
+
+
+def _renamed(words: dict[str, Any]) -> dict[str, Any]:
+    return {FORMER.get(key, key): value for key, value in words.items()}
 
 
 def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:
@@ -200,10 +214,10 @@ def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> st
         ran["robot"],
         *((way.recorded, way.simulator, way.mapping) if way else ("default", "default", ran["mapping"])),
         thresholds,
-        f"{random['predicted']:.1f}, {random['lived']:.1f}",
+        f"{random['predicted']:.1f}, {random['measured']:.1f}",
         "-" if ran["limit"] is None else f"{ran['limit']:.1f}",
         f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})",
-        f"{policies['lived']:.1f}",
+        f"{policies['measured']:.1f}",
         f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})",
         "-" if ran["gap_share"] is None else f"{100 * ran['gap_share']:+.0f} %",
         f"{policies['pulses_per_action']:.0f}",

@@ -298,12 +298,12 @@ def test_a_culture_that_another_s_state_was_given_to_is_what_it_was(tmp_path: Pa
         culture.restore_state(tmp_path / "first.state")
     with culture:
         assert culture.record(SHORT).equals(begun)
-    lived = small_culture()
-    lived.restore_state(tmp_path / "first.state")
+    restored = small_culture()
+    restored.restore_state(tmp_path / "first.state")
     with pytest.raises(Mismatch, match="differs in seed"):
-        lived.restore_state(tmp_path / "other.state")
-    with lived:
-        assert lived.record(SHORT).equals(recording)
+        restored.restore_state(tmp_path / "other.state")
+    with restored:
+        assert restored.record(SHORT).equals(recording)
 
 
 def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from animat.errors import (
 from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
-from animat.live.shadowing import Lived, live
+from animat.live.shadowing import LiveRun, live
 from animat.neurons.made_up import made_up_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
@@ -61,15 +61,15 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lived, Path, int]:
+def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[LiveRun, Path, int]:
     folder = tmp_path_factory.mktemp("live") / "live"
     with FakeCulture() as culture:
         found = live(TRAINING, culture, PROTOCOL, folder, timetable=QUICK, episodes=3)
         return found, folder, culture.delivered
 
 
-def test_the_culture_is_recorded_every_interval(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, _ = lived
+def test_the_culture_is_recorded_every_interval(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
     assert [file.name for file in found.recordings] == [f"recording_{m}_min.nwb" for m in ("00.2", "10.2", "20.2")]
     recordings = read_recordings([folder / "recordings"])
     np.testing.assert_allclose(np.diff([r.start_min for r in recordings]), 10, atol=1e-9)
@@ -78,8 +78,8 @@ def test_the_culture_is_recorded_every_interval(lived: tuple[Lived, Path, int]) 
     assert found.culture_min == pytest.approx(30.0)
 
 
-def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, _ = lived
+def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
     starts_min = [r.start_min for r in read_recordings([folder / "recordings"])]
     assert [swap["recorded_at_min"] for swap in found.swaps] == pytest.approx(starts_min[1:])
     assert all(swap["members"] == [0, 1] for swap in found.swaps)
@@ -100,8 +100,8 @@ def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(lived
         assert policy.presentation == PROTOCOL.presentation
 
 
-def test_what_happened_is_in_the_log_in_order(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, _ = lived
+def test_what_happened_is_in_the_log_in_order(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
     told = lines(folder)
     whats = [line["what"] for line in told]
     assert whats == [
@@ -114,8 +114,8 @@ def test_what_happened_is_in_the_log_in_order(lived: tuple[Lived, Path, int]) ->
     json.dumps(found.to_dict())
 
 
-def test_the_loop_runs_with_what_was_trained_on_last(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, delivered = lived
+def test_the_loop_runs_with_what_was_trained_on_last(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, delivered = ran
     gap = found.gap
     assert gap.session.ending.by == "plan"
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
@@ -142,17 +142,17 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
     timetable = replace(QUICK, interval_min=1, duration_min=3)
     with small_culture() as culture:
         found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=timetable, episodes=1)
-        lived_s = culture.now_s
+        ended_s = culture.now_s
     recordings = read_recordings(found.recordings)
     # After each recording, in case the run is killed, and after the loop.
     begun_s = [60 * each.start_min for each in recordings]
     assert [begun < kept < begun + 60 for begun, kept in zip(begun_s, after[:-1], strict=True)] == [True] * 3
-    assert after[-1] == lived_s > 3 * 60
+    assert after[-1] == ended_s > 3 * 60
     known = recorded_culture("virtual", recordings, [tmp_path / "live" / "recordings"])
     assert known == {"seed": 1, "state": tmp_path / "live" / "recordings" / "culture.state"}
     goes_on = small_culture()
     goes_on.restore_state(known["state"])
-    assert goes_on.now_s == lived_s
+    assert goes_on.now_s == ended_s
 
 
 @pytest.mark.oracle

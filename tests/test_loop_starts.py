@@ -65,7 +65,7 @@ def starts_of(session: Session, contender: str) -> list[tuple[float, ...]]:
     return [episode.start for episode in session.episodes if episode.contender == contender]
 
 
-def lived(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
+def ran(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
     looking = Looking()
     contenders = [
         Contender("p0", "", looking),
@@ -78,7 +78,7 @@ def lived(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
 
 
 def test_each_episode_starts_where_the_robot_draws_it(tmp_path: Path) -> None:
-    session, looking = lived(tmp_path / "a", seed=3)
+    session, looking = ran(tmp_path / "a", seed=3)
     assert session.ending.by == "plan"
     starts = starts_of(session, "p0")
     assert len(set(starts)) == 5
@@ -92,8 +92,8 @@ def test_each_episode_starts_where_the_robot_draws_it(tmp_path: Path) -> None:
         after, _, _ = COURSE.advance(np.empty(0), state, np.float32(first.command))
         np.testing.assert_allclose(first.observation, COURSE.observe(after), atol=1e-6)
     # The seed decides, and the culture does not.
-    assert starts_of(lived(tmp_path / "b", seed=3, culture=2)[0], "random") == starts
-    assert not set(starts_of(lived(tmp_path / "c", seed=4)[0], "random")) & set(starts)
+    assert starts_of(ran(tmp_path / "b", seed=3, culture=2)[0], "random") == starts
+    assert not set(starts_of(ran(tmp_path / "c", seed=4)[0], "random")) & set(starts)
 
 
 def test_the_starts_are_those_of_the_robots_own_distribution() -> None:
@@ -105,7 +105,7 @@ def test_the_starts_are_those_of_the_robots_own_distribution() -> None:
 
 
 def test_a_robot_of_ones_own_is_recovered_with_its_starts(tmp_path: Path) -> None:
-    session, _ = lived(tmp_path, seed=3)
+    session, _ = ran(tmp_path, seed=3)
     table = session.ticks_file.read_bytes()
     assert b",x_m,y_m,heading_rad," in table.splitlines()[0]
     session.ticks_file.unlink()

@@ -1,4 +1,4 @@
-"""Predicted against lived return: what is in the table is what the simulator and the session say."""
+"""Predicted against measured return: what is in the table is what the simulator and the session say."""
 
 from __future__ import annotations
 
@@ -120,19 +120,19 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     assert gap.session.ending.by == "plan"
     assert gap.findings == Calibration.of_series(series).findings
 
-    lived: dict[str, list[float]] = {}
+    measured: dict[str, list[float]] = {}
     for tick in read_session(tmp_path).ticks:
         if tick.handled == "lead-in":
             continue
         assert tick.reward is not None
-        episodes = lived.setdefault(tick.contender, [])
+        episodes = measured.setdefault(tick.contender, [])
         if tick.iteration == 0:
             episodes.append(0.0)
         episodes[-1] += tick.reward
-    for name, returns in lived.items():
-        np.testing.assert_allclose(rows[name].lived, returns)
+    for name, returns in measured.items():
+        np.testing.assert_allclose(rows[name].measured, returns)
         assert len(returns) == 4
-    np.testing.assert_allclose(np.sort(rows["policies"].lived), np.sort(lived["p0"] + lived["p1"]))
+    np.testing.assert_allclose(np.sort(rows["policies"].measured), np.sort(measured["p0"] + measured["p1"]))
 
     calibration = Calibration.of_series(series)
     environment = Animat(policies["p0"].robot, Thresholds(1), 5)
@@ -164,21 +164,22 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
     limit = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
     assert gap.limit == pytest.approx(limit)
-    won = rows["policies"].lived.mean() - rows["policies"].predicted.mean()
+    won = rows["policies"].measured.mean() - rows["policies"].predicted.mean()
     assert gap.gap_share == pytest.approx(won / (limit - rows["random"].predicted.mean()))
     assert gap.session.log.header["contenders"][-2]["in_turn"] == ["p0", "p1"]
-    # A silent culture commands -1 throughout; the robot of the test has no noise: one return, and it is lived too.
+    # A silent culture commands -1 throughout; the robot of the test has no noise: one return, predicted and measured.
     assert np.ptp(rows["silent"].predicted) == 0
     assert rows["silent"].pulses_per_action == 0
     assert all(row.pulses_per_action == 2 for row in gap.rows if row.name != "silent")
 
     for row in gap.rows[3:]:
-        expected = mannwhitneyu(rows["policies"].lived, row.lived, alternative="two-sided", method="asymptotic")
+        expected = mannwhitneyu(rows["policies"].measured, row.measured, alternative="two-sided", method="asymptotic")
         assert row.beside is not None
         assert row.beside.p == pytest.approx(min(1.0, expected.pvalue))
-        assert row.beside.wins == pytest.approx(expected.statistic / (len(rows["policies"].lived) * len(row.lived)))
+        pairs = len(rows["policies"].measured) * len(row.measured)
+        assert row.beside.wins == pytest.approx(expected.statistic / pairs)
     for row in gap.rows:
-        assert row.gap.value == pytest.approx(row.lived.mean() - row.predicted.mean())
+        assert row.gap.value == pytest.approx(row.measured.mean() - row.predicted.mean())
         assert row.gap.low <= row.gap.value + 1e-9
         assert row.gap.value <= row.gap.high + 1e-9
     told = json.loads(json.dumps(gap.to_dict()))
@@ -232,9 +233,9 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     gap, _ = run(tmp_path, series, with_controls=False)
     policies, *each, random = gap.rows
 
-    def verdict(p: float, wins: float, lived: float) -> str:
+    def verdict(p: float, wins: float, measured: float) -> str:
         control = replace(random, beside=Beside(p, wins, 20, 20))
-        rows = (replace(policies, lived=np.full(20, lived)), *each, control)
+        rows = (replace(policies, measured=np.full(20, measured)), *each, control)
         return replace(gap, rows=rows).verdict()
 
     high = float(policies.predicted.max()) + 1
@@ -243,19 +244,19 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     at = float(policies.predicted.mean())
     assert verdict(0.001, 0.9, at).endswith("of the pairs of episodes or more)")
     looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, how often"
-    for lived, less in ((at - 1e3, "less"), (at + 1e3, "more")):
+    for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         told = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
             "(looked for: "
         )
-        assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, lived)
-    uncertain = replace(gap, rows=(replace(policies, lived=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
+        assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, measured)
+    uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
         f"; their measured return is 20.0 less than predicted, within what the recording's {gap.responses} responses "
         "and 10 episodes can tell"
     )
     reasons = (Finding("a", "note", "it rained"), Finding("b", "note", "it snowed"))
-    explained = replace(gap, rows=(replace(policies, lived=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
+    explained = replace(gap, rows=(replace(policies, measured=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
     assert explained.verdict().endswith("less than predicted: it rained; it snowed")
     assert [each["name"] for each in explained.to_dict()["reasons"]] == ["a", "b"]
 
@@ -279,7 +280,7 @@ def test_what_policies_were_answered_is_as_the_log_and_the_followed_median_have_
     np.testing.assert_array_equal(found.responses.rate_hz, [tick.rate_hz for tick in ticks])
     np.testing.assert_array_equal(found.responses.time_s, [tick.read_after_s for tick in ticks])
     np.testing.assert_array_equal(found.late_s, [tick.late_s for tick in ticks])
-    np.testing.assert_allclose(np.sort(found.returns), np.sort(gap.rows[0].lived))
+    np.testing.assert_allclose(np.sort(found.returns), np.sort(gap.rows[0].measured))
     rewards = np.bincount(found.episode, [tick.reward or 0.0 for tick in ticks])
     np.testing.assert_allclose(rewards, found.returns)
     assert found.passes.presented.sum() == len(ticks)
@@ -309,13 +310,13 @@ def test_a_policy_may_have_the_name_of_a_control_that_is_not_run(tmp_path: Path,
     assert gap.rows[0].pulses_per_action == 2
 
 
-def test_what_was_not_lived_is_named(without_controls: Ran) -> None:
+def test_what_was_not_measured_is_named(without_controls: Ran) -> None:
     gap = without_controls[0]
     policies, *others = gap.rows
     none = np.empty(0)
-    no_controls = replace(gap, rows=(policies, *(replace(row, lived=none, beside=None) for row in others)))
+    no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, beside=None) for row in others)))
     assert no_controls.verdict().startswith("no control ran to its end")
-    no_policy = replace(gap, rows=(replace(policies, lived=none), *(replace(row, beside=None) for row in others)))
+    no_policy = replace(gap, rows=(replace(policies, measured=none), *(replace(row, beside=None) for row in others)))
     assert no_policy.verdict().startswith("no episode of a policy ran to its end")
 
 
@@ -340,7 +341,7 @@ def test_a_prediction_with_memory_is_told_to_lack_a_lead_in(tmp_path: Path, seri
 
 def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> None:
     gap = without_controls[0]
-    row = replace(gap.rows[0], lived=gap.rows[0].lived[:1] - 100)
+    row = replace(gap.rows[0], measured=gap.rows[0].measured[:1] - 100)
     assert (row.gap.low, row.gap.high) == (-np.inf, np.inf)
     alone = replace(gap, rows=(row, *gap.rows[1:]))
     assert "less than predicted" not in alone.verdict()
@@ -363,10 +364,10 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
         np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
     for follow in (True, False):
         with FakeCulture() as culture:
-            lived = run_policies(
+            gap = run_policies(
                 {"p": policy}, culture, first, tmp_path / str(follow), episodes=1, with_controls=False, follow=follow
             )
-        assert ("moving-percentiles" in [finding.name for finding in lived.findings]) == follow
+        assert ("moving-percentiles" in [finding.name for finding in gap.findings]) == follow
     gap, _ = run(tmp_path / "held", series, with_controls=False, follow=False)
     other, _ = run(tmp_path / "follow", series, with_controls=False, follow=True)
     assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
@@ -470,7 +471,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
             predicted_anew=np.array(
                 [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.redrawn)]
             ),
-            lived=returns(living, 40, 1000 + seed),
+            measured=returns(living, 40, 1000 + seed),
         )
         covered += row.gap.low <= 0 <= row.gap.high
     # 114 of 120, standard deviation 2.4.
@@ -506,8 +507,8 @@ def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Re
         observed = rng.uniform(low, high, (500, len(low)))
         rule = jax.tree.map(lambda x: x[0], rule)
         predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
-        lived = [HandMadeRule(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
-        np.testing.assert_array_equal(np.asarray(predicted), lived)
+        chosen = [HandMadeRule(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
+        np.testing.assert_array_equal(np.asarray(predicted), chosen)
 
 
 @pytest.mark.oracle
@@ -567,15 +568,15 @@ def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series
 
 
 @pytest.mark.usefixtures("few_redrawn")
-def test_a_budget_that_ends_early_leaves_what_was_lived(tmp_path: Path, series: list[Responses]) -> None:
+def test_a_budget_that_ends_early_leaves_what_was_measured(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, account=Account(Budget(pulses=60)), with_controls=False)
     assert gap.session.ending.by == "budget"
     assert gap.account.pulses <= 60
-    assert sum(len(row.lived) for row in gap.rows[1:]) < 12
+    assert sum(len(row.measured) for row in gap.rows[1:]) < 12
     assert "60 pulses" in gap.to_text()
     gap, _ = run(tmp_path / "none", series, account=Account(Budget(pulses=0)), with_controls=False)
-    assert all(len(row.lived) == 0 for row in gap.rows)
-    assert gap.to_dict()["rows"][0]["lived"] is None
+    assert all(len(row.measured) == 0 for row in gap.rows)
+    assert gap.to_dict()["rows"][0]["measured"] is None
     gap.to_text()
 
 

@@ -162,7 +162,7 @@ def test_policies_run_and_are_predicted(
     calibration = Calibration.of_series(timeline.responses)
     with FakeCulture(3) as culture:
         gap = run_policies(policies, culture, calibration, tmp_path, episodes=4)
-    assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].lived))
+    assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].measured))
     assert "no-limit" in {finding.name for finding in gap.findings}
     assert {"silent", "shuffled", "made by hand", "constant 5 Hz"} <= {row.name for row in gap.rows}
 

@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument
 from animat.writing import alone_in
 
 if TYPE_CHECKING:
-    from animat.live.shadowing import Lived
+    from animat.live.shadowing import LiveRun
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Live(Stimulating):
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
             ) as culture,
         ):
-            lived = live(
+            ran = live(
                 training,
                 culture,
                 replace(protocol, patterns=min(100, len(culture.patterns))),
@@ -128,22 +128,22 @@ class Live(Stimulating):
                 **settings,
             )
             # It is told even where the culture cannot be closed then.
-            told.callback(self._tell, lived)
-        return lived.to_dict()
+            told.callback(self._tell, ran)
+        return ran.to_dict()
 
-    def _tell(self, lived: Lived) -> None:
+    def _tell(self, ran: LiveRun) -> None:
         print(
-            f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
-            f"({lived.wall_s:.0f} s of ours); {lived.iterations:,} iterations of each policy, never stopped; "
-            f"{len(lived.swaps)} swaps of simulators:"
+            f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
+            f"({ran.wall_s:.0f} s of ours); {ran.iterations:,} iterations of each policy, never stopped; "
+            f"{len(ran.swaps)} swaps of simulators:"
         )
-        for swap in lived.swaps:
+        for swap in ran.swaps:
             print(
                 f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
                 f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
             )
-        print(lived.gap.to_text())
-        expect_no_fault(lived.gap.session, self.out)
+        print(ran.gap.to_text())
+        expect_no_fault(ran.gap.session, self.out)
 
 
 def _range(members: Sequence[int]) -> str:

@@ -35,7 +35,7 @@ CALIBRATION_FILE = "calibration.nwb"
 
 @dataclass(frozen=True)
 class Run(Stimulating):
-    """Run policies in closed loop on a culture, with controls between them: predicted against lived return."""
+    """Run policies in closed loop on a culture, with controls between them: predicted against measured return."""
 
     policies: Positional[Path] = Path("policies")
     """A policy file or a folder of them"""

@@ -109,7 +109,7 @@ def run_session(
             else:
                 files.finish(session.log.records, ending)
         except Exception as error:
-            # What was lived comes back, whatever its files are like.
+            # What was measured comes back, whatever its files are like.
             told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
             sentence = f"{ending.sentence}; and {told} (animat recover {folder} makes them again)"
             session = replace(session, ending=replace(ending, sentence=sentence))

@@ -43,7 +43,7 @@ _POLL_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Lived:
+class LiveRun:
     """What came of a live run.
 
     Attributes:
@@ -52,7 +52,7 @@ class Lived:
         swaps: every time that a group of policies went over to newer simulators, dated.
         iterations: that each policy was trained for at least.
         culture_min, wall_s: how long it took from the first recording to the end of training.
-        gap: predicted against lived return.
+        gap: predicted against measured return.
     """
 
     recordings: tuple[Path, ...]
@@ -90,7 +90,7 @@ def live(
     progress: Progress | None = None,
     tell: Callable[[str], None] | None = None,
     **settings: Any,
-) -> Lived:
+) -> LiveRun:
     """Record a culture again and again while policies train on its newest simulators, then run them on it.
 
     The culture is recorded; training starts at once, in processes of its own, and never stops; every `interval_min` the
@@ -157,7 +157,7 @@ def live(
             run.write("end", budget=run.account.to_dict())
         raise
     run.write("end", budget=run.account.to_dict())
-    return Lived(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
+    return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 
 class _Run:

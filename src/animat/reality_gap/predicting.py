@@ -1,4 +1,4 @@
-"""What the recording's simulator says that policies and controls will live, and how well it can know."""
+"""What the recording's simulator says that policies and controls will return, and how well it can know."""
 
 from __future__ import annotations
 

@@ -32,13 +32,13 @@ LEAST_SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is known of policies that lived another return than was predicted.
+    """What is known of policies whose measured return differs from the predicted one.
 
     Attributes:
         answered: what the culture answered them.
         calibration: the recording that predicted.
         predicted: of all policies together.
-        gap: the sign of their gap: -1 where they lived less.
+        gap: the sign of their gap: -1 where less was measured.
     """
 
     answered: Answered
@@ -158,11 +158,11 @@ def answers(evidence: Evidence) -> Finding | None:
     """
     from scipy.stats import t as student
 
-    lived, predicted = evidence.answered.passes, evidence.predicted
-    episodes, recorded_hz = len(lived.passed), evidence.calibration.responses_hz
+    measured, predicted = evidence.answered.passes, evidence.predicted
+    episodes, recorded_hz = len(measured.passed), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
         return None
-    conditions = np.flatnonzero((lived.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
+    conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
     names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
     # Of one readout there is no axis.
     of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
@@ -170,7 +170,7 @@ def answers(evidence: Evidence) -> Finding | None:
     told, most = [], 0.0
     for i, of in tested:
         at: Any = (i, *of)
-        n, passed = lived.presented[:, i], lived.passed[:, *at]
+        n, passed = measured.presented[:, i], measured.passed[:, *at]
         share, expected = float(passed.sum() / n.sum()), float(predicted.passes.share[at])
         between = episodes / (episodes - 1) * float(np.sum((passed - share * n) ** 2)) / float(n.sum()) ** 2
         error = max(between, _variance(share, int(n.sum()))) ** 0.5
@@ -180,11 +180,11 @@ def answers(evidence: Evidence) -> Finding | None:
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < LEVEL / len(tested) and abs(difference) >= LEAST_SHARE:
             most = max(most, difference, key=abs)
-            lived_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
+            measured_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
             on = f" on {names[of[0]]}" if of else ""
             told.append(
                 f"{_conditions(evidence)[i].label}{on} in {share:.2f} +- {error:.2f} ({expected:.2f} +- "
-                f"{expected_error:.2f}; mean {lived_hz:.3g} Hz, "
+                f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, "
                 f"{recorded_hz[i][:, *of].mean():.3g} in the recording)"
             )
     if not told:

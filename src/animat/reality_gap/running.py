@@ -300,7 +300,7 @@ def _rows(
             meaning=meaning,
             predicted=of_them.returns,
             predicted_anew=of_them.anew,
-            lived=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
+            measured=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
             pulses_per_action=sum(each.pulses for each in acted) / actions,
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,
             bursts=sum(each.bursts for each in acted) / presentations,
@@ -315,7 +315,7 @@ def _rows(
                 rows.append(row(contender.name, contender.meaning, [contender.name]))
             continue
         control = row(contender.name, contender.meaning, [contender.name])
-        if len(control.lived) and len(policies.lived):
-            control = replace(control, beside=beside(policies.lived, control.lived))
+        if len(control.measured) and len(policies.measured):
+            control = replace(control, beside=beside(policies.measured, control.measured))
         rows.append(control)
     return tuple(rows)
