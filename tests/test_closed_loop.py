@@ -55,7 +55,7 @@ RANDOM = Contender("random", "any", AnyCondition(5))
 
 def loop_of(**changed: Any) -> Loop:
     given = {"robot": SHORT, "mapping": Thresholds(9), "conditions": CONDITIONS, "percentiles": PERCENTILES}
-    return Loop(**(given | {"pause_s": 0.1, "lead_in": 0} | changed))
+    return Loop(**(given | {"pause_s": 0.1, "warm_up": 0} | changed))
 
 
 class TestFake(CultureContract):
@@ -74,7 +74,7 @@ class TestFake(CultureContract):
     jitter=st.booleans(),
     on_burst=st.sampled_from(["use", "repeat", "skip"]),
     window_ms=st.sampled_from([(2.0, 10.0), (0.0, 5.0), (3.15, 11.05)]),
-    lead_in=st.integers(0, 2),
+    warm_up=st.integers(0, 2),
 )
 def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     tmp_path_factory: pytest.TempPathFactory,
@@ -83,10 +83,10 @@ def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     jitter: bool,
     on_burst: str,
     window_ms: tuple[float, float],
-    lead_in: int,
+    warm_up: int,
 ) -> None:
     folder = tmp_path_factory.mktemp("session")
-    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms, lead_in=lead_in)
+    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms, warm_up=warm_up)
     contenders = [
         RANDOM,
         Contender("shuffled", "", OneCondition(1), "shuffled"),
@@ -298,22 +298,22 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
         pass
 
     rest = Contender("rest", "no pulse", AnyCondition(5), "silent")
-    loop = loop_of(lead_in=3, pulses=2, burst_threshold=0.5, on_burst="repeat")
+    loop = loop_of(warm_up=3, pulses=2, burst_threshold=0.5, on_burst="repeat")
     with FakeCulture() as culture:
         session = run_session(culture, loop, [RANDOM, rest], tmp_path / "two", episodes=2)
     for episode in session.episodes:
         ticks = [tick for tick in session.ticks if tick.episode == episode.number]
-        leading = [tick for tick in ticks if tick.handled == "lead-in"]
+        warming = [tick for tick in ticks if tick.handled == "warm-up"]
         # Silence has nothing before it either.
-        assert len(leading) == (0 if episode.contender == "rest" else 15)
-        assert ticks[: len(leading)] == leading
-        for n in range(0, len(leading), 5):
-            assert sorted(tick.delivered for tick in leading[n : n + 5]) == [0, 1, 2, 3, 4]
-        assert len({tuple(tick.delivered for tick in leading[n : n + 5]) for n in (0, 5, 10)}) == (3 if leading else 1)
-        for tick in leading:
+        assert len(warming) == (0 if episode.contender == "rest" else 15)
+        assert ticks[: len(warming)] == warming
+        for n in range(0, len(warming), 5):
+            assert sorted(tick.delivered for tick in warming[n : n + 5]) == [0, 1, 2, 3, 4]
+        assert len({tuple(tick.delivered for tick in warming[n : n + 5]) for n in (0, 5, 10)}) == (3 if warming else 1)
+        for tick in warming:
             assert (tick.iteration, tick.command, tick.reward, tick.observation) == (-1, None, None, ())
             assert len(tick.pulse_time_s) == 2
-        assert ticks[len(leading)].iteration == 0
+        assert ticks[len(warming)].iteration == 0
         assert episode.iterations == 6
         assert episode.pulses == sum(len(tick.pulse_time_s) for tick in ticks)
     assert_read_alike(tmp_path / "two", loop)
@@ -327,33 +327,33 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
 
 def test_what_leads_in_counts_for_percentiles_that_follow(tmp_path: Path) -> None:
     following = tuple(np.zeros(3) for _ in HZ)
-    loop = loop_of(lead_in=3, following=following)
+    loop = loop_of(warm_up=3, following=following)
     one = Contender("constant", "", OneCondition(0), calibrates=False)
     with FakeCulture() as culture:
         session = run_session(culture, loop, [one], tmp_path, episodes=1)
-    leading = [tick.rate_hz for tick in session.ticks if tick.handled == "lead-in"]
+    warming = [tick.rate_hz for tick in session.ticks if tick.handled == "warm-up"]
     told = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
-    assert len(leading) == 15
-    assert max(leading) > 0
+    assert len(warming) == 15
+    assert max(warming) > 0
     # Three of each condition: all that was recorded has given way.
-    np.testing.assert_array_equal(told, [np.percentile(leading, np.linspace(0, 100, 11)).astype(np.float32)])
-    acted = [tick for tick in session.ticks if tick.handled != "lead-in"]
+    np.testing.assert_array_equal(told, [np.percentile(warming, np.linspace(0, 100, 11)).astype(np.float32)])
+    acted = [tick for tick in session.ticks if tick.handled != "warm-up"]
     assert all(
         tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), np.float32(told[0]))) for tick in acted
     )
 
 
-def test_several_pulses_lead_in_by_themselves() -> None:
-    assert [loop_of(pulses=n, lead_in=None).lead_in for n in (1, 2, 5)] == [2, 0, 0]
-    assert loop_of(pulses=5, lead_in=1).lead_in == 1
+def test_several_pulses_need_no_warm_up() -> None:
+    assert [loop_of(pulses=n, warm_up=None).warm_up for n in (1, 2, 5)] == [2, 0, 0]
+    assert loop_of(pulses=5, warm_up=1).warm_up == 1
 
 
-def test_a_budget_that_runs_out_while_leading_in_ends_the_session(tmp_path: Path) -> None:
+def test_a_budget_that_runs_out_in_the_warm_up_ends_the_session(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         account = Account(Budget(7))
-        session = run_session(culture, loop_of(lead_in=2), [RANDOM], tmp_path, episodes=1, account=account)
+        session = run_session(culture, loop_of(warm_up=2), [RANDOM], tmp_path, episodes=1, account=account)
     assert session.ending.by == "budget"
-    assert [tick.handled for tick in session.ticks] == ["lead-in"] * 7
+    assert [tick.handled for tick in session.ticks] == ["warm-up"] * 7
     (episode,) = session.episodes
     assert (episode.iterations, episode.is_whole, episode.pulses) == (0, False, 7)
     assert_read_alike(tmp_path, loop_of())
@@ -434,8 +434,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"on_burst": "panic"}, "use, repeat, skip"),
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),
-        ({"lead_in": -1}, "lead_in"),
-        ({"lead_in": 1.5}, "lead_in: expected a whole number"),
+        ({"warm_up": -1}, "warm_up"),
+        ({"warm_up": 1.5}, "warm_up: expected a whole number"),
         ({"patience_s": float("nan")}, "patience_s"),
         ({"patience_s": 0.0}, "patience_s"),
         ({"patterns": 0}, "patterns"),

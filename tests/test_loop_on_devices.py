@@ -52,7 +52,7 @@ def loop_at(
         pulses=5,
         pulse=pulse,
         pause_s=0.1,
-        lead_in=0,
+        warm_up=0,
         on_late="stop",
     )
     with culture:

@@ -73,7 +73,7 @@ def ran(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
         Contender("silent", "", InTurn({"p0": looking, "p1": Looking()}), "silent"),
     ]
     with FakeCulture(culture) as fake:
-        loop = loop_of(robot=Anywhere(), lead_in=1)
+        loop = loop_of(robot=Anywhere(), warm_up=1)
         return run_session(fake, loop, contenders, folder, episodes=5, seed=seed), looking
 
 

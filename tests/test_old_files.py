@@ -78,6 +78,7 @@ def test_a_session_is_read_and_its_recording_written_again(old: Path, told: dict
     was = told["session"]
     assert session.ending.by == was["ended_by"]
     assert sum(episode.pulses for episode in session.episodes) == was["pulses"]
+    assert "warm-up" in {tick.handled for tick in session.ticks}
     ticks = [[t.contender, t.delivered, t.rate_hz, t.command, t.reward] for t in session.ticks]
     assert ticks == was["ticks"]
     for name in ("session.nwb", "ticks.csv"):

@@ -122,7 +122,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
 
     measured: dict[str, list[float]] = {}
     for tick in read_session(tmp_path).ticks:
-        if tick.handled == "lead-in":
+        if tick.handled == "warm-up":
             continue
         assert tick.reward is not None
         episodes = measured.setdefault(tick.contender, [])
@@ -321,22 +321,22 @@ def test_what_was_not_measured_is_named(without_controls: Ran) -> None:
 
 
 @pytest.mark.oracle
-def test_a_prediction_with_memory_is_told_to_lack_a_lead_in(tmp_path: Path, series: list[Responses]) -> None:
+def test_a_prediction_with_memory_is_told_to_lack_a_warm_up(tmp_path: Path, series: list[Responses]) -> None:
     remembering = Calibration.of_series(series, kind="memory")
     policies = {"p0": policy_of(0, series)}
-    for pulses, lead_in, told in ((1, 0, True), (1, 1, False), (2, 0, False)):
+    for pulses, warm_up, told in ((1, 0, True), (1, 1, False), (2, 0, False)):
         with FakeCulture() as culture:
             gap = run_policies(
                 policies,
                 culture,
                 remembering,
-                tmp_path / f"{pulses}-{lead_in}",
+                tmp_path / f"{pulses}-{warm_up}",
                 episodes=1,
                 with_controls=False,
                 pulses=pulses,
-                lead_in=lead_in,
+                warm_up=warm_up,
             )
-        assert ("no-lead-in" in {finding.name for finding in gap.findings}) == told
+        assert ("no-warm-up" in {finding.name for finding in gap.findings}) == told
 
 
 def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> None:
@@ -735,8 +735,8 @@ class TestCommand:
             (["--seed", "-1"], "--seed: expected 0 or more"),
             (["--pulses", "0"], "pulses: expected at least 1"),
             (["--pause-s", "-1"], "pause_s: expected a finite number from 0"),
-            (["--lead-in", "-1"], "lead_in: expected a whole number from 0 to 100, got -1"),
-            (["--lead-in", "101"], "lead_in: expected a whole number from 0 to 100, got 101"),
+            (["--warm-up", "-1"], "warm_up: expected a whole number from 0 to 100, got -1"),
+            (["--warm-up", "101"], "warm_up: expected a whole number from 0 to 100, got 101"),
             (["--patience-s", "nan"], "patience_s: expected a finite number from 0"),
             (["--patience-s", "0"], "patience_s: expected above 0 s"),
             (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),

@@ -62,7 +62,7 @@ def as_logged(folder: Path) -> dict[str, Any]:
 
 
 def test_a_killed_session_is_recovered_to_the_bits_that_it_would_have_written(tmp_path: Path) -> None:
-    session = ran(tmp_path / "whole", pulses=3, lead_in=1, burst_threshold=0.9, on_burst="repeat")
+    session = ran(tmp_path / "whole", pulses=3, warm_up=1, burst_threshold=0.9, on_burst="repeat")
     killed = tmp_path / "killed"
     killed.mkdir()
     (killed / LOG_FILE).write_bytes((tmp_path / "whole" / LOG_FILE).read_bytes())

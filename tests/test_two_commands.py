@@ -89,7 +89,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         np.asarray(timeline.at(0.0).percentiles),
         following=recorded_hz,
         burst_threshold=0.95,
-        lead_in=1,
+        warm_up=1,
         readouts=timeline.readouts,
     )
     means = tuple((0.2 * i - 0.4, 0.4 - 0.2 * i) for i in range(5))
@@ -129,7 +129,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
             pooled = np.concatenate(newest)
             expected = [np.percentile(pooled[:, d], range(0, 101, 10)) for d in range(2)]
             np.testing.assert_allclose(told[tick.episode], expected, rtol=1e-6)
-        counts = tick.contender != "constant" or tick.handled == "lead-in"
+        counts = tick.contender != "constant" or tick.handled == "warm-up"
         if counts and tick.patterns and not tick.is_burst:
             newest[tick.delivered] = [*newest[tick.delivered][1:], np.array(tick.readout_hz)]
     assert moved > 10

@@ -34,14 +34,14 @@ class Stimulating:
     """A pulse that comes late: continue and log it, or stop"""
     pause_s: float = 2.0
     """Without stimulation before each episode"""
-    lead_in: int | None = None
+    warm_up: int | None = None
     """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
 
     def _of_the_loop(self) -> dict[str, Any]:
         """Settings of the closed loop."""
-        names = ("on_burst", "on_late", "pause_s", "lead_in", "patience_s")
+        names = ("on_burst", "on_late", "pause_s", "warm_up", "patience_s")
         return {name: getattr(self, name) for name in names}
 
 

@@ -118,7 +118,7 @@ class Driver:
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
-        self._lead_in(contender, episode)
+        self._warm_up(contender, episode)
         if self._following is not None and self._following.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
             self._percentiles = self._following.percentiles()
@@ -151,11 +151,11 @@ class Driver:
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
         return observation
 
-    def _lead_in(self, contender: Contender, episode: int) -> None:
+    def _warm_up(self, contender: Contender, episode: int) -> None:
         """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
         if contender.delivery == "silent":
             return
-        for _ in range(self._loop.lead_in or 0):
+        for _ in range(self._loop.warm_up or 0):
             for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
                 self._present(contender, episode, -1, condition, condition, 0)
 
@@ -179,7 +179,7 @@ class Driver:
 
         Before iteration 0 the robot stands, whatever the answer.
         """
-        loop, is_lead_in = self._loop, iteration < 0
+        loop, is_warm_up = self._loop, iteration < 0
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
@@ -208,7 +208,7 @@ class Driver:
             readout_hz = tuple(np.atleast_1d(x_hz).tolist())
         self._last_pulse_s = self._zero_s + float(after_s[0])
         is_burst = bool(active_ratio[0] > loop.burst_threshold)
-        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_lead_in
+        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {
             "number": self._presented,
             "contender": contender.name,
@@ -224,7 +224,7 @@ class Driver:
             "rate_hz": float(rate_hz[0]),
             "active_ratio": float(active_ratio[0]),
             "is_burst": is_burst,
-            "handled": "lead-in" if is_lead_in else "repeated" if again else "unfinished",
+            "handled": "warm-up" if is_warm_up else "repeated" if again else "unfinished",
             "command": None,
             "reward": None,
             "observation": (),
@@ -235,14 +235,14 @@ class Driver:
             "readout_hz": readout_hz,
         }
         self._presented += 1
-        if self._following is not None and stimuli and (contender.calibrates or is_lead_in) and not is_burst:
+        if self._following is not None and stimuli and (contender.calibrates or is_warm_up) and not is_burst:
             self._following.add(delivered, x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
-            if not (again or is_lead_in):
+            if not (again or is_warm_up):
                 tick |= self._move(x_hz, is_burst, iteration)
         finally:
             # Whatever happens to the robot, what the culture did is written down.

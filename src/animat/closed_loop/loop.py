@@ -27,8 +27,8 @@ from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 OnBurst = Literal["use", "repeat", "skip"]
 OnLate = Literal["continue", "stop"]
 
-MOST_LEAD_IN = 100
-"""Times that each condition leads in: as many as a recording holds; more wears a culture out for nothing."""
+MOST_WARM_UP = 100
+"""Presentations of each condition in a warm-up: as many as a recording holds; more wears a culture out for nothing."""
 
 
 class Trained(Protocol):
@@ -89,7 +89,7 @@ class Loop:
         most_repeats: of one action; the response after that is used.
         on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: observed without a stimulus before each episode.
-        lead_in: how often each condition is presented after that, in random order, before the robot moves: a culture
+        warm_up: how often each condition is presented after that, in random order, before the robot moves: a culture
             that has rested answers otherwise than in a recording. The responses count where percentiles follow. None:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
@@ -116,7 +116,7 @@ class Loop:
     most_repeats: int = 3
     on_late: OnLate = "continue"
     pause_s: float = 2.0
-    lead_in: int | None = None
+    warm_up: int | None = None
     patience_s: float = 10.0
     real_time: bool = False
     readouts: Readouts = ALL
@@ -144,10 +144,10 @@ class Loop:
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
-        if self.lead_in is None:
-            object.__setattr__(self, "lead_in", 2 if self.pulses == 1 else 0)
-        if not (isinstance(self.lead_in, int) and 0 <= self.lead_in <= MOST_LEAD_IN):
-            raise InvalidArgument(f"lead_in: expected a whole number from 0 to {MOST_LEAD_IN}, got {self.lead_in!r}")
+        if self.warm_up is None:
+            object.__setattr__(self, "warm_up", 2 if self.pulses == 1 else 0)
+        if not (isinstance(self.warm_up, int) and 0 <= self.warm_up <= MOST_WARM_UP):
+            raise InvalidArgument(f"warm_up: expected a whole number from 0 to {MOST_WARM_UP}, got {self.warm_up!r}")
         for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")

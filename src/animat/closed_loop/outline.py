@@ -11,7 +11,7 @@ from animat.closed_loop.tick import Ending
 
 @dataclass
 class Acted:
-    """What was presented in an episode while its robot moved; what led in is none of it.
+    """What was presented in an episode while its robot moved, without the warm-up.
 
     Attributes:
         presentations: repeated ones among them.
@@ -42,10 +42,10 @@ class Episode:
         iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
         is_whole: whether it came to its end; what the session broke off has no return.
-        pulses: that the culture was given, what led in among them.
-        bursts: responses that were bursts, also of what led in.
-        late: pulses that came late, also of what led in.
-        acted: the same without what led in, and more.
+        pulses: that the culture was given, those of the warm-up among them.
+        bursts: responses that were bursts, also in the warm-up.
+        late: pulses that came late, also in the warm-up.
+        acted: the same without the warm-up, and more.
     """
 
     number: int
@@ -139,7 +139,7 @@ class Outline:
         episode.pulses += n_pulses
         episode.bursts += tick["is_burst"]
         episode.late += is_late
-        if tick["handled"] != "lead-in":
+        if tick["handled"] != "warm-up":
             acted = episode.acted
             acted.presentations += 1
             acted.actions += tick["command"] is not None

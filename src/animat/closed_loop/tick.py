@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self
 
-Handled = Literal["used", "repeated", "skipped", "lead-in", "unfinished"]
+Handled = Literal["used", "repeated", "skipped", "warm-up", "unfinished"]
 EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
 
 
@@ -18,8 +18,8 @@ class Tick:
         contender: whose episode it is.
         episode: number of the episode in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
-            and what leads in has -1.
-        chosen: the condition that was chosen, by the contender or, where it leads in, by lot.
+            and the warm-up has -1.
+        chosen: the condition that was chosen, by the contender or, in a warm-up, by lot.
         delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
         frequency_hz: that the delivered one was presented at.
         patterns: of each pulse, -1 where its electrodes are none of the culture's; none under the silent control.
@@ -30,7 +30,7 @@ class Tick:
         readout_hz: x of each readout, where these are groups of channels; else empty.
         active_ratio: share of channels that spiked in the window.
         is_burst: whether that is above the threshold.
-        handled: what was done with the response; `"lead-in"` before the robot of an episode moves; `"unfinished"` if
+        handled: what was done with the response; `"warm-up"` before the robot of an episode moves; `"unfinished"` if
             something went wrong before the robot had moved.
         command: the robot was moved by, one for each readout where there are several; None where it was not moved.
         reward: of the step.

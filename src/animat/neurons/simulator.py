@@ -26,7 +26,7 @@ PERCENTILES = tuple(range(0, 101, 10))
 
 
 AT_FIRST = 0.5
-"""The past that an episode begins with: what has led in to it was presented in random order, as in a recording."""
+"""The past that an episode begins with: its warm-up was presented in random order, as in a recording."""
 
 
 class Answer(NamedTuple):

@@ -18,7 +18,7 @@ from animat.responses.responses import Presented, Responses
 
 @dataclass(frozen=True, eq=False)
 class Answered:
-    """Responses in the episodes of policies that came to their end, without what led in.
+    """Responses in the episodes of policies that came to their end, without the warm-up.
 
     Attributes:
         responses: in the order of time, on the session's clock, with all that the culture was presented between them.

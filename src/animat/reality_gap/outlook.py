@@ -74,7 +74,7 @@ def outlook(
     interval_s = loop.pulses * np.array([condition.interval_s for condition in loop.conditions])
     total_s = pulses = 0.0
     for n, acted, is_stimulated in episodes:
-        presented = acted + (loop.lead_in or 0) * is_stimulated
+        presented = acted + (loop.warm_up or 0) * is_stimulated
         total_s += n * (loop.pause_s + float(presented @ interval_s))
         pulses += n * is_stimulated * loop.pulses * float(presented.sum())
     of, drift, since_min = account.budget.pulses, calibration.drift, calibration.start_min - now_min

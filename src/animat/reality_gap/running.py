@@ -110,12 +110,12 @@ def run_policies(
             "what they choose is delivered"
         )
         findings += (Finding("trained-as-control", "warning", sentence),)
-    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.lead_in:
+    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
         sentence = (
-            "episodes begin after a rest (--lead-in 0), and those of the simulator as after stimuli of all conditions: "
+            "episodes begin after a rest (--warm-up 0), and those of the simulator as after stimuli of all conditions: "
             "the measured return will be less than predicted"
         )
-        findings += (Finding("no-lead-in", "warning", sentence),)
+        findings += (Finding("no-warm-up", "warning", sentence),)
     if follow and first.percentiles == "first":
         sentence = (
             "the policies were trained on held percentiles, and in this loop they follow the culture: with "

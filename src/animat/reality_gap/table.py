@@ -34,7 +34,7 @@ class Row:
         predicted: returns on the simulator, shape (episodes,).
         predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (redrawn,).
         measured: returns of whole episodes on the culture, shape (episodes,).
-        pulses_per_action: that the culture was given, without what led in; so are the next three.
+        pulses_per_action: that the culture was given, without the warm-up; so are the next three.
         seconds_per_action: of the culture's time.
         bursts: share of responses that were.
         late: share of presentations that came late.
