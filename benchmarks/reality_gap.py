@@ -1,7 +1,7 @@
 """The headline table: predicted against measured return by recordings and presentation, over cultures and both robots.
 
     python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation]
-        [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
+        [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds adaptive fixed]
         [--controls] [--out gap/]
     python benchmarks/reality_gap.py --backends virtual cl1 maxone --channels 1024 256 128 60 16
 
@@ -35,7 +35,7 @@ COLUMNS = (
     "recorded",
     "simulator",
     "mapping",
-    "percentiles",
+    "thresholds",
     "random: predicted, measured",
     "limit",
     "predicted, 95 %",
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--robots", nargs="+", default=["cartpole", "navigation"])
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--thresholds", nargs="+", default=["follow", "held"])
+    parser.add_argument("--thresholds", nargs="+", default=["adaptive", "fixed"])
     parser.add_argument("--policies", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--iterations", type=int, help="default: the paper's")
@@ -133,8 +133,8 @@ def main() -> None:
             policies = str(folder / "policies")
             given = training_options(way, robot, options.policies, options.iterations)
             expect(["train", robot, "--recordings", recordings, *given, "--out", policies])
-            for thresholds in options.thresholds if way else ["follow"]:
-                table = folder / f"{thresholds}.json"
+            for thresholds in options.thresholds if way else ["adaptive"]:
+                table = table_of(folder, thresholds)
                 if not table.exists():
                     run = ["run", policies, "--recordings", recordings, "--out", str(free(folder / thresholds))]
                     run += running_options(way, thresholds, options.episodes, controls=options.controls)
@@ -188,11 +188,19 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
             print(f"{folder}: no row: {outcome['session']['ended']}", file=sys.stderr)
             return None
         table.write_text(json.dumps(outcome) + "\n")
-    return told(seed, way, "follow", read_table(table))
+    return told(seed, way, "adaptive", read_table(table))
 
 
 FORMER = {"lived": "measured"}
 """Keys as tables of before have them."""
+FORMER_FILES = {"adaptive": "follow", "fixed": "held"}
+"""What tables of before are called."""
+
+
+def table_of(folder: Path, thresholds: str) -> Path:
+    """Where the table is: the former one, or the new one."""
+    former = folder / f"{FORMER_FILES[thresholds]}.json"
+    return former if former.exists() else folder / f"{thresholds}.json"
 
 
 def read_table(file: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import (
     AnyCondition,
@@ -24,7 +25,6 @@ from animat.closed_loop.contenders import (
     controls,
     interleaved,
 )
-from animat.closed_loop.following import Following
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
@@ -325,9 +325,9 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
     assert len(session.ticks) == 15
 
 
-def test_what_leads_in_counts_for_percentiles_that_follow(tmp_path: Path) -> None:
-    following = tuple(np.zeros(3) for _ in HZ)
-    loop = loop_of(warm_up=3, following=following)
+def test_the_warm_up_counts_for_adaptive_thresholds(tmp_path: Path) -> None:
+    reference = tuple(np.zeros(3) for _ in HZ)
+    loop = loop_of(warm_up=3, adaptive_from=reference)
     one = Contender("constant", "", OneCondition(0), calibrates=False)
     with FakeCulture() as culture:
         session = run_session(culture, loop, [one], tmp_path, episodes=1)
@@ -547,25 +547,25 @@ def test_a_budget_is_kept_to_the_pulse() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_percentiles_follow_the_newest_of_each_condition_and_of_nothing_else(data: st.DataObject) -> None:
+def test_thresholds_adapt_to_the_newest_of_each_condition_and_of_nothing_else(data: st.DataObject) -> None:
     # Where a condition has more than a hundred, the newest count, of every condition the same part.
     sizes = data.draw(st.lists(st.integers(1, 6) | st.integers(98, 130), min_size=1, max_size=4))
     rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
     history = [rng.gamma(5.0, 2.0, n).tolist() for n in sizes]
-    following = Following([np.array(each) for each in history])
+    adaptive = AdaptiveThresholds([np.array(each) for each in history])
     for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
         x = float(rng.gamma(5.0, 1.0))
         history[condition].append(x)
-        following.add(condition, x)
+        adaptive.add(condition, x)
     part = min(1, 100 / max(sizes))
     pooled = np.concatenate([each[-max(1, round(part * n)) :] for each, n in zip(history, sizes, strict=True)])
     expected = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
-    np.testing.assert_array_equal(following.percentiles(), expected)
+    np.testing.assert_array_equal(adaptive.percentiles(), expected)
 
 
 def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> None:
     reference = tuple(np.full(4, 100.0) for _ in HZ)
-    loop = loop_of(following=reference, mapping=Linear(), burst_threshold=0.95)
+    loop = loop_of(adaptive_from=reference, mapping=Linear(), burst_threshold=0.95)
     contenders = [
         RANDOM,
         Contender("always", "", OneCondition(4), calibrates=False),
@@ -588,8 +588,8 @@ def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> 
     assert sum(len(each) for each in history) > 20 + 20
     assert_read_alike(tmp_path, loop)
     for wrong in (reference[:3], (*reference[:4], np.empty(0))):
-        with pytest.raises(InvalidArgument, match="following"):
-            loop_of(following=wrong)
+        with pytest.raises(InvalidArgument, match="adaptive_from"):
+            loop_of(adaptive_from=wrong)
 
 
 class Tiring(FakeCulture):
@@ -601,25 +601,27 @@ class Tiring(FakeCulture):
         return replace(observed, spikes=Spikes(observed.spikes.time_s[kept], observed.spikes.channel[kept]))
 
 
-def test_following_keeps_half_of_the_responses_above_the_median_of_a_culture_that_tires(tmp_path: Path) -> None:
+def test_adaptive_thresholds_keep_half_of_the_responses_above_the_median_of_a_culture_that_tires(
+    tmp_path: Path,
+) -> None:
     above: dict[str, float] = {}
     protocol = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
-    for how in ("held", "follow"):
+    for how in ("fixed", "adaptive"):
         with Tiring() as culture:
             responses = extract_responses(culture.record(protocol), burst_threshold=0.95)
             percentiles = np.percentile(responses.non_burst_rate_hz, range(0, 101, 10))
-            reference = tuple(responses.rates_of(i) for i in range(5)) if how == "follow" else None
+            reference = tuple(responses.rates_of(i) for i in range(5)) if how == "adaptive" else None
             culture.rest(600.0)
             loop = loop_of(
                 robot=Navigation(episode_limit=25),
                 mapping=Thresholds(1),
                 percentiles=percentiles,
-                following=reference,
+                adaptive_from=reference,
                 burst_threshold=0.95,
             )
             session = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=16)
         # The last quarter of the session.
         above[how] = float(np.mean([tick.command == 1.0 for tick in session.ticks[-100:]]))
     # Half of a binomial of 100: standard deviation 0.05. Ties at the median count as above it.
-    assert above["held"] < 0.25
-    assert 0.38 < above["follow"] < 0.72
+    assert above["fixed"] < 0.25
+    assert 0.38 < above["adaptive"] < 0.72

@@ -82,7 +82,7 @@ def test_one_line_tells_it() -> None:
     line = str(Outlook(26.2, (24.0, 11.0), math.inf))
     assert line == (
         "the session is planned for about 26 min of the culture's time; by the recordings' drift the median response "
-        "has changed by 25 % in 24 min (11 min at least), beyond which following thresholds may not help; the plan is "
+        "has changed by 25 % in 24 min (11 min at least), beyond which adaptive thresholds may not help; the plan is "
         "longer: ask for fewer --episodes"
     )
     assert str(Outlook(26.2, (-5.0, -9.0), 30.0)).endswith("the plan is longer: ask for fewer --episodes")

@@ -18,8 +18,8 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from animat.cli import main
+from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.contenders import HandMadeRule
-from animat.closed_loop.following import Following
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -261,19 +261,19 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert [each["name"] for each in explained.to_dict()["reasons"]] == ["a", "b"]
 
 
-def test_what_policies_were_answered_is_as_the_log_and_the_followed_median_have_it(without_controls: Ran) -> None:
+def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_it(without_controls: Ran) -> None:
     gap, policies, told = without_controls
     assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
-    assert gap.loop.following is not None
-    following, p50_hz, passed = Following(gap.loop.following), gap.loop.percentiles[5], []
+    assert gap.loop.adaptive_from is not None
+    thresholds, p50_hz, passed = AdaptiveThresholds(gap.loop.adaptive_from), gap.loop.percentiles[5], []
     ticks, episode = [tick for tick in gap.session.ticks if tick.contender in policies], -1
     for tick in gap.session.ticks:
         if tick.episode != episode:
-            episode, p50_hz = tick.episode, following.percentiles()[5] if following.seen else p50_hz
+            episode, p50_hz = tick.episode, thresholds.percentiles()[5] if thresholds.seen else p50_hz
         if tick.contender in policies:
             passed.append(tick.rate_hz >= p50_hz)
         if not tick.is_burst:
-            following.add(tick.delivered, tick.rate_hz)
+            thresholds.add(tick.delivered, tick.rate_hz)
     found = answered(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.passed, passed)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
@@ -355,21 +355,27 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
     calibration = Calibration.of_series(series)
     moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.redrawn}
     assert len(moving) > 50
-    held = calibration.holding(calibration.simulator.percentiles)
-    for each in (held.simulator, *held.redrawn):
+    fixed = calibration.with_percentiles(calibration.simulator.percentiles)
+    for each in (fixed.simulator, *fixed.redrawn):
         np.testing.assert_array_equal(each.percentiles, calibration.simulator.percentiles)
     policy = policy_of(0, series, provenance={"training": {"percentiles": "first"}})
     first = Calibration.of_series(series, policy, at_min=series[-1].start_min)
     for each in (first.simulator, *first.redrawn):
         np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
-    for follow in (True, False):
+    for adaptive in (True, False):
         with FakeCulture() as culture:
             gap = run_policies(
-                {"p": policy}, culture, first, tmp_path / str(follow), episodes=1, with_controls=False, follow=follow
+                {"p": policy},
+                culture,
+                first,
+                tmp_path / str(adaptive),
+                episodes=1,
+                with_controls=False,
+                adaptive=adaptive,
             )
-        assert ("moving-percentiles" in [finding.name for finding in gap.findings]) == follow
-    gap, _ = run(tmp_path / "held", series, with_controls=False, follow=False)
-    other, _ = run(tmp_path / "follow", series, with_controls=False, follow=True)
+        assert ("moving-percentiles" in [finding.name for finding in gap.findings]) == adaptive
+    gap, _ = run(tmp_path / "fixed", series, with_controls=False, adaptive=False)
+    other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
     assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
     np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[0].predicted)
 
@@ -440,12 +446,12 @@ def test_no_two_roll_outs_have_the_same_draws() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("mapping", "held"),
+    ("mapping", "fixed"),
     [(Thresholds(1), False), (Thresholds(9), False), (Thresholds(1), True), (Linear(), True)],
-    ids=["1 threshold", "9 thresholds", "1 threshold, held", "linear, held"],
+    ids=["1 threshold", "9 thresholds", "1 threshold, fixed", "linear, fixed"],
 )
 def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
-    mapping: Mapping, held: bool, series: list[Responses], tmp_path: Path
+    mapping: Mapping, fixed: bool, series: list[Responses], tmp_path: Path
 ) -> None:
     """A culture that does answer as its recording's distribution says, and 100 responses of it in each recording."""
     gap, _ = run(tmp_path, series, with_controls=False)
@@ -462,9 +468,9 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     for seed in range(recordings):
         calibration = Calibration.of_series([drawn_responses(rng, 100)])
         living = culture
-        if held:
+        if fixed:
             percentiles = calibration.simulator.percentiles
-            calibration, living = calibration.holding(percentiles), replace(culture, percentiles=percentiles)
+            calibration, living = calibration.with_percentiles(percentiles), replace(culture, percentiles=percentiles)
         row = replace(
             gap.rows[0],
             predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from animat.cli import main
+from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.contenders import Contender, HandMadeRule, OneCondition, random_control
-from animat.closed_loop.following import Following
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -87,7 +87,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         Thresholds(9),
         timeline.conditions,
         np.asarray(timeline.at(0.0).percentiles),
-        following=recorded_hz,
+        adaptive_from=recorded_hz,
         burst_threshold=0.95,
         warm_up=1,
         readouts=timeline.readouts,
@@ -110,7 +110,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     np.testing.assert_array_equal(whole.read_hz, [tick.readout_hz for tick in stimulated])
     np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
 
-    # The thresholds follow each half on its own: percentiles over its newest responses, computed again here.
+    # The thresholds adapt to each half on its own: percentiles over its newest responses, computed again here.
     newest = [list(of) for of in recorded_hz]
     logged = {w["episode"]: w["percentiles_hz"] for w in session.log.records.words() if w["kind"] == "percentiles"}
     # Until something was answered they are the recording's.
@@ -279,11 +279,11 @@ def test_the_rule_made_by_hand_takes_the_nearest_in_the_plane() -> None:
         assert HandMadeRule(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
 
 
-def test_thresholds_follow_every_readout_on_its_own() -> None:
+def test_thresholds_adapt_to_every_readout_on_its_own() -> None:
     rng = np.random.default_rng(0)
-    both = Following([rng.gamma(4, 5, (30, 2)) for _ in range(3)])
+    both = AdaptiveThresholds([rng.gamma(4, 5, (30, 2)) for _ in range(3)])
     rng = np.random.default_rng(0)
-    alone = [Following([x[:, d] for x in [rng.gamma(4, 5, (30, 2)) for _ in range(3)]]) for d in range(1)]
+    alone = [AdaptiveThresholds([x[:, d] for x in [rng.gamma(4, 5, (30, 2)) for _ in range(3)]]) for d in range(1)]
     for _ in range(20):
         x = np.random.default_rng(1).gamma(4, 5, 2)
         both.add(1, x)

@@ -48,7 +48,7 @@ class Live(Stimulating):
     controls: Literal["all", "random"] = "all"
     """Run between the policies' episodes"""
     percentiles: Literal["moving", "first"] = "moving"
-    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
     """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
     histogram: the paper's; empirical: draw any measured value"""
@@ -99,7 +99,7 @@ class Live(Stimulating):
         protocol = Protocol(
             order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
         )
-        settings = {**self._of_the_loop(), "follow": self.thresholds == "follow"}
+        settings = {**self._of_the_loop(), "adaptive": self.thresholds == "adaptive"}
         check_plan(training, protocol, self.out, timetable, self.episodes, settings)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []

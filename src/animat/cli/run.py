@@ -130,7 +130,7 @@ class Run(Stimulating):
                 episodes=self.episodes,
                 with_controls=self.controls == "all",
                 greedy=not self.drawn,
-                follow=self.thresholds == "follow",
+                adaptive=self.thresholds == "adaptive",
                 seed=self.seed,
                 account=account,
                 progress=progress,

@@ -26,8 +26,8 @@ class Stimulating:
     """Most pulses in all, recordings included; default: no end, but the culture's limits"""
     budget_per_electrode: int | None = None
     """Most pulses on any one electrode"""
-    thresholds: Literal["follow", "held"] = "follow"
-    """The mapping's percentiles in closed loop: following the culture's newest responses, or held from the recording"""
+    thresholds: Literal["adaptive", "fixed"] = "adaptive"
+    """The mapping's thresholds in closed loop: adaptive to the culture's newest responses, or fixed by the recording"""
     on_burst: Literal["use", "repeat", "skip"] = "use"
     """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
     on_late: Literal["continue", "stop"] = "continue"

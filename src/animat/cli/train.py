@@ -45,7 +45,7 @@ class Train(Fitting):
     duration_min: float | None = None
     """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
-    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     delivery: Literal["chosen", "shuffled"] = "chosen"
     """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
     parameters: tuple[str, ...] = ()

@@ -109,7 +109,7 @@ class Contender:
         controller: who chooses.
         delivery: `"chosen"`: the culture gets what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
             `"silent"`: no pulse, and what the culture fires by itself is read where the response would be.
-        calibrates: whether its responses count where percentiles follow the culture; one condition presented over
+        calibrates: whether its responses count for adaptive thresholds; one condition presented over
             and over is answered otherwise than between others. The warm-up of its episodes always counts.
     """
 

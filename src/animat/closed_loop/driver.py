@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import Contender, Controller
-from animat.closed_loop.following import Following
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.stretch import Asked, Stretch, rows_of
@@ -72,7 +72,7 @@ class Driver:
         self._rng = np.random.default_rng([seed, 21])
         self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
-        self._following = None if loop.following is None else Following(loop.following)
+        self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
         self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
@@ -119,9 +119,9 @@ class Driver:
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
         self._warm_up(contender, episode)
-        if self._following is not None and self._following.seen:
+        if self._adaptive is not None and self._adaptive.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
-            self._percentiles = self._following.percentiles()
+            self._percentiles = self._adaptive.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         for iteration in range(loop.robot.episode_limit):
@@ -235,8 +235,8 @@ class Driver:
             "readout_hz": readout_hz,
         }
         self._presented += 1
-        if self._following is not None and stimuli and (contender.calibrates or is_warm_up) and not is_burst:
-            self._following.add(delivered, x_hz)
+        if self._adaptive is not None and stimuli and (contender.calibrates or is_warm_up) and not is_burst:
+            self._adaptive.add(delivered, x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-_LOOP = {"lead_in": "warm_up"}
+_LOOP = {"lead_in": "warm_up", "following": "adaptive"}
 _HANDLED = {"lead-in": "warm-up"}
 
 

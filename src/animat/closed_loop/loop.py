@@ -77,8 +77,8 @@ class Loop:
         conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,); of several readouts
             (readouts, 11).
-        following: non-burst responses of each condition in that recording, Hz, in the order of time; where given, the
-            percentiles follow the culture (see `animat.closed_loop.following`). None: they are held.
+        adaptive_from: non-burst responses of each condition in that recording, Hz, in the order of time, which adaptive
+            thresholds start from (see `animat.closed_loop.adaptive`). None: thresholds are fixed.
         pulses: of a presentation.
         window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
@@ -90,7 +90,7 @@ class Loop:
         on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: observed without a stimulus before each episode.
         warm_up: how often each condition is presented after that, in random order, before the robot moves: a culture
-            that has rested answers otherwise than in a recording. The responses count where percentiles follow. None:
+            that has rested answers otherwise than in a recording. The responses count for adaptive thresholds. None:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
@@ -106,7 +106,7 @@ class Loop:
     mapping: Mapping
     conditions: tuple[Condition, ...]
     percentiles: Float32[np.ndarray, "*readouts percentiles"] = field(repr=False)
-    following: tuple[Float64[np.ndarray, "responses *readouts"], ...] | None = field(default=None, repr=False)
+    adaptive_from: tuple[Float64[np.ndarray, "responses *readouts"], ...] | None = field(default=None, repr=False)
     pulses: int = 1
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
     burst_threshold: float = 1.0
@@ -134,12 +134,12 @@ class Loop:
         check_window(self.window_ms)
         _ = self.presentation
         _ = self.encoder
-        if self.following is not None and (
-            len(self.following) != len(self.conditions) or not all(len(x) for x in self.following)
+        if self.adaptive_from is not None and (
+            len(self.adaptive_from) != len(self.conditions) or not all(len(x) for x in self.adaptive_from)
         ):
             raise InvalidArgument(
-                f"following: expected some responses of each of {len(self.conditions)} conditions, got "
-                f"{[len(x) for x in self.following]}"
+                f"adaptive_from: expected some responses of each of {len(self.conditions)} conditions, got "
+                f"{[len(x) for x in self.adaptive_from]}"
             )
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
@@ -213,12 +213,12 @@ class Loop:
     def to_dict(self) -> dict[str, Any]:
         """As plain data, for the log of a session."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        plain["adaptive"] = plain.pop("adaptive_from") is not None
         return plain | {
             "robot": robot_to_dict(self.robot),
             "mapping": mapping_to_data(self.mapping),
             "conditions": [condition.label for condition in self.conditions],
             "percentiles": self.percentiles.tolist(),
-            "following": self.following is not None,
             "readouts": self.readouts.to_dict(),
             "pulse": self.pulse.to_list(),
         }

@@ -27,7 +27,7 @@ from animat.writing import LOCK
 
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
-_NOT_OF_THE_LOOP = ("follow", "greedy")
+_NOT_OF_THE_LOOP = ("adaptive", "greedy")
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ def live(
         policies = run.shadow()
         calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
         if training.percentiles == "first":
-            calibration = calibration.holding(pooled_percentiles(run.used[0]))
+            calibration = calibration.with_percentiles(pooled_percentiles(run.used[0]))
         # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
         with alone_in(run.folder / SESSION):
             gap = run_policies(

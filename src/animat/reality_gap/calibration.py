@@ -78,7 +78,7 @@ class Calibration:
 
         Args:
             series: in any order.
-            policy: its last simulator in training is the one that is taken, its percentiles held if they were then.
+            policy: its last simulator in training is the one that is taken, its thresholds fixed if they were then.
             at_min: the minute whose newest recording is taken instead; None without a policy: the last.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
@@ -115,13 +115,14 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
         )
-        held = policy is not None and policy.percentiles == "first"
-        return calibration.holding(timeline.with_first_percentiles().at(start_min).percentiles) if held else calibration
+        if policy is None or policy.percentiles != "first":
+            return calibration
+        return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
 
-    def holding(self, percentiles: Any) -> Self:
+    def with_percentiles(self, percentiles: Any) -> Self:
         """The same with one set of percentiles in all simulators: they do not move with the responses."""
 
-        def held(simulator: NeuronSimulator) -> NeuronSimulator:
+        def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
-        return replace(self, simulator=held(self.simulator), redrawn=tuple(map(held, self.redrawn)))
+        return replace(self, simulator=fixed(self.simulator), redrawn=tuple(map(fixed, self.redrawn)))

@@ -42,7 +42,7 @@ class Outlook:
             likely, least = (max(0.0, each) for each in self.drifted_min)
             drift = (
                 f"by the recordings' drift the median response has changed by {100 * LARGE:.0f} % in "
-                f"{_words(likely)} ({_words(least)} at least), beyond which following thresholds may not help"
+                f"{_words(likely)} ({_words(least)} at least), beyond which adaptive thresholds may not help"
             )
         said = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
         if np.isfinite(self.budget_min):

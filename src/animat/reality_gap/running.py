@@ -56,7 +56,7 @@ def run_policies(
     episodes: int = 5,
     with_controls: bool = True,
     greedy: bool = True,
-    follow: bool = True,
+    adaptive: bool = True,
     seed: int = 1,
     pulses: int | None = None,
     account: Account | None = None,
@@ -80,8 +80,8 @@ def run_policies(
         episodes: of each policy, and at most of each control.
         with_controls: all of them; if not, only the random one.
         greedy: whether policies take the most probable action, or draw as in training.
-        follow: whether the mapping's percentiles follow the culture (`animat.closed_loop.following`) from where the
-            calibration left them, or are held.
+        adaptive: whether the mapping's thresholds adapt to the culture (`animat.closed_loop.adaptive`) from where the
+            calibration left them, or are fixed.
         seed: decides every random draw, but what the culture does.
         pulses: of a presentation; None: as in the policies' recordings.
         account: of a stimulation budget.
@@ -98,8 +98,8 @@ def run_policies(
     first = check_policies(policies)
     check_conditions(first, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if follow:
-        settings["following"] = calibration.responses_hz
+    if adaptive:
+        settings["adaptive_from"] = calibration.responses_hz
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
@@ -116,10 +116,10 @@ def run_policies(
             "the measured return will be less than predicted"
         )
         findings += (Finding("no-warm-up", "warning", sentence),)
-    if follow and first.percentiles == "first":
+    if adaptive and first.percentiles == "first":
         sentence = (
-            "the policies were trained on held percentiles, and in this loop they follow the culture: with "
-            "--thresholds held they are as in training"
+            "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
+            "--thresholds fixed they are as in training"
         )
         findings += (Finding("moving-percentiles", "warning", sentence),)
     findings += (
@@ -156,8 +156,8 @@ def run_policies(
     predicted = predict(
         [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
         environment,
-        # Held percentiles are what they are; those that follow the culture would follow other responses too.
-        calibration if follow else calibration.holding(calibration.simulator.percentiles),
+        # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
+        calibration if adaptive else calibration.with_percentiles(calibration.simulator.percentiles),
         rule,
         greedy=greedy,
         seed=seed,
