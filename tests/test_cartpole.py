@@ -181,7 +181,7 @@ def test_the_printed_variants_are_selectable_and_say_what_they_mean() -> None:
 
 
 def test_a_pole_left_alone_falls_and_a_simple_rule_keeps_it_up() -> None:
-    """A hand-made rule holds for all 120 iterations, so the task's best return of 120 can be had."""
+    """A heuristic policy holds for all 120 iterations, so the task's best return of 120 can be had."""
     robot = Cartpole()
 
     def episode(key, rule):

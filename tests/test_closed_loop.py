@@ -19,7 +19,7 @@ from animat.closed_loop.body import Body
 from animat.closed_loop.contenders import (
     AnyCondition,
     Contender,
-    HandMadeRule,
+    HeuristicController,
     InTurn,
     OneCondition,
     controls,
@@ -468,8 +468,8 @@ def test_a_session_needs_an_open_culture_contenders_and_a_folder_of_its_own(tmp_
             run_session(culture, loop_of(), [RANDOM], tmp_path / "other")
 
 
-def test_the_hand_made_rule_steers_the_right_way() -> None:
-    rule = HandMadeRule(Cartpole(), (-0.4, -0.1, 0.0, 0.1, 0.4))
+def test_the_heuristic_policy_steers_the_right_way() -> None:
+    rule = HeuristicController(Cartpole(), (-0.4, -0.1, 0.0, 0.1, 0.4))
     rng = np.random.default_rng(1)
     assert rule.act(np.array([0.0, 0.0, 0.1, 0.0]), rng) == 4
     assert rule.act(np.array([0.0, 0.0, 0.05, -1.0]), rng) == 0
@@ -481,7 +481,7 @@ def test_the_hand_made_rule_steers_the_right_way() -> None:
     turn_rad = (to_goal + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_array_equal([navigation.heuristic(place) for place in places], np.sign(turn_rad))
     names = [c.name for c in controls(Cartpole(), ["a", "b"], means=(-0.2, 0.2), policies={"p0": rule})]
-    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "made by hand"]
+    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "heuristic"]
 
 
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])

@@ -15,7 +15,7 @@ import pytest
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
@@ -182,7 +182,7 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
         "constant 5 Hz",
         "constant 10 Hz",
         "constant 20 Hz",
-        "made by hand",
+        "heuristic",
         "silent",
         "shuffled",
     ]
@@ -245,12 +245,12 @@ def test_simulators_made_otherwise_than_in_training_are_told() -> None:
     assert "other-simulator" not in {each.name for each in noticed}
 
 
-def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> None:
+def test_the_heuristic_policy_goes_through_the_same_mapping_and_neurons() -> None:
     timeline = timeline_of()
     evaluation = evaluate({"a": policy_of(timeline)}, timeline, at_min=14.0, episodes=50, seed=3)
-    (row,) = [row for row in evaluation.rows if row.name == "made by hand"]
+    (row,) = [row for row in evaluation.rows if row.name == "heuristic"]
     environment, simulator = Animat(Cartpole(), Thresholds(1), 3), timeline.at(14.0)
-    rule = hand_made(environment, simulator)
+    rule = heuristic_policy(environment, simulator)
     np.testing.assert_array_equal(
         row.episodes.returns, roll_out(environment, simulator, rule, 1, episodes=50, seed=3).returns
     )
@@ -320,8 +320,8 @@ def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
     assert evaluation.limit is not None
     assert evaluation.limit.value == pytest.approx(120, abs=0.01)
     rows = {row.name: row for row in evaluation.rows}
-    by_hand, random = (float(rows[name].mean_returns.mean()) for name in ("made by hand", "random"))
-    assert evaluation.score(rows["made by hand"]) == pytest.approx((by_hand - random) / (120 - random), abs=0.001)
+    heuristic, random = (float(rows[name].mean_returns.mean()) for name in ("heuristic", "random"))
+    assert evaluation.score(rows["heuristic"]) == pytest.approx((heuristic - random) / (120 - random), abs=0.001)
     assert evaluation.score(rows["constant -1"]) == pytest.approx(
         (float(rows["constant -1"].mean_returns.mean()) - random) / (120 - random), abs=0.001
     )
@@ -353,7 +353,7 @@ def test_shuffling_makes_every_policy_a_random_one() -> None:
 
 def test_without_neurons_there_is_nothing_to_silence() -> None:
     evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=4)
-    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "made by hand"]
+    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "heuristic"]
     assert isinstance(WithoutNeurons(Cartpole(), (-1.0, 1.0)).n_actions, int)
 
 

@@ -21,7 +21,7 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.execution.training import train
@@ -479,7 +479,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     chances = {"after_low": (0.05, 0.2, 0.35, 0.5, 0.6), "after_high": (0.25, 0.5, 0.75, 0.85, 0.95)}
     environment = Animat(Cartpole(), Thresholds(1), 5)
     culture = fit_memory(chain(40_000, seed=99, **chances))
-    rule = hand_made(environment, culture)
+    rule = heuristic_policy(environment, culture)
 
     def returns(simulator: MemorySimulator, episodes: int, seed: int) -> np.ndarray:
         return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.contenders import HandMadeRule
+from animat.closed_loop.contenders import HeuristicController
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument
-from animat.evaluation.hand_made import HandMade
+from animat.evaluation.heuristic import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
@@ -234,9 +234,9 @@ def test_a_heuristic_s_command_is_one(wanted: float) -> None:
 def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: float, nearest: int) -> None:
     robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
     means = (-0.4, 0.1, 0.4)
-    assert HandMadeRule(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
+    assert HeuristicController(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
     environment = Animat(robot, Thresholds(1), 3)
-    rule = HandMade(jnp.arange(3), jnp.asarray(means, jnp.float32))
+    rule = HeuristicPolicy(jnp.arange(3), jnp.asarray(means, jnp.float32))
     assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros((1, 1))).tolist() == [nearest]
 
 

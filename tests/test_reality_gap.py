@@ -19,7 +19,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.contenders import HandMadeRule
+from animat.closed_loop.contenders import HeuristicController
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -28,7 +28,7 @@ from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
@@ -116,7 +116,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     gap, policies = run(tmp_path, series)
     rows = {row.name: row for row in gap.rows}
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
-    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "made by hand"]
+    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "heuristic"]
     assert gap.session.ending.by == "plan"
     assert gap.findings == Calibration.of_series(series).findings
 
@@ -459,7 +459,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     rng = np.random.default_rng(5)
     environment = Animat(Cartpole(), mapping, 5)
     culture = fit_empirical(drawn_responses(rng, 50_000))
-    rule = hand_made(environment, culture)
+    rule = heuristic_policy(environment, culture)
 
     def returns(simulator: NeuronSimulator, episodes: int, seed: int) -> np.ndarray:
         return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()
@@ -488,7 +488,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
 def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
     rng, widths = np.random.default_rng(3), []
     environment = Animat(Cartpole(), Thresholds(1), 5)
-    rule = hand_made(environment, fit_empirical(drawn_responses(rng, 5_000)))
+    rule = heuristic_policy(environment, fit_empirical(drawn_responses(rng, 5_000)))
     for n in (50, 800):
         calibration = Calibration.of_series([drawn_responses(rng, n)])
         means = [roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.redrawn]
@@ -500,7 +500,7 @@ def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
 
 
 @pytest.mark.usefixtures("few_redrawn")
-def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
+def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
     simulator = Calibration.of_series(series).simulator
     rng = np.random.default_rng(1)
     for robot, low, high in (
@@ -508,12 +508,12 @@ def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Re
         (Navigation(), [0, 0, -np.pi], [1, 1, np.pi]),
     ):
         environment: Animat[Any] = Animat(robot, Thresholds(1), 5)
-        rule = hand_made(environment, simulator)
+        rule = heuristic_policy(environment, simulator)
         assert int(np.argmax(rule.means)) == 4
         observed = rng.uniform(low, high, (500, len(low)))
         rule = jax.tree.map(lambda x: x[0], rule)
         predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
-        chosen = [HandMadeRule(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
+        chosen = [HeuristicController(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
         np.testing.assert_array_equal(np.asarray(predicted), chosen)
 
 
@@ -620,7 +620,7 @@ class TestCommand:
         told = json.loads(printed.out.splitlines()[-1])
         assert len(told["rows"]) == 12
         assert told["session"]["ended_by"] == "plan"
-        assert "made by hand" in printed.out
+        assert "heuristic" in printed.out
         (folder / "session" / "session.nwb").unlink()
         assert main(["recover", str(folder / "session"), "--json"]) == 0
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == told["session"]["ticks"]

@@ -132,7 +132,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     assert main(["run", *asked, "--culture", "replay"]) == 0
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
-    assert "made by hand" not in {row["name"] for row in told["rows"]}
+    assert "heuristic" not in {row["name"] for row in told["rows"]}
     assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
     assert "no optimal return: rover has no method `value_grid`" in said
 

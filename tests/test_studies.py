@@ -31,7 +31,7 @@ from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
@@ -485,7 +485,7 @@ def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -
         assert policies.mean() < best + float(limit["grid_error"]) + 4 * error
     controls = rows(finished / "tables/controls.csv")
     names = {row["control"] for row in controls if row["mapping"] == "1-threshold"}
-    assert {"random", "silent", "shuffled", "made by hand", "constant 80 Hz"} <= names
+    assert {"random", "silent", "shuffled", "heuristic", "constant 80 Hz"} <= names
 
 
 def test_limits_have_intervals_where_conditions_are_evaluated_through_thresholds(finished: Path) -> None:
@@ -969,7 +969,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
 
 
 @pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
-def test_the_rule_made_by_hand_goes_where_it_should(mapping: str) -> None:
+def test_the_heuristic_policy_goes_where_it_should(mapping: str) -> None:
     simulator = made_up_simulator()
     for robot, lean_right in (
         (Cartpole(), [0.0, 0.0, 0.05, 0.0]),
@@ -977,7 +977,7 @@ def test_the_rule_made_by_hand_goes_where_it_should(mapping: str) -> None:
         (Navigation(), [0.5, 0.0, 0.0]),
     ):
         environment: Animat[Any] = Animat(robot, mapping_named(mapping), 5)
-        rule = hand_made(environment, simulator)
+        rule = heuristic_policy(environment, simulator)
         seen = np.array([lean_right, lean_right]) / environment.scales
         if isinstance(robot, Cartpole):
             seen[1] *= -1

@@ -1,4 +1,4 @@
-"""What a study says of its policies beside the rule made by hand, for returns whose order is known."""
+"""What a study says of its policies beside the heuristic policy, for returns whose order is known."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.contenders import Contender, HandMadeRule, OneCondition, random_control
+from animat.closed_loop.contenders import Contender, HeuristicController, OneCondition, random_control
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -28,7 +28,7 @@ from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.evaluation.hand_made import Heuristic
+from animat.evaluation.heuristic import Heuristic
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -96,7 +96,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     contenders = [
         random_control(5),
         Contender("constant", "", OneCondition(3), calibrates=False),
-        Contender("made by hand", "", HandMadeRule(loop.robot, means)),
+        Contender("heuristic", "", HeuristicController(loop.robot, means)),
         Contender("silent", "", OneCondition(0), "silent"),
     ]
     with FakeCulture(3) as culture:
@@ -164,7 +164,7 @@ def test_policies_run_and_are_predicted(
         gap = run_policies(policies, culture, calibration, tmp_path, episodes=4)
     assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].measured))
     assert "no-limit" in {finding.name for finding in gap.findings}
-    assert {"silent", "shuffled", "made by hand", "constant 5 Hz"} <= {row.name for row in gap.rows}
+    assert {"silent", "shuffled", "heuristic", "constant 5 Hz"} <= {row.name for row in gap.rows}
 
 
 def test_a_policy_carries_its_readouts_through_its_file(
@@ -217,9 +217,9 @@ def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy
 
 def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
     table = evaluate(baseline, None, episodes=40, limit_resolution=0.5)
-    assert [row.name for row in table.rows] == ["policies", "random", "made by hand"]
+    assert [row.name for row in table.rows] == ["policies", "random", "heuristic"]
     assert table.no_limit is not None and "expected one command for an optimal return, got 2" in table.no_limit
-    # The rule by hand is the robot's own, for any commands can be given.
+    # The heuristic policy is the robot's own, for any commands can be given.
     wheels = Wheels(episode_limit=8)
     state = wheels.reset(jax.random.key(4))
     seen = wheels.observe(state)
@@ -232,9 +232,9 @@ def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[st
 def test_the_baseline_of_two_commands_learns_to_drive() -> None:
     trained = train(Training(Wheels(), None, policies=1, iterations=60_000), None, None)
     returns = {row.name: float(row.episodes.returns.mean()) for row in evaluate(trained, None, episodes=40).rows}
-    # At random it stays where it is, a field away from the middle; by hand it drives there.
+    # At random it stays where it is, a field away from the middle; the heuristic drives it there.
     assert returns["random"] < -40
-    assert returns["made by hand"] > -12
+    assert returns["heuristic"] > -12
     assert returns["policies"] > -15
 
 
@@ -272,11 +272,11 @@ def test_a_robot_of_two_commands_is_checked(robot: Robot[Any], words: str) -> No
         check_robot(robot)
 
 
-def test_the_rule_made_by_hand_takes_the_nearest_in_the_plane() -> None:
+def test_the_heuristic_policy_takes_the_nearest_in_the_plane() -> None:
     means = ((-1.0, -1.0), (0.9, -0.2), (1.0, 1.0))
     for wanted, nearest in (((0.2, -0.9), 1), ((0.3, 0.9), 2), ((-1.0, -0.1), 0)):
         robot = changed(heuristic=lambda self, seen, wanted=wanted: np.array(wanted))
-        assert HandMadeRule(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
+        assert HeuristicController(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
 
 
 def test_thresholds_adapt_to_every_readout_on_its_own() -> None:

@@ -194,7 +194,7 @@ def test_a_policy_knows_what_it_sees_and_is_evaluated_so(seeing: Policy, tmp_pat
     # Who acts without looking, or looks at the robot alone, does the same whatever the policies see.
     for one, other in zip(*(table.rows for table in tables), strict=True):
         assert one.name == other.name
-        if one.name in ("random", "made by hand") or one.name.startswith("constant"):
+        if one.name in ("random", "heuristic") or one.name.startswith("constant"):
             np.testing.assert_array_equal(one.episodes.returns, other.episodes.returns)
     with pytest.raises(Mismatch, match="the same neural_observation as"):
         evaluate({"p": seeing, "q": blind}, timeline_of(), episodes=20)

@@ -52,7 +52,7 @@ class Run(Stimulating):
     episodes: int = 5
     """Of each policy; of each control as many at most, and together no more than of policies, but 5 each"""
     controls: Literal["all", "random"] = "all"
-    """all: random, constant, silent, shuffled and made by hand; random: only that one"""
+    """all: random, constant, silent, shuffled and heuristic; random: only that one"""
     pulses: int | None = None
     """Pulses per trial; default: as the policies' recordings had"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None

@@ -57,7 +57,7 @@ class Greedy:
 
 
 @dataclass(frozen=True)
-class HandMadeRule:
+class HeuristicController:
     """The condition whose mean command is the nearest to the one that the robot's `heuristic` gives.
 
     Attributes:
@@ -155,9 +155,9 @@ def controls(
     if means is not None:
         found.append(
             Contender(
-                "made by hand",
+                "heuristic",
                 "no learning: the stimulus nearest to the command of the robot's heuristic",
-                HandMadeRule(robot, tuple(means)),
+                HeuristicController(robot, tuple(means)),
             )
         )
     return found

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, OneCondition
+from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HeuristicController, OneCondition
 from animat.environment import Animat
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import silenced
@@ -78,7 +78,7 @@ def predict(
         groups: contenders as they will act on the culture; those of a group are policies that are run together.
         environment: robot and mapping.
         calibration: the simulators.
-        rule: the hand-made one, where there is one among the contenders.
+        rule: the heuristic policy, where it is among the contenders.
         greedy: whether policies take the most probable action.
         seed: decides every random draw.
         progress: told after each group.
@@ -130,7 +130,7 @@ def _actor(group: Sequence[Contender], rule: Actor | None, *, greedy: bool) -> t
         return Uniform(), 1
     if isinstance(first, OneCondition):
         return Constant(jnp.array([first.condition])), 1
-    if isinstance(first, HandMadeRule) and rule is not None:
+    if isinstance(first, HeuristicController) and rule is not None:
         return rule, 1
     policies: list[Any] = [
         each.policy if isinstance(each, Greedy) else each for each in (contender.controller for contender in group)

@@ -22,7 +22,7 @@ from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import Mismatch
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
@@ -138,7 +138,7 @@ def run_policies(
         if "heuristic" in lacks:
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
         else:
-            rule = hand_made(environment, simulator)
+            rule = heuristic_policy(environment, simulator)
         contenders += controls(
             loop.robot,
             [condition.label for condition in loop.conditions],

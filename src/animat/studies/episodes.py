@@ -30,6 +30,8 @@ COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "
 """
 POLICY = "policy"
 RANDOM = "random"
+FORMER_AGENTS = {"made by hand": "heuristic"}
+"""What files of before call agents."""
 
 
 def tabulated(
@@ -69,7 +71,8 @@ def read_episodes(paths: Iterable[Path]) -> DataFrame:
     """The table, put together from its files; raises InvalidFile if one cannot be read."""
     import pandas as pd
 
-    return pd.concat([pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths], ignore_index=True)
+    parts = [pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths]
+    return pd.concat(parts, ignore_index=True).replace({"agent": FORMER_AGENTS})
 
 
 def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.ndarray, " actors"]:

@@ -22,6 +22,9 @@ from animat.studies.task import StudyTask
 from animat.studies.training import training_of
 from animat.training.policy import Policy
 
+_DRAWN_BY = {"heuristic": "made by hand"}
+"""Names that random numbers are drawn by where controls have been renamed since: a seed's numbers stay as they are."""
+
 
 @final
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Evaluate(StudyTask):
 @final
 @dataclass(frozen=True)
 class Control(StudyTask):
-    """Run the controls of a mapping on a robot: random, constant, made by hand; and silent and shuffled with policies.
+    """Run the controls of a mapping on a robot: random, constant, heuristic; and silent and shuffled with policies.
 
     Attributes:
         plain: condition that gives the mapping; the one whose policies are used, if it is trained as usual.
@@ -85,7 +88,8 @@ class Control(StudyTask):
             progress.update(i, len(minutes), f"at {at_min:g} min")
             answering = setting.simulator(at_min)
             for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
-                seed, n = draw_seed(study.seed, robot, name, at_min, each.name), each.n_actors
+                drawn_by = _DRAWN_BY.get(each.name, each.name)
+                seed, n = draw_seed(study.seed, robot, name, at_min, drawn_by), each.n_actors
                 ran = roll_out(each.environment, each.simulator, each.actor, n, episodes=study.episodes, seed=seed)
                 parts.append(tabulated(ran, robot=robot, arm=arm, at_min=at_min, agent=each.name))
         if timeline is not None and condition.through_neurons:

@@ -14,7 +14,7 @@ from animat.studies.specification import Body, Study, named_mapping
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-HEURISTIC = "made by hand"
+HEURISTIC = "heuristic"
 OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few episodes to tell"
 
 

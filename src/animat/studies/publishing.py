@@ -175,7 +175,7 @@ def _controls(study: Study, results: Results) -> Section:
         ("random", "Any action, equally likely, whatever is observed."),
         ("constant", "One stimulus always (without neurons: one command)."),
         (
-            "made by hand",
+            "heuristic",
             "A rule instead of learning: the stimulus whose mean command is nearest to a push to the side where the "
             "pole will lean in 0.1 s, to a turn towards the goal, or to what another robot's rule wants.",
         ),
