@@ -15,16 +15,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import (
+from animat.closed_loop.agents import (
+    Agent,
     AnyCondition,
-    Contender,
     HeuristicController,
     InTurn,
     OneCondition,
     controls,
     interleaved,
 )
+from animat.closed_loop.body import Body
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
@@ -50,7 +50,7 @@ HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 CONDITIONS = tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ)
 PERCENTILES = np.linspace(0.0, 125.0, 11)
 SHORT = Navigation(episode_limit=6)
-RANDOM = Contender("random", "any", AnyCondition(5))
+RANDOM = Agent("random", "any", AnyCondition(5))
 
 
 def loop_of(**changed: Any) -> Loop:
@@ -87,13 +87,13 @@ def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
 ) -> None:
     folder = tmp_path_factory.mktemp("session")
     loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms, warm_up=warm_up)
-    contenders = [
+    agents = [
         RANDOM,
-        Contender("shuffled", "", OneCondition(1), "shuffled"),
-        Contender("no", "", OneCondition(0), "silent"),
+        Agent("shuffled", "", OneCondition(1), "shuffled"),
+        Agent("no", "", OneCondition(0), "silent"),
     ]
     with FakeCulture(seed, jitter=jitter) as culture:
-        session = run_session(culture, loop, contenders, folder, episodes=2, seed=seed)
+        session = run_session(culture, loop, agents, folder, episodes=2, seed=seed)
     assert session.ending.by == "plan", session.ending
     assert_read_alike(folder, loop)
     ticks = session.ticks
@@ -139,7 +139,7 @@ def assert_table_is_the_session(folder: Path, names: list[str]) -> None:
     again = [
         Tick(
             number=int(row["tick"]),
-            contender=row["contender"],
+            agent=row["agent"],
             episode=int(row["episode"]),
             iteration=int(row["iteration"]),
             chosen=[c.label for c in CONDITIONS].index(row["chosen"]),
@@ -180,9 +180,9 @@ def assert_table_is_the_session(folder: Path, names: list[str]) -> None:
 )
 def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Robot[Any], names: list[str]) -> None:
     loop = loop_of(robot=robot, pulses=2, burst_threshold=0.9, on_burst="repeat")
-    contenders = [RANDOM, Contender("no", "", OneCondition(0), "silent")]
+    agents = [RANDOM, Agent("no", "", OneCondition(0), "silent")]
     with FakeCulture(1) as culture:
-        session = run_session(culture, loop, contenders, tmp_path, episodes=3)
+        session = run_session(culture, loop, agents, tmp_path, episodes=3)
     assert {tick.handled for tick in session.ticks} == {"used", "repeated"}
     assert_table_is_the_session(tmp_path, names)
     said = read_recording(session.recording_file).provenance["session_description"]
@@ -196,8 +196,8 @@ def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Ro
 def test_on_the_virtual_culture_too(tmp_path: Path) -> None:
     loop = loop_of(pulses=5, percentiles=np.linspace(0, 40, 11), burst_threshold=0.9)
     with small_culture() as culture:
-        contenders = [RANDOM, Contender("no", "", OneCondition(4), "silent")]
-        session = run_session(culture, loop, contenders, tmp_path, episodes=2)
+        agents = [RANDOM, Agent("no", "", OneCondition(4), "silent")]
+        session = run_session(culture, loop, agents, tmp_path, episodes=2)
         assert session.ending.by == "plan"
         assert not culture.is_stopped
         assert culture.delivered == sum(episode.pulses for episode in session.episodes) == 60
@@ -244,7 +244,7 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
     assert 0 < max(tick.decided_s for tick in session.ticks) < 0.002
 
 
-def test_contenders_take_turns_in_random_order() -> None:
+def test_agents_take_turns_in_random_order() -> None:
     rng = np.random.default_rng(1)
     turns = interleaved([50] * 4, rng)
     rounds = np.array(turns).reshape(50, 4)
@@ -253,7 +253,7 @@ def test_contenders_take_turns_in_random_order() -> None:
     assert all(4 <= np.sum(rounds[:, place] == who) <= 24 for place in range(4) for who in range(4))
 
 
-def test_contenders_with_fewer_episodes_are_spread_over_the_session() -> None:
+def test_agents_with_fewer_episodes_are_spread_over_the_session() -> None:
     turns = np.array(interleaved([40, 5], np.random.default_rng(2)))
     assert np.bincount(turns).tolist() == [40, 5]
     before = np.cumsum(turns == 0)[turns == 1]
@@ -262,15 +262,15 @@ def test_contenders_with_fewer_episodes_are_spread_over_the_session() -> None:
 
 
 def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_condition(tmp_path: Path) -> None:
-    contenders = [Contender("no", "", OneCondition(0), "silent"), Contender("any", "", OneCondition(4), "shuffled")]
+    agents = [Agent("no", "", OneCondition(0), "silent"), Agent("any", "", OneCondition(4), "shuffled")]
     with FakeCulture() as culture:
-        session = run_session(culture, loop_of(), contenders, tmp_path, episodes=10)
+        session = run_session(culture, loop_of(), agents, tmp_path, episodes=10)
         assert culture.delivered == culture.pulses == 60
-    silent = [tick for tick in session.ticks if tick.contender == "no"]
+    silent = [tick for tick in session.ticks if tick.agent == "no"]
     assert not any(tick.patterns or tick.pulse_time_s for tick in silent)
     assert all(tick.reward is not None for tick in silent)
-    shuffled = [tick.delivered for tick in session.ticks if tick.contender == "any"]
-    assert {tick.chosen for tick in session.ticks if tick.contender == "any"} == {4}
+    shuffled = [tick.delivered for tick in session.ticks if tick.agent == "any"]
+    assert {tick.chosen for tick in session.ticks if tick.agent == "any"} == {4}
     assert set(shuffled) == set(range(5))
 
 
@@ -297,7 +297,7 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
     class Done(Exception):
         pass
 
-    rest = Contender("rest", "no pulse", AnyCondition(5), "silent")
+    rest = Agent("rest", "no pulse", AnyCondition(5), "silent")
     loop = loop_of(warm_up=3, pulses=2, burst_threshold=0.5, on_burst="repeat")
     with FakeCulture() as culture:
         session = run_session(culture, loop, [RANDOM, rest], tmp_path / "two", episodes=2)
@@ -305,7 +305,7 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
         ticks = [tick for tick in session.ticks if tick.episode == episode.number]
         warming = [tick for tick in ticks if tick.handled == "warm-up"]
         # Silence has nothing before it either.
-        assert len(warming) == (0 if episode.contender == "rest" else 15)
+        assert len(warming) == (0 if episode.agent == "rest" else 15)
         assert ticks[: len(warming)] == warming
         for n in range(0, len(warming), 5):
             assert sorted(tick.delivered for tick in warming[n : n + 5]) == [0, 1, 2, 3, 4]
@@ -319,7 +319,7 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
     assert_read_alike(tmp_path / "two", loop)
     # The robot stands until the policy's first choice.
     with FakeCulture() as culture:
-        session = run_session(culture, loop, [Contender("fixed", "", Fixed())], tmp_path / "one", episodes=1)
+        session = run_session(culture, loop, [Agent("fixed", "", Fixed())], tmp_path / "one", episodes=1)
     assert session.ending.by == "controller"
     assert "Done" in session.ending.sentence
     assert len(session.ticks) == 15
@@ -328,7 +328,7 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
 def test_the_warm_up_counts_for_adaptive_thresholds(tmp_path: Path) -> None:
     reference = tuple(np.zeros(3) for _ in HZ)
     loop = loop_of(warm_up=3, adaptive_from=reference)
-    one = Contender("constant", "", OneCondition(0), calibrates=False)
+    one = Agent("constant", "", OneCondition(0), calibrates=False)
     with FakeCulture() as culture:
         session = run_session(culture, loop, [one], tmp_path, episodes=1)
     warming = [tick.rate_hz for tick in session.ticks if tick.handled == "warm-up"]
@@ -446,14 +446,14 @@ def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) 
         loop_of(**wrong)
 
 
-def test_a_session_needs_an_open_culture_contenders_and_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path: Path) -> None:
     culture = FakeCulture()
     with pytest.raises(InvalidArgument, match="closed"):
         run_session(culture, loop_of(), [RANDOM], tmp_path)
     with culture:
-        for contenders in ([], [RANDOM, RANDOM]):
-            with pytest.raises(InvalidArgument, match="contenders"):
-                run_session(culture, loop_of(), contenders, tmp_path)
+        for agents in ([], [RANDOM, RANDOM]):
+            with pytest.raises(InvalidArgument, match="agents"):
+                run_session(culture, loop_of(), agents, tmp_path)
         with pytest.raises(InvalidArgument, match="patterns"):
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
         with pytest.raises(InvalidArgument, match="episodes"):
@@ -514,14 +514,14 @@ def test_what_the_device_left_out_is_told(tmp_path: Path) -> None:
 
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
     who = InTurn({f"p{i}": OneCondition(i) for i in range(3)})
-    contenders = [RANDOM, Contender("silent", "", who, "silent"), Contender("shuffled", "", who, "shuffled")]
+    agents = [RANDOM, Agent("silent", "", who, "silent"), Agent("shuffled", "", who, "shuffled")]
     with FakeCulture() as culture:
-        session = run_session(culture, loop_of(), contenders, tmp_path, episodes=5)
+        session = run_session(culture, loop_of(), agents, tmp_path, episodes=5)
     for name in ("silent", "shuffled"):
-        episodes = [episode.number for episode in session.episodes if episode.contender == name]
+        episodes = [episode.number for episode in session.episodes if episode.agent == name]
         chosen = [{tick.chosen for tick in session.ticks if tick.episode == number} for number in episodes]
         assert chosen == [{0}, {1}, {2}, {0}, {1}]
-    assert [told.get("in_turn") for told in session.log.header["contenders"]] == [None, *[["p0", "p1", "p2"]] * 2]
+    assert [told.get("in_turn") for told in session.log.header["agents"]] == [None, *[["p0", "p1", "p2"]] * 2]
 
 
 def test_a_budget_is_kept_to_the_pulse() -> None:
@@ -566,13 +566,13 @@ def test_thresholds_adapt_to_the_newest_of_each_condition_and_of_nothing_else(da
 def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> None:
     reference = tuple(np.full(4, 100.0) for _ in HZ)
     loop = loop_of(adaptive_from=reference, mapping=Linear(), burst_threshold=0.95)
-    contenders = [
+    agents = [
         RANDOM,
-        Contender("always", "", OneCondition(4), calibrates=False),
-        Contender("no", "", OneCondition(4), "silent"),
+        Agent("always", "", OneCondition(4), calibrates=False),
+        Agent("no", "", OneCondition(4), "silent"),
     ]
     with FakeCulture() as culture:
-        session = run_session(culture, loop, contenders, tmp_path, episodes=6)
+        session = run_session(culture, loop, agents, tmp_path, episodes=6)
     in_force = {record.words["episode"]: record.words["percentiles_hz"] for record in session.log.records
                 if record.words["kind"] == "percentiles"}  # fmt: skip
     history = [list(each) for each in reference]
@@ -583,7 +583,7 @@ def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> 
             percentiles = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
             np.testing.assert_array_equal(np.float32(in_force[tick.episode]), percentiles)
         assert tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), percentiles))
-        if tick.contender == "random" and not tick.is_burst:
+        if tick.agent == "random" and not tick.is_burst:
             history[tick.delivered].append(tick.rate_hz)
     assert sum(len(each) for each in history) > 20 + 20
     assert_read_alike(tmp_path, loop)

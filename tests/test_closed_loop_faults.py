@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.closed_loop.contenders import Contender
+from animat.closed_loop.agents import Agent
 from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
@@ -209,8 +209,8 @@ def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace:
 
     with FakeCulture() as culture:
         try:
-            contender = Contender("it", "", Pondering())
-            session = run_session(culture, loop_of(robot=LONG, patience_s=0.3), [contender], tmp_path, episodes=1)
+            agent = Agent("it", "", Pondering())
+            session = run_session(culture, loop_of(robot=LONG, patience_s=0.3), [agent], tmp_path, episodes=1)
             assert session.ending.by == "hang"
             assert "it did not answer 0.3 s after it should have" in session.ending.sentence
             assert_safe(session, culture, 7)
@@ -410,7 +410,7 @@ def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> Non
             return action if rng.random() < 0.2 else 0
 
     with FakeCulture() as culture:
-        session = run_session(culture, loop_of(robot=LONG), [Contender("it", "", Confused())], tmp_path, episodes=1)
+        session = run_session(culture, loop_of(robot=LONG), [Agent("it", "", Confused())], tmp_path, episodes=1)
         assert session.ending.by == "controller"
         assert f"it {words}" in session.ending.sentence
         assert_safe(session, culture, 0)

@@ -12,7 +12,7 @@ import pytest
 
 import stand_in_cl
 import stand_in_maxlab
-from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
@@ -56,7 +56,7 @@ def loop_at(
         on_late="stop",
     )
     with culture:
-        return run_session(culture, loop, [Contender("one", "", OneCondition(chosen))], tmp_path, episodes=2)
+        return run_session(culture, loop, [Agent("one", "", OneCondition(chosen))], tmp_path, episodes=2)
 
 
 def assert_in_time(session: Session, chosen: int, frame_s: float) -> None:

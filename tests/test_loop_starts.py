@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from scipy.stats import kstest
 
+from animat.closed_loop.agents import Agent, InTurn
 from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import Contender, InTurn
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
 from animat.robots import Navigation, Robot
@@ -61,20 +61,20 @@ class Looking:
         return int(rng.integers(5))
 
 
-def starts_of(session: Session, contender: str) -> list[tuple[float, ...]]:
-    return [episode.start for episode in session.episodes if episode.contender == contender]
+def starts_of(session: Session, agent: str) -> list[tuple[float, ...]]:
+    return [episode.start for episode in session.episodes if episode.agent == agent]
 
 
 def ran(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
     looking = Looking()
-    contenders = [
-        Contender("p0", "", looking),
+    agents = [
+        Agent("p0", "", looking),
         RANDOM,
-        Contender("silent", "", InTurn({"p0": looking, "p1": Looking()}), "silent"),
+        Agent("silent", "", InTurn({"p0": looking, "p1": Looking()}), "silent"),
     ]
     with FakeCulture(culture) as fake:
         loop = loop_of(robot=Anywhere(), warm_up=1)
-        return run_session(fake, loop, contenders, folder, episodes=5, seed=seed), looking
+        return run_session(fake, loop, agents, folder, episodes=5, seed=seed), looking
 
 
 def test_each_episode_starts_where_the_robot_draws_it(tmp_path: Path) -> None:

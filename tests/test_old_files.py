@@ -79,7 +79,7 @@ def test_a_session_is_read_and_its_recording_written_again(old: Path, told: dict
     assert session.ending.by == was["ended_by"]
     assert sum(episode.pulses for episode in session.episodes) == was["pulses"]
     assert "warm-up" in {tick.handled for tick in session.ticks}
-    ticks = [[t.contender, t.delivered, t.rate_hz, t.command, t.reward] for t in session.ticks]
+    ticks = [[t.agent, t.delivered, t.rate_hz, t.command, t.reward] for t in session.ticks]
     assert ticks == was["ticks"]
     for name in ("session.nwb", "ticks.csv"):
         (tmp_path / "session" / name).unlink()

@@ -19,7 +19,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.contenders import HeuristicController
+from animat.closed_loop.agents import HeuristicController
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -125,7 +125,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
         if tick.handled == "warm-up":
             continue
         assert tick.reward is not None
-        episodes = measured.setdefault(tick.contender, [])
+        episodes = measured.setdefault(tick.agent, [])
         if tick.iteration == 0:
             episodes.append(0.0)
         episodes[-1] += tick.reward
@@ -166,7 +166,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     assert gap.limit == pytest.approx(limit)
     won = rows["policies"].measured.mean() - rows["policies"].predicted.mean()
     assert gap.gap_share == pytest.approx(won / (limit - rows["random"].predicted.mean()))
-    assert gap.session.log.header["contenders"][-2]["in_turn"] == ["p0", "p1"]
+    assert gap.session.log.header["agents"][-2]["in_turn"] == ["p0", "p1"]
     # A silent culture commands -1 throughout; the robot of the test has no noise: one return, predicted and measured.
     assert np.ptp(rows["silent"].predicted) == 0
     assert rows["silent"].pulses_per_action == 0
@@ -266,11 +266,11 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
     assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
     assert gap.loop.adaptive_from is not None
     thresholds, p50_hz, passed = AdaptiveThresholds(gap.loop.adaptive_from), gap.loop.percentiles[5], []
-    ticks, episode = [tick for tick in gap.session.ticks if tick.contender in policies], -1
+    ticks, episode = [tick for tick in gap.session.ticks if tick.agent in policies], -1
     for tick in gap.session.ticks:
         if tick.episode != episode:
             episode, p50_hz = tick.episode, thresholds.percentiles()[5] if thresholds.seen else p50_hz
-        if tick.contender in policies:
+        if tick.agent in policies:
             passed.append(tick.rate_hz >= p50_hz)
         if not tick.is_burst:
             thresholds.add(tick.delivered, tick.rate_hz)

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from animat.cli import main
-from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
@@ -33,7 +33,7 @@ from test_closed_loop import RANDOM, loop_of
 
 
 def ran(folder: Path, **changed: Any) -> Session:
-    silent = Contender("silent", "", OneCondition(0), "silent")
+    silent = Agent("silent", "", OneCondition(0), "silent")
     with FakeCulture(3) as culture:
         return run_session(culture, loop_of(**changed), [RANDOM, silent], folder, episodes=3)
 
@@ -229,7 +229,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], byt
         ("loop", None, "loop.pulses: expected a whole number, got None"),
         ("loop.pulses", 0, "pulses"),
         ("loop.conditions", "5 Hz", "loop.conditions: expected a list of texts"),
-        ("contenders", [{"name": 1}], "contenders[0].name: expected text, got 1"),
+        ("agents", [{"name": 1}], "agents[0].name: expected text, got 1"),
         ("observed", {"x": 1}, "observed: expected a list of texts"),
     ],
 )

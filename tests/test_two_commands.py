@@ -20,7 +20,7 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.contenders import Contender, HeuristicController, OneCondition, random_control
+from animat.closed_loop.agents import Agent, HeuristicController, OneCondition, random_control
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -93,14 +93,14 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         readouts=timeline.readouts,
     )
     means = tuple((0.2 * i - 0.4, 0.4 - 0.2 * i) for i in range(5))
-    contenders = [
+    agents = [
         random_control(5),
-        Contender("constant", "", OneCondition(3), calibrates=False),
-        Contender("heuristic", "", HeuristicController(loop.robot, means)),
-        Contender("silent", "", OneCondition(0), "silent"),
+        Agent("constant", "", OneCondition(3), calibrates=False),
+        Agent("heuristic", "", HeuristicController(loop.robot, means)),
+        Agent("silent", "", OneCondition(0), "silent"),
     ]
     with FakeCulture(3) as culture:
-        ended = run_session(culture, loop, contenders, tmp_path, episodes=2).ending
+        ended = run_session(culture, loop, agents, tmp_path, episodes=2).ending
     assert ended.by == "plan", ended
 
     # The session's own recording, read like any other, says what was read of each half.
@@ -129,7 +129,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
             pooled = np.concatenate(newest)
             expected = [np.percentile(pooled[:, d], range(0, 101, 10)) for d in range(2)]
             np.testing.assert_allclose(told[tick.episode], expected, rtol=1e-6)
-        counts = tick.contender != "constant" or tick.handled == "warm-up"
+        counts = tick.agent != "constant" or tick.handled == "warm-up"
         if counts and tick.patterns and not tick.is_burst:
             newest[tick.delivered] = [*newest[tick.delivered][1:], np.array(tick.readout_hz)]
     assert moved > 10
@@ -144,7 +144,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
 
     # How often each half passed its own median, as the reasons of a gap ask.
     read = answered(session, loop, ["random"])
-    used = [tick for tick in session.ticks if tick.handled == "used" and tick.contender == "random"]
+    used = [tick for tick in session.ticks if tick.handled == "used" and tick.agent == "random"]
     above = [np.array(t.readout_hz) >= told[t.episode][:, 5] for t in used]
     np.testing.assert_array_equal(read.passed, above)
     np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in used])
@@ -321,7 +321,7 @@ HEADER: dict[str, Any] = {
     "recorded_at": "2026-01-01T00:00:00+00:00",
     "sampling_rate_hz": 20000.0,
     "start_min": 0.0,
-    "contenders": [{"name": "p0"}],
+    "agents": [{"name": "p0"}],
     "provenance": {},
     "observed": ["x_m"],
 }

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
+from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import Contender, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.stretch import Asked, Stretch, rows_of
@@ -43,7 +43,7 @@ class Driver:
     Args:
         culture: open.
         loop: the settings.
-        contenders: who acts.
+        agents: who acts.
         turns: whose turn each episode is.
         account: of the stimulation budget.
         clock: the machine's.
@@ -54,7 +54,7 @@ class Driver:
         self,
         culture: Culture,
         loop: Loop,
-        contenders: Sequence[Contender],
+        agents: Sequence[Agent],
         turns: Sequence[int],
         account: Account,
         clock: Clock,
@@ -67,7 +67,7 @@ class Driver:
         """By when, on `time.monotonic()`, who should have answered at the latest; a supervisor watches it."""
         self.under_way: Asked | None = None
         """What was asked of the culture and is not answered yet; a supervisor writes it down."""
-        self._culture, self._loop, self._contenders, self._turns = culture, loop, contenders, turns
+        self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
         self._rng = np.random.default_rng([seed, 21])
         self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
@@ -100,7 +100,7 @@ class Driver:
             self._zero_s = self._now_s()
             self._data_at_s = self._wall_zero_s = self._clock.now_s()
             for episode, turn in enumerate(self._turns):
-                self._run_episode(episode, self._contenders[turn])
+                self._run_episode(episode, self._agents[turn])
                 self.episodes_done = episode + 1
         except Stop as stop:
             return stop.ending
@@ -108,30 +108,30 @@ class Driver:
             return Ending("crash", f"an error of the loop itself: {in_words(error)}")
         return Ending("plan", f"all {len(self._turns)} episodes were run")
 
-    def _run_episode(self, episode: int, contender: Contender) -> None:
+    def _run_episode(self, episode: int, agent: Agent) -> None:
         loop = self._loop
-        turn = self._begun[contender.name]
-        self._begun[contender.name] += 1
-        controller = contender.acting(turn)
+        turn = self._begun[agent.name]
+        self._begun[agent.name] += 1
+        controller = agent.acting(turn)
         observation = self._start(episode, turn)
         self._last_command = self._at_rest
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
-        self._warm_up(contender, episode)
+        self._warm_up(agent, episode)
         if self._adaptive is not None and self._adaptive.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
             self._percentiles = self._adaptive.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         for iteration in range(loop.robot.episode_limit):
-            chosen = self._choose(contender, controller, observation)
+            chosen = self._choose(agent, controller, observation)
             repeats = 0
             while True:
                 delivered = chosen
-                if contender.delivery == "shuffled":
+                if agent.delivery == "shuffled":
                     delivered = int(self._rng.integers(len(loop.conditions)))
-                tick, again = self._present(contender, episode, iteration, chosen, delivered, repeats)
+                tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if not again:
                     break
                 repeats += 1
@@ -140,7 +140,7 @@ class Driver:
             observation = np.array(tick.observation)
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
-        """Put the robot where it starts: in a round of all contenders each meets the same start."""
+        """Put the robot where it starts: in a round of all agents each meets the same start."""
         self._expect("the robot")
         try:
             observation = self._body.reset(turn)
@@ -151,29 +151,27 @@ class Driver:
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
         return observation
 
-    def _warm_up(self, contender: Contender, episode: int) -> None:
+    def _warm_up(self, agent: Agent, episode: int) -> None:
         """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
-        if contender.delivery == "silent":
+        if agent.delivery == "silent":
             return
         for _ in range(self._loop.warm_up or 0):
             for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
-                self._present(contender, episode, -1, condition, condition, 0)
+                self._present(agent, episode, -1, condition, condition, 0)
 
-    def _choose(
-        self, contender: Contender, controller: Controller, observation: Float64[np.ndarray, " observations"]
-    ) -> int:
+    def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
         n = len(self._loop.conditions)
-        self._expect(contender.name)
+        self._expect(agent.name)
         try:
             chosen = int(controller.act(observation, self._rng))
         except Exception as error:
-            raise Stop(Ending("controller", f"{contender.name} raised {in_words(error)}")) from error
+            raise Stop(Ending("controller", f"{agent.name} raised {in_words(error)}")) from error
         if not 0 <= chosen < n:
-            raise Stop(Ending("controller", f"{contender.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
+            raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
 
     def _present(
-        self, contender: Contender, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
+        self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
     ) -> tuple[Tick, bool]:
         """Present a condition and move the robot by the answer; returns whether to present it once more instead.
 
@@ -184,7 +182,7 @@ class Driver:
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
         stimuli: list[Stimulus] = []
-        if contender.delivery != "silent":
+        if agent.delivery != "silent":
             stimuli = [
                 Stimulus(float(t), on.electrodes, loop.pulse, frequency_hz, on.pattern, self._presented)
                 for t, on in zip(times_s, self._dealer.targets(delivered), strict=True)
@@ -211,7 +209,7 @@ class Driver:
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {
             "number": self._presented,
-            "contender": contender.name,
+            "agent": agent.name,
             "episode": episode,
             "iteration": iteration,
             "chosen": chosen,
@@ -235,7 +233,7 @@ class Driver:
             "readout_hz": readout_hz,
         }
         self._presented += 1
-        if self._adaptive is not None and stimuli and (contender.calibrates or is_warm_up) and not is_burst:
+        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
             self._adaptive.add(delivered, x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+_RECORD = {"contenders": "agents"}
 _LOOP = {"lead_in": "warm_up", "following": "adaptive"}
+_TICK = {"contender": "agent"}
 _HANDLED = {"lead-in": "warm-up"}
 
 
 def in_todays_words(words: dict[str, Any]) -> dict[str, Any]:
-    """A record's words by the names of today; those that need not be renamed are left as they are."""
+    """A record's words by the names of today."""
+    words = _renamed(words, _RECORD)
     if isinstance(loop := words.get("loop"), dict):
         words["loop"] = _renamed(loop, _LOOP)
-    if isinstance(tick := words.get("tick"), dict) and tick.get("handled") in tuple(_HANDLED):
-        tick["handled"] = _HANDLED[tick["handled"]]
+    if isinstance(tick := words.get("tick"), dict):
+        words["tick"] = tick = _renamed(tick, _TICK)
+        if isinstance(handled := tick.get("handled"), str):
+            tick["handled"] = _HANDLED.get(handled, handled)
     return words
 
 

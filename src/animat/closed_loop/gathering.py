@@ -176,6 +176,6 @@ def in_words(left_out: Mapping[str, int]) -> str:
 def _described(header: Header) -> str:
     return (
         "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
-        f"from episode to episode ({', '.join(header.contenders)}): {TICKS_FILE} beside this file says whose each "
+        f"from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this file says whose each "
         "stimulus was, and what came of it."
     )

@@ -32,11 +32,11 @@ class Acted:
 
 @dataclass
 class Episode:
-    """One episode of a contender.
+    """One episode of an agent.
 
     Attributes:
         number: in the session, from 0.
-        contender: who acted.
+        agent: who acted.
         start: what was observed before the first step; empty where the log is of before this was written.
         total: the sum of rewards, in the task's own units.
         iterations: of the robot.
@@ -49,7 +49,7 @@ class Episode:
     """
 
     number: int
-    contender: str
+    agent: str
     start: tuple[float, ...] = ()
     total: float = 0.0
     iterations: int = 0
@@ -124,7 +124,7 @@ class Outline:
         number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
         episode = self._episodes.get(number)
         if episode is None:
-            episode = Episode(number, tick["contender"], self._starts.pop(number, ()))
+            episode = Episode(number, tick["agent"], self._starts.pop(number, ()))
             self._episodes[number] = episode
         self.ticks += 1
         self.pulses += n_pulses

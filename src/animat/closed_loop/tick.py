@@ -15,11 +15,11 @@ class Tick:
 
     Attributes:
         number: of the presentation in the session, from 0.
-        contender: whose episode it is.
+        agent: whose episode it is.
         episode: number of the episode in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
             and the warm-up has -1.
-        chosen: the condition that was chosen, by the contender or, in a warm-up, by lot.
+        chosen: the condition that was chosen, by the agent or, in a warm-up, by lot.
         delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
         frequency_hz: that the delivered one was presented at.
         patterns: of each pulse, -1 where its electrodes are none of the culture's; none under the silent control.
@@ -44,7 +44,7 @@ class Tick:
     """
 
     number: int
-    contender: str
+    agent: str
     episode: int
     iteration: int
     chosen: int

@@ -66,7 +66,7 @@ def outlook(
     Args:
         loop: its settings.
         calibration: whose recordings' drift is gone on with.
-        episodes: of each contender how many, how often each condition is presented in one of them, and whether the
+        episodes: of each agent how many, how often each condition is presented in one of them, and whether the
             culture gets pulses then.
         account: of the budget.
         now_min: on the culture's clock.

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.contenders import Contender, Greedy, controls, random_control
+from animat.closed_loop.agents import Agent, Greedy, controls, random_control
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
@@ -132,21 +132,21 @@ def run_policies(
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
     simulator = calibration.simulator
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
-    contenders = [Contender(name, "as trained", controller) for name, controller in acting.items()]
+    agents = [Agent(name, "as trained", controller) for name, controller in acting.items()]
     rule, lacks = None, lacking(loop.robot)
     if with_controls:
         if "heuristic" in lacks:
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
         else:
             rule = heuristic_policy(environment, simulator)
-        contenders += controls(
+        agents += controls(
             loop.robot,
             [condition.label for condition in loop.conditions],
             means=None if rule is None else np.asarray(rule.means)[0].tolist(),
             policies=acting,
         )
     else:
-        contenders.append(random_control(len(loop.conditions)))
+        agents.append(random_control(len(loop.conditions)))
 
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
@@ -154,7 +154,7 @@ def run_policies(
     if why_not is not None:
         findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
     predicted = predict(
-        [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
+        [agents[: len(policies)], *([control] for control in agents[len(policies) :])],
         environment,
         # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
         calibration if adaptive else calibration.with_percentiles(calibration.simulator.percentiles),
@@ -168,10 +168,9 @@ def run_policies(
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and limit is not None:
         _wait_for(limit, progress)
-    of_each = planned_episodes(len(policies), len(contenders) - len(policies), episodes)
+    of_each = planned_episodes(len(policies), len(agents) - len(policies), episodes)
     plan = [
-        (n, predicted[each.name].presented, each.delivery != "silent")
-        for n, each in zip(of_each, contenders, strict=True)
+        (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
     ahead = outlook(loop, calibration, plan, account, culture.now_s / 60)
     findings = (*noticed, *findings, *calibration.findings)
@@ -181,7 +180,7 @@ def run_policies(
             tell(f"warning: {sentence}")
         tell(str(ahead))
     session = run_session(
-        culture, loop, contenders, folder, episodes=of_each, seed=seed, account=account, progress=progress
+        culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=progress
     )
     best = None
     # Whoever stopped the session does not wait for it.
@@ -190,7 +189,7 @@ def run_policies(
             best = _wait_for(limit, progress)
         except Exception as error:
             findings += (Finding("no-limit", "note", f"no optimal return: {in_words(error)}"),)
-    rows = _rows(contenders, tuple(policies), predicted, session)
+    rows = _rows(agents, tuple(policies), predicted, session)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
@@ -287,10 +286,10 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
 
 
 def _rows(
-    contenders: Sequence[Contender], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
+    agents: Sequence[Agent], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
 ) -> tuple[Row, ...]:
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
-        episodes = [episode for episode in session.episodes if episode.contender in of]
+        episodes = [episode for episode in session.episodes if episode.agent in of]
         acted = [episode.acted for episode in episodes]
         actions = max(1, sum(each.actions for each in acted))
         presentations = max(1, sum(each.presentations for each in acted))
@@ -309,12 +308,12 @@ def _rows(
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
     rows = [policies]
-    for contender in contenders:
-        if contender.name in names:
+    for agent in agents:
+        if agent.name in names:
             if len(names) > 1:
-                rows.append(row(contender.name, contender.meaning, [contender.name]))
+                rows.append(row(agent.name, agent.meaning, [agent.name]))
             continue
-        control = row(contender.name, contender.meaning, [contender.name])
+        control = row(agent.name, agent.meaning, [agent.name])
         if len(control.measured) and len(policies.measured):
             control = replace(control, beside=beside(policies.measured, control.measured))
         rows.append(control)

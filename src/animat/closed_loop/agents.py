@@ -90,7 +90,7 @@ class InTurn:
     by_name: Mapping[str, Controller]
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The first one's choice; the loop takes each at its turn (`Contender.acting`)."""
+        """The first one's choice; the loop takes each at its turn (`Agent.acting`)."""
         return self.acting(0).act(observation, rng)
 
     def acting(self, turn: int) -> Controller:
@@ -100,7 +100,7 @@ class InTurn:
 
 
 @dataclass(frozen=True, eq=False)
-class Contender:
+class Agent:
     """Someone who acts in some of a session's episodes.
 
     Attributes:
@@ -120,13 +120,13 @@ class Contender:
     calibrates: bool = True
 
     def acting(self, turn: int) -> Controller:
-        """Who chooses in the contender's episode number `turn`, counted from 0."""
+        """Who chooses in the agent's episode number `turn`, counted from 0."""
         return self.controller.acting(turn) if isinstance(self.controller, InTurn) else self.controller
 
 
-def random_control(n_conditions: int) -> Contender:
+def random_control(n_conditions: int) -> Agent:
     """The control that chooses any condition."""
-    return Contender("random", "any condition, equally likely", AnyCondition(n_conditions))
+    return Agent("random", "any condition, equally likely", AnyCondition(n_conditions))
 
 
 def controls(
@@ -135,7 +135,7 @@ def controls(
     *,
     means: Sequence[Any] | None,
     policies: Mapping[str, Controller] | None = None,
-) -> list[Contender]:
+) -> list[Agent]:
     """The controls of the study.
 
     Args:
@@ -147,14 +147,14 @@ def controls(
     """
     found = [random_control(len(labels))]
     for i, label in enumerate(labels):
-        found.append(Contender(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
+        found.append(Agent(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
     if policies:
         who = InTurn(dict(policies))
-        found.append(Contender("silent", "no pulse; the culture's own activity is read", who, "silent"))
-        found.append(Contender("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
+        found.append(Agent("silent", "no pulse; the culture's own activity is read", who, "silent"))
+        found.append(Agent("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
     if means is not None:
         found.append(
-            Contender(
+            Agent(
                 "heuristic",
                 "no learning: the stimulus nearest to the command of the robot's heuristic",
                 HeuristicController(robot, tuple(means)),
@@ -166,11 +166,11 @@ def controls(
 def interleaved(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
     """Whose turn each episode is, in random order and spread evenly: whatever drifts in the culture hits all alike.
 
-    The session is cut into as many equal parts as a contender has episodes, and one of them is in each part. Where all
+    The session is cut into as many equal parts as an agent has episodes, and one of them is in each part. Where all
     have as many, round follows round of all of them.
 
     Args:
-        episodes: of each contender.
+        episodes: of each agent.
         rng: of the places within the parts.
     """
     places = [(part + rng.random()) / n for n in episodes for part in range(n)]
