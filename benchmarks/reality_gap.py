@@ -37,7 +37,7 @@ COLUMNS = (
     "mapping",
     "thresholds",
     "random: predicted, measured",
-    "limit",
+    "optimum",
     "predicted, 95 %",
     "measured",
     "gap, 95 %",
@@ -191,7 +191,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
     return told(seed, way, "adaptive", read_table(table))
 
 
-FORMER = {"lived": "measured"}
+FORMER = {"lived": "measured", "limit": "optimum"}
 """Keys as tables of before have them."""
 FORMER_FILES = {"adaptive": "follow", "fixed": "held"}
 """What tables of before are called."""
@@ -214,7 +214,7 @@ def _renamed(words: dict[str, Any]) -> dict[str, Any]:
 
 
 def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:
-    """A line of the table; the range is from random to the limit, both on the simulator."""
+    """A line of the table; the range is from random to the optimum, both on the simulator."""
     policies, random = ran["rows"][0], next(row for row in ran["rows"] if row["name"] == "random")
     prediction, gap = policies["prediction"], policies["gap"]
     cells = (
@@ -223,7 +223,7 @@ def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> st
         *((way.recorded, way.simulator, way.mapping) if way else ("default", "default", ran["mapping"])),
         thresholds,
         f"{random['predicted']:.1f}, {random['measured']:.1f}",
-        "-" if ran["limit"] is None else f"{ran['limit']:.1f}",
+        "-" if ran["optimum"] is None else f"{ran['optimum']:.1f}",
         f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})",
         f"{policies['measured']:.1f}",
         f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})",

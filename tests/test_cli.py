@@ -122,7 +122,7 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.oracle
-def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
+def test_evaluate_tells_the_optimum_of_the_recording_it_evaluates_on(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
@@ -137,15 +137,15 @@ def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
     monkeypatch.setattr("animat.evaluation.table.best_return", rough)
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0"]
-    assert main([*command, "--limit", "--json"]) == 0
+    assert main([*command, "--optimum", "--json"]) == 0
     said = capsys.readouterr().out
     told: dict[str, Any] = last_json(said)
     assert asked == [1.0]
     simulator = fit_timeline(extract_series(read_recordings([recordings]))).at(0.0)
     direct = best_return(Animat(Cartpole(), Thresholds(9), 5), simulator, resolution=0.25, episodes=0)
-    interval = told["limit"].pop("interval")
+    interval = told["optimum"].pop("interval")
     assert interval["low"] <= interval["value"] == direct.value <= interval["high"]
-    assert told["limit"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
+    assert told["optimum"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
     assert f"optimal return {direct.value:.1f}, 95 % interval {interval['low']:.1f} to" in said
     means = {row["name"]: row["mean_return"] for row in told["rows"]}
     score = (means["policies"] - means["random"]) / (direct.value - means["random"])

@@ -25,7 +25,7 @@ from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
 from animat.training.policy import Policy
-from test_prospects import answers
+from test_optimal_returns import answers
 from test_simulator import responses_of
 from test_training import timeline_of
 
@@ -219,18 +219,18 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
 
 @pytest.mark.oracle
 def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
-    """Whatever it chooses, what is delivered is drawn: as good as random actions, and no limit is its own."""
+    """Whatever it chooses, what is delivered is drawn: as good as random actions, and no optimum is its own."""
     timeline = timeline_of()
     chosen = policy_of(timeline, SHORT, seed=1)
     control = replace(chosen, provenance={"training": {"delivery": "shuffled"}})
-    found = evaluate({"a": control}, timeline, episodes=500, seed=3, limit_resolution=0.25)
+    found = evaluate({"a": control}, timeline, episodes=500, seed=3, optimum_resolution=0.25)
     rows = {row.name: row for row in found.rows}
     np.testing.assert_array_equal(rows["policies"].episodes.returns, rows["shuffled"].episodes.returns)
     assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=500, seed=3).rows[0]
                   .episodes.returns)  # fmt: skip
     assert "as trained: what is delivered is drawn anew" in found.to_text()
     assert found.score(rows["policies"]) is None and found.score(rows["random"]) == 0.0
-    assert "none for policies and silent and shuffled, whose limit is another" in found.to_text()
+    assert "none for policies and silent and shuffled, whose optimum is another" in found.to_text()
 
 
 def test_simulators_made_otherwise_than_in_training_are_told() -> None:
@@ -257,8 +257,8 @@ def test_the_heuristic_policy_goes_through_the_same_mapping_and_neurons() -> Non
 
 
 @pytest.mark.oracle
-def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
-    """The limit is `best_return` of the very simulator; scores are worked out again from the means."""
+def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
+    """The optimum is `best_return` of the very simulator; scores are worked out again from the means."""
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, SHORT, seed=1), "b": policy_of(timeline, SHORT, seed=2)}
     told: list[str] = []
@@ -269,17 +269,17 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
             told.append(note)
 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
-    found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, limit_resolution=0.25, progress=Noting())
+    found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, optimum_resolution=0.25, progress=Noting())
     environment = Animat(SHORT, Thresholds(1), 3)
-    assert found.limit is not None
-    assert replace(found.limit, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
+    assert found.optimum is not None
+    assert replace(found.optimum, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
     assert told[-2:] == ["shuffled", "optimal return"]
-    assert set(found.limit.findings()) <= set(found.findings)
+    assert set(found.optimum.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))
-    assert data["limit"] == json.loads(json.dumps(found.limit.to_dict())) and data["no_limit"] is None
+    assert data["optimum"] == json.loads(json.dumps(found.optimum.to_dict())) and data["no_optimum"] is None
     rows = {row["name"]: row for row in data["rows"]}
-    random, best = rows["random"]["mean_return"], data["limit"]["value"]
+    random, best = rows["random"]["mean_return"], data["optimum"]["value"]
     for name, row in rows.items():
         if name in ("silent", "shuffled"):
             assert row["normalised_score"] is None
@@ -287,38 +287,38 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
             assert row["normalised_score"] == pytest.approx((row["mean_return"] - random) / (best - random))
     assert rows["random"]["normalised_score"] == 0
     text = found.to_text()
-    assert found.limit.to_text() in text and "none for silent and shuffled, whose limit is another" in text
+    assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is another" in text
     assert f"{rows['policies']['normalised_score']:.2f}  as trained" in text
 
     # Nothing else changes by it, and nothing is told of it where it was not asked for.
-    assert plainly.limit is None and plainly.no_limit is None
+    assert plainly.optimum is None and plainly.no_optimum is None
     assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in data["rows"]]
     assert "score" not in plainly.to_text() and "optimal return" not in plainly.to_text()
     assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
 
 
 @pytest.mark.oracle
-def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The rows act on these conditions too; the limit is at the thresholds of all responses, as the rows are."""
+def test_an_optimum_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows act on these conditions too; the optimum is at the thresholds of all responses, as the rows are."""
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", lambda optima, *_, **__: tuple(optima))
     monkeypatch.setattr("animat.evaluation.table.best_return", partial(best_return, episodes=0))
     responses = answers([60, 60, 60, 60, 3], 2)
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
     timeline = fit_timeline([lucky], kind="histogram")
-    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=50, limit_resolution=0.25)
-    assert found.limit is not None and found.limit.left_out == ("80 Hz (3)",)
+    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=50, optimum_resolution=0.25)
+    assert found.optimum is not None and found.optimum.left_out == ("80 Hz (3)",)
     held = replace(fit_histogram(lucky.only([0, 1, 2, 3])), percentiles=timeline.at(0.0).percentiles)
-    assert found.limit.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
+    assert found.optimum.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
     assert {row["normalised_score"] for row in found.to_dict()["rows"]} == {None}
     assert "no score, as the optimal return is without conditions" in found.to_text()
 
 
 @pytest.mark.oracle
-def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
+def test_without_neurons_the_optimum_is_a_pole_kept_up_to_the_end() -> None:
     """In closed form: a reward of 1 an iteration, and no fall, as two forces are enough to hold the pole."""
-    evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, limit_resolution=0.6)
-    assert evaluation.limit is not None
-    assert evaluation.limit.value == pytest.approx(120, abs=0.01)
+    evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, optimum_resolution=0.6)
+    assert evaluation.optimum is not None
+    assert evaluation.optimum.value == pytest.approx(120, abs=0.01)
     rows = {row.name: row for row in evaluation.rows}
     heuristic, random = (float(rows[name].mean_returns.mean()) for name in ("heuristic", "random"))
     assert evaluation.score(rows["heuristic"]) == pytest.approx((heuristic - random) / (120 - random), abs=0.001)
@@ -328,16 +328,18 @@ def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
     assert "none for" not in evaluation.to_text()
 
 
-def test_where_there_is_no_limit_or_no_score_a_line_says_so() -> None:
+def test_where_there_is_no_optimum_or_no_score_a_line_says_so() -> None:
     wide = replace(WITHOUT_NEURONS, robot=Cartpole(angle_limit_rad=1.0, episode_limit=10))
-    unknown = evaluate({"a": wide}, None, episodes=3, limit_resolution=0.25)
+    unknown = evaluate({"a": wide}, None, episodes=3, optimum_resolution=0.25)
     (line,) = [line for line in unknown.to_text().splitlines() if "no optimal return: " in line]
     assert "angle_limit_rad" in line
     data = unknown.to_dict()
-    assert data["limit"] is None and data["no_limit"] in line
+    assert data["optimum"] is None and data["no_optimum"] in line
     assert {row["normalised_score"] for row in data["rows"]} == {None}
 
-    nothing_to_learn = replace(unknown, limit=Optimum(-200.0, 0.0, -200.0, 1.0, -200.0, 1.0, 100, 1000), no_limit=None)
+    nothing_to_learn = replace(
+        unknown, optimum=Optimum(-200.0, 0.0, -200.0, 1.0, -200.0, 1.0, 100, 1000), no_optimum=None
+    )
     assert {row["normalised_score"] for row in nothing_to_learn.to_dict()["rows"]} == {None}
     assert "no score, as the optimal return is not above" in nothing_to_learn.to_text()
 
@@ -374,8 +376,8 @@ def test_what_does_not_belong_together_is_refused() -> None:
         with pytest.raises(InvalidArgument, match="seed: expected a whole number"):
             evaluate({"a": policy}, timeline, seed=seed)
     for resolution in (0.0, float("nan")):
-        with pytest.raises(InvalidArgument, match="limit_resolution: expected a positive number"):
-            evaluate({"a": policy}, timeline, limit_resolution=resolution)
+        with pytest.raises(InvalidArgument, match="optimum_resolution: expected a positive number"):
+            evaluate({"a": policy}, timeline, optimum_resolution=resolution)
     with pytest.raises(Mismatch, match="robot: expected cartpole"):
         evaluate({"a": policy}, timeline, robot=Navigation())
     with pytest.raises(Mismatch, match="b: expected the same robot as a"):

@@ -186,22 +186,22 @@ def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
 def test_a_receipt_of_the_first_plan_is_read(tmp_path: Path) -> None:
     """As commit 5e75c96 wrote it, byte for byte: digests of later receipts rest on it."""
     text = (
-        '{\n "inputs": {\n  "record": "00"\n },\n "job": "limit/cartpole",\n'
-        ' "outputs": {\n  "limits/a.csv": "11"\n },\n "study": "22"\n}\n'
+        '{\n "inputs": {\n  "record": "00"\n },\n "job": "optimum/cartpole",\n'
+        ' "outputs": {\n  "optima/a.csv": "11"\n },\n "study": "22"\n}\n'
     )
-    (tmp_path / "limit+cartpole.json").write_text(text)
-    receipt = Receipt.load(tmp_path, "limit/cartpole")
-    assert receipt == Receipt("limit/cartpole", "22", {"record": "00"}, {"limits/a.csv": "11"})
+    (tmp_path / "optimum+cartpole.json").write_text(text)
+    receipt = Receipt.load(tmp_path, "optimum/cartpole")
+    assert receipt == Receipt("optimum/cartpole", "22", {"record": "00"}, {"optima/a.csv": "11"})
     receipt.save(tmp_path)
-    assert (tmp_path / "limit+cartpole.json").read_text() == text
-    (tmp_path / "limit+cartpole.json").write_text("{")
+    assert (tmp_path / "optimum+cartpole.json").read_text() == text
+    (tmp_path / "optimum+cartpole.json").write_text("{")
     with pytest.raises(InvalidFile, match="expected a job's receipt"):
-        Receipt.load(tmp_path, "limit/cartpole")
+        Receipt.load(tmp_path, "optimum/cartpole")
 
 
 def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
     """Names of robots and conditions may hold dots, spaces and dashes."""
-    jobs = ["limit/cartpole/over-time", "limit/cartpole.over-time", "limit.cartpole/over-time"]
+    jobs = ["optimum/cartpole/over-time", "optimum/cartpole.over-time", "optimum.cartpole/over-time"]
     assert len({receipt_path(tmp_path, job) for job in jobs}) == 3
 
 

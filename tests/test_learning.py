@@ -77,10 +77,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[int, SimulatorTim
 
 @pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()], ids=["cartpole", "navigation"])
-def test_policies_are_as_good_as_the_limit_allows(
+def test_policies_are_as_good_as_the_optimum_allows(
     robot: Cartpole | Navigation, mapping: str, recorded: dict[int, SimulatorTimeline], tmp_path: Path
 ) -> None:
-    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (limit - random).
+    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (optimum - random).
 
     None of the cultures makes up for another by more than the 0.01 that other seeds of training move a score.
     """
@@ -94,7 +94,7 @@ def test_policies_are_as_good_as_the_limit_allows(
         actors = networks_of(list(policies.values()), greedy=True)
         trained = roll_out(environment, simulator, actors, 4, episodes=2_000, seed=5).returns.mean()
         random = roll_out(environment, simulator, Uniform(), 1, episodes=20_000, seed=3).returns.mean()
-        limit = best_return(environment, simulator, episodes=0).value
-        scores.append((trained - random) / (limit - random))
+        optimum = best_return(environment, simulator, episodes=0).value
+        scores.append((trained - random) / (optimum - random))
     assert np.mean(scores) >= 0.97, scores
     assert min(scores) >= 0.96, scores

@@ -368,7 +368,7 @@ def persistent(n: int = 10) -> MemorySimulator:
 
 
 @pytest.mark.parametrize("limit", [2, 60, *(pytest.param(limit, marks=pytest.mark.oracle) for limit in (1, 5))])
-def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
+def test_the_optimum_knows_what_the_neurons_remember(limit: int) -> None:
     """Up and down stairs with a coin that remembers, folded back by hand over step and last toss."""
     heads = np.array([[0.2, 0.5], [0.5, 0.8]])  # after tails and heads, of each action
     worth = np.zeros((5, 2))
@@ -384,7 +384,7 @@ def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
     assert abs(found.monte_carlo - worth[2, 0]) < 4 * found.standard_error + 1e-6
 
 
-def test_cases_with_and_without_memory_have_the_limits_that_they_have_alone() -> None:
+def test_cases_with_and_without_memory_have_the_optima_that_they_have_alone() -> None:
     environment = Animat(Stairs(), Thresholds(1), 2)
     cases = [(environment, coins(3, 6)), (environment, persistent()), (environment, coins(1, 2))]
     together = best_returns(cases, grid=STEPS, episodes=500)
@@ -430,7 +430,7 @@ def test_without_memory_none_is_found_where_responses_are_of_few_spikes() -> Non
     assert found.count(NO_MEMORY) >= 36
 
 
-def test_the_limit_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
+def test_the_optimum_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
     class Own(EmpiricalSimulator):
         has_memory = True
 
@@ -443,7 +443,7 @@ def test_the_limit_of_a_simulator_of_ones_own_that_remembers_is_refused() -> Non
 @pytest.mark.parametrize(
     "mapping", [Thresholds(1), *(pytest.param(other, marks=pytest.mark.oracle) for other in (Thresholds(9), Linear()))]
 )
-def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory(mapping: Any) -> None:
+def test_where_nothing_is_remembered_commands_and_optimum_are_those_without_memory(mapping: Any) -> None:
     responses = independent(0)
     simulator, plain = fit_memory(responses), fit_empirical(responses)
     assert np.all(simulator.nearest == simulator.followers)
@@ -456,15 +456,15 @@ def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory
         mean = sum(np.sum(each.levels * each.probabilities, axis=1) for each in row)
         np.testing.assert_allclose(mean, means, atol=0.01)
     if isinstance(mapping, Thresholds):
-        limits = [best_return(environment, each, resolution=0.4, episodes=0).value for each in (simulator, plain)]
-        assert limits[0] == pytest.approx(limits[1], abs=0.1)
+        optima = [best_return(environment, each, resolution=0.4, episodes=0).value for each in (simulator, plain)]
+        assert optima[0] == pytest.approx(optima[1], abs=0.1)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 def test_the_controller_that_remembers_gets_what_was_promised(robot: Any, mapping: Any) -> None:
-    """The limit's own controller, on the simulator with its memory of a real number, beside six classes of it."""
+    """The optimum's own controller, on the simulator with its memory of a real number, beside six classes of it."""
     chances = {"after_low": (0.05, 0.2, 0.35, 0.45, 0.5), "after_high": (0.25, 0.5, 0.75, 0.85, 0.9)}
     simulator = fit_memory(chain(2500, **chances))
     found = best_return(Animat(robot, mapping, 5), simulator, resolution=0.8, episodes=4000)
@@ -493,7 +493,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     assert 51 <= covered <= 60
 
 
-def test_an_environment_without_neurons_has_its_limit_whatever_simulator_is_beside_it() -> None:
+def test_an_environment_without_neurons_has_its_optimum_whatever_simulator_is_beside_it() -> None:
     """As a case of its own, and beside one whose neurons remember."""
     alone = best_return(WithoutNeurons(Stairs(5), (-1.0, 1.0)), None, grid=STEPS, episodes=10)
     both = [(WithoutNeurons(Stairs(5), (-1.0, 1.0)), persistent()), (Animat(Stairs(5), Thresholds(1), 2), persistent())]
@@ -506,14 +506,14 @@ def test_an_environment_without_neurons_has_its_limit_whatever_simulator_is_besi
 def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
     simulator = fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9)))
     environment = ShuffledDelivery(Animat(Stairs(), Thresholds(1), 2))
-    limit = best_return(environment, simulator, grid=STEPS, episodes=0)
+    optimum = best_return(environment, simulator, grid=STEPS, episodes=0)
     played = [
         roll_out(environment, simulator, actor, 1, episodes=4000, seed=1).returns
         for actor in (Uniform(), Constant(jnp.array([0])))
     ]
     for returns in played:
         # Six classes stand for a memory of a real number.
-        assert abs(returns.mean() - limit.value) < 5 * returns.std() / np.sqrt(4000) + 0.03
+        assert abs(returns.mean() - optimum.value) < 5 * returns.std() / np.sqrt(4000) + 0.03
 
 
 @settings(max_examples=30, deadline=None)

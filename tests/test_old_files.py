@@ -12,7 +12,7 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import read_session
-from animat.errors import Mismatch
+from animat.errors import InvalidFile, Mismatch
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.studies.plan import plan_study
@@ -97,3 +97,21 @@ def test_a_study_is_read_and_its_folder_left_to_the_version_that_began_it(old: P
     with pytest.raises(Mismatch, match=r"got one of another .*; give another folder"):
         run_study(study, folder, base=tmp_path / "old", executor=Halts())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_studys_former_keys_are_read_by_their_names_of_today(tmp_path: Path) -> None:
+    former, today = tmp_path / "former.toml", tmp_path / "today.toml"
+    text = """optimum_resolution = 0.5
+optimum_episodes = 7
+[simulators]
+allow = ["dead-window"]
+[[robots]]
+name = "navigation"
+optimum_resolution = 0.4
+"""
+    today.write_text(text)
+    former.write_text(text.replace("optimum", "limit").replace("allow", "despite"))
+    assert read_study(former) == read_study(today)
+    former.write_text("limit_resolution = 0.5\noptimum_resolution = 0.5\n")
+    with pytest.raises(InvalidFile, match="limit_resolution: no such setting at the top"):
+        read_study(former)

@@ -169,7 +169,7 @@ def test_cartpole_tried_to_the_end() -> None:
 @pytest.mark.parametrize(
     ("robot", "resolution"), [pytest.param(Cartpole(), 0.75, marks=pytest.mark.oracle), (Navigation(), 0.5)]
 )
-def test_where_nothing_can_be_chosen_the_limit_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
+def test_where_nothing_can_be_chosen_the_optimum_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
     """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
     environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
     found = best_return(environment, SIMULATOR, resolution=resolution, episodes=0)
@@ -236,7 +236,7 @@ def test_a_grid_too_rough_is_noticed() -> None:
     grid = grid_for(Navigation()).scaled(0.12)
     found = best_return(WithoutNeurons(Navigation(), None), None, grid=grid, episodes=200)
     (told,) = found.findings()
-    assert told.name == "limit"
+    assert told.name == "optimum"
 
 
 def test_the_grid_error_looks_at_headings_too() -> None:

@@ -162,10 +162,10 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
         error = np.hypot(*(each.std() / np.sqrt(each.size) for each in (returns, rows[name].predicted)))
         assert abs(returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
-    limit = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
-    assert gap.limit == pytest.approx(limit)
+    optimum = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
+    assert gap.optimum == pytest.approx(optimum)
     won = rows["policies"].measured.mean() - rows["policies"].predicted.mean()
-    assert gap.gap_share == pytest.approx(won / (limit - rows["random"].predicted.mean()))
+    assert gap.gap_share == pytest.approx(won / (optimum - rows["random"].predicted.mean()))
     assert gap.session.log.header["agents"][-2]["in_turn"] == ["p0", "p1"]
     # A silent culture commands -1 throughout; the robot of the test has no noise: one return, predicted and measured.
     assert np.ptp(rows["silent"].predicted) == 0
@@ -200,8 +200,8 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     with FakeCulture() as culture:
         gap = run_policies({"p0": policy_of(0, series)}, culture, few, tmp_path, episodes=1, with_controls=False)
     told = json.loads(json.dumps(gap.to_dict()))
-    assert (told["limit"], told["gap_share"]) == (None, None)
-    (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-limit"]
+    assert (told["optimum"], told["gap_share"]) == (None, None)
+    (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-optimum"]
     assert sentence == "no optimal return: these conditions have too few responses: 80 Hz (3)"
     assert sentence in gap.to_text() and "optimal return on this" not in gap.to_text()
 

@@ -108,9 +108,9 @@ def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path)
     assert "my_package" not in sys.modules
     robot_named(ROVER)
     loaded = load_policies(package / "policies")
-    evaluation = evaluate(loaded, timeline_of(), episodes=5, limit_resolution=1.0)
+    evaluation = evaluate(loaded, timeline_of(), episodes=5, optimum_resolution=1.0)
     assert evaluation.robot == "rover" and evaluation.names == tuple(trained)
-    assert "rover has no method `value_grid`" in (evaluation.no_limit or "")
+    assert "rover has no method `value_grid`" in (evaluation.no_optimum or "")
     assert "no heuristic policy among the controls: rover has no method `heuristic`" in evaluation.to_text()
 
 
@@ -123,17 +123,17 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     assert main(["evaluate", "--recordings", "recordings"]) == 1
     assert f"--robot {ROVER}" in capsys.readouterr().err
     asked = ["--recordings", "recordings", "--robot", ROVER, "--episodes", "2", "--json"]
-    assert main(["evaluate", *asked, "--limit"]) == 0
+    assert main(["evaluate", *asked, "--optimum"]) == 0
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
-    assert told["robot"] == "rover" and told["limit"] is None and "value_grid" in told["no_limit"]
+    assert told["robot"] == "rover" and told["optimum"] is None and "value_grid" in told["no_optimum"]
     assert "no heuristic policy among the controls: rover has no method `heuristic`" in said
     forget()
     assert main(["run", *asked, "--culture", "replay"]) == 0
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
     assert "heuristic" not in {row["name"] for row in told["rows"]}
-    assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
+    assert {"no-heuristic", "no-optimum"} <= {finding["name"] for finding in told["findings"]}
     assert "no optimal return: rover has no method `value_grid`" in said
 
 

@@ -454,14 +454,14 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
     assert (float(told["paper_p"]), told["as_in_paper"]) == (PRINTED[told["comparison"], "navigation"].p, "cannot tell")
 
 
-def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -> None:
-    """From the episodes and the limits themselves, not from other columns of the table."""
+def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path) -> None:
+    """From the episodes and the optima themselves, not from other columns of the table."""
     arm_of = {
         "none": "without neurons",
         "1-threshold": "1-threshold",
         "9-thresholds": "9-thresholds, percentiles held",
     }
-    limits = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/limits.csv")}
+    optima = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/optima.csv")}
 
     def returns_of(arm: str, agent: str, at_min: str) -> np.ndarray:
         """All have as many episodes."""
@@ -475,21 +475,21 @@ def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -
         random_ = returns_of(arm_of[mapping], "random", row["at_min"]).mean()
         policies = returns_of(row["condition"], "policy", row["at_min"])
         if row["condition"] in CONTROLS:
-            # Whatever it chooses is as good as random: it has no limit of its own.
-            assert (row["limit"], row["normalised_score"]) == ("", "")
+            # Whatever it chooses is as good as random: it has no optimum of its own.
+            assert (row["optimum"], row["normalised_score"]) == ("", "")
             continue
-        limit = limits[mapping, at_min]
-        best = float(limit["best_return"])
+        optimum = optima[mapping, at_min]
+        best = float(optimum["best_return"])
         assert float(row["normalised_score"]) == pytest.approx((policies.mean() - random_) / (best - random_))
         error = policies.std(ddof=1) / np.sqrt(len(policies))
-        assert policies.mean() < best + float(limit["grid_error"]) + 4 * error
+        assert policies.mean() < best + float(optimum["grid_error"]) + 4 * error
     controls = rows(finished / "tables/controls.csv")
     names = {row["control"] for row in controls if row["mapping"] == "1-threshold"}
     assert {"random", "silent", "shuffled", "heuristic", "constant 80 Hz"} <= names
 
 
-def test_limits_have_intervals_where_conditions_are_evaluated_through_thresholds(finished: Path) -> None:
-    for row in rows(finished / "tables/limits.csv"):
+def test_optima_have_intervals_where_conditions_are_evaluated_through_thresholds(finished: Path) -> None:
+    for row in rows(finished / "tables/optima.csv"):
         assert row["left_out"] == ""
         evaluated = row["mapping"] != "none" and (row["mapping"] == "1-threshold" or float(row["at_min"]) == 140)
         assert bool(row["low_95"]) == bool(row["high_95"]) == evaluated
@@ -564,7 +564,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
         assert f"<dt>{decision}</dt>" in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
-        "scores", "comparisons", "controls", "heuristic", "learning-curves", "limits", "controllability", "findings",
+        "scores", "comparisons", "controls", "heuristic", "learning-curves", "optima", "controllability", "findings",
         "culture-array", "culture-psth", "culture-bursts", "culture-conditions", "culture-drift",
         "navigation-learning", "navigation-over-time", "navigation-paths", "episodes",
     }  # fmt: skip
@@ -767,7 +767,7 @@ COMPARED = (
                 ("", "policies"),
                 ("", "episodes"),
                 ("", "episodes_over_time"),
-                ("", "limit_episodes"),
+                ("", "optimum_episodes"),
                 ("[culture]\n", "sessions"),
                 ("[culture]\n", "presentations"),
                 ("[culture]\nkind = 'made-up'\n", "channels"),
@@ -783,7 +783,7 @@ COMPARED = (
             + "]",
             "policies: expected at most 20,000 in a study, got 22,000",
         ),
-        ("limit_resolution = 3.0", "limit_resolution: expected at most 2.0, got 3.0"),
+        ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2.0, got 3.0"),
         ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
         ("[culture]\nkind = 'made-up'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
         (f"policies = {'9' * 5000}", "expected TOML, got a mistake: Exceeds the limit (4300 digits)"),

@@ -27,11 +27,11 @@ from animat.robots import Navigation
 from animat.studies.draws import draw_seed
 from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, tabulated, write_episodes
 from animat.studies.evaluating import Evaluate
-from animat.studies.limits import FindLimits, read_limits
-from animat.studies.places import controls_file, episodes_file, limits_file, results_file, table_file
+from animat.studies.optima import FindOptima, read_optima
+from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
-from animat.studies.results import ComparedReturns, Limit, Results, Score, read_typed, write_typed
-from animat.studies.shown import limits_shown
+from animat.studies.results import ComparedReturns, Results, Score, StudyOptimum, read_typed, write_typed
+from animat.studies.shown import optima_shown
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Body, Compared, Study, StudyCondition, named_mapping
@@ -68,8 +68,8 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
             table = tabulated(episodes_of(returns), robot=body.name, arm=condition.name, at_min=0.0)
             write_episodes(episodes_file(folder, body, condition), [table])
         write_random(folder, body, LIKE, 0.0)
-        limit = Limit(body.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
-        write_typed(limits_file(folder, body.name), [limit])
+        optimum = StudyOptimum(body.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
+        write_typed(optima_file(folder, body.name), [optimum])
     Tabulate(study).run(folder, Silent())
     results = read_typed(results_file(folder), Results)
     with table_file(folder, "comparisons").open(newline="") as file:
@@ -203,8 +203,8 @@ FEW = Study(
     robots=(Body("navigation", parameters={"episode_limit": 60}),),
     conditions=(StudyCondition("1 threshold", trained=False), StudyCondition("without neurons", mapping="none")),
     comparisons=(Compared("c", "without neurons", "1 threshold", at_min=0.0, episodes=2),),
-    limit_resolution=0.25,
-    limit_episodes=20,
+    optimum_resolution=0.25,
+    optimum_episodes=20,
 )
 
 
@@ -216,14 +216,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def limits_of(folder: Path, name: str = "limits") -> tuple[Limit, ...]:
-    (file,) = FindLimits(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
-    assert file == limits_file(folder, "navigation", name)
-    return read_limits(folder, "navigation", name)
+def optima_of(folder: Path, name: str = "optima") -> tuple[StudyOptimum, ...]:
+    (file,) = FindOptima(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
+    assert file == optima_file(folder, "navigation", name)
+    return read_optima(folder, "navigation", name)
 
 
 @pytest.mark.oracle
-def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
+def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     series = extract_series(read_recordings(recorded / "recordings"))
@@ -233,7 +233,7 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
     assert min(n[1]) >= enough > min(n[0])
     monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", enough)
     few = [i for i in range(5) if n[0][i] < enough]
-    at_first, at_last, without = limits_of(recorded)
+    at_first, at_last, without = optima_of(recorded)
     assert at_first.left_out == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
     assert at_last.left_out is None is without.left_out
     for row in (at_first, at_last):
@@ -249,27 +249,27 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
         write_random(recorded, FEW.robots[0], condition, 0.0, 140.0)
     random = read_episodes(controls_file(recorded, FEW.robots[0], condition) for condition in FEW.conditions)
     known, condition = References(FEW, recorded, FEW.robots[0], random), FEW.conditions[0]
-    assert known.limit(condition, 0.0) is None is known.score(condition, 0.0, 5.0)
-    assert known.limit(condition, 140.0) is not None is not known.score(condition, 140.0, 5.0)
-    rough = limits_of(recorded, "over-time")
+    assert known.optimum(condition, 0.0) is None is known.score(condition, 0.0, 5.0)
+    assert known.optimum(condition, 140.0) is not None is not known.score(condition, 140.0, 5.0)
+    rough = optima_of(recorded, "over-time")
     assert [row.left_out for row in rough] == [at_first.left_out, None]
     assert {row.low_95 for row in rough} == {None}
-    note = limits_shown((at_first, at_last, without))
-    assert "1 of 3 limits leave out conditions with fewer than 30 responses" in note.note
+    note = optima_shown((at_first, at_last, without))
+    assert "1 of 3 optima leave out conditions with fewer than 30 responses" in note.note
     assert note.rows[0][-1] == at_first.left_out
 
 
-def test_where_no_condition_has_enough_responses_a_study_has_no_limit(
+def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", 41)
-    at_first, at_last, without = limits_of(recorded)
+    at_first, at_last, without = optima_of(recorded)
     for row in (at_first, at_last):
         assert row.left_out.count(" Hz (") == 5
         assert set(astuple(row)[4:-1]) == {None}
     assert without.best_return > 0
-    shown = limits_shown((at_first, without))
-    assert shown.rows[0][shown.head.index("limit ± grid")] is None and 0 not in shown.marked
+    shown = optima_shown((at_first, without))
+    assert shown.rows[0][shown.head.index("optimum ± grid")] is None and 0 not in shown.marked
 
 
 # --- a real recording -----------------------------------------------------------------------------------------------
@@ -279,8 +279,8 @@ title = "An organoid's answers to two intervals"
 policies = 2
 episodes = 20
 episodes_over_time = 2
-limit_resolution = 0.4
-limit_episodes = 400
+optimum_resolution = 0.4
+optimum_episodes = 400
 algorithm = {{ environments = 8, updates = 1, batch = 16, replay = 1024, hidden = 8 }}
 
 [culture]
@@ -322,12 +322,12 @@ def test_a_study_of_a_real_recording_with_two_conditions(
     policy = Policy.load(folder / "policies" / "navigation" / "9-thresholds" / "p0.safetensors")
     assert [condition.label for condition in policy.conditions] == ["5 Hz", "10 Hz"]
     results = read_typed(results_file(folder), Results)
-    limits, scores = {limit.mapping: limit for limit in results.limits}, results.scores
-    assert {score.mapping for score in scores} == set(limits) == {"1-threshold", "9-thresholds"}
+    optima, scores = {optimum.mapping: optimum for optimum in results.optima}, results.scores
+    assert {score.mapping for score in scores} == set(optima) == {"1-threshold", "9-thresholds"}
     for score in scores:
-        limit = limits[score.mapping]
-        # That culture could do better than chance, and never well: without neurons the limit is above 20.
-        assert score.random + 20 < limit.best_return < 10
-        assert abs(limit.monte_carlo - limit.best_return) < 4 * limit.standard_error + limit.grid_error + 1
-        assert score.mean_return < limit.best_return + 4 * limit.standard_error + limit.grid_error
+        optimum = optima[score.mapping]
+        # That culture could do better than chance, and never well: without neurons the optimum is above 20.
+        assert score.random + 20 < optimum.best_return < 10
+        assert abs(optimum.monte_carlo - optimum.best_return) < 4 * optimum.standard_error + optimum.grid_error + 1
+        assert score.mean_return < optimum.best_return + 4 * optimum.standard_error + optimum.grid_error
     assert (folder / "report.html").stat().st_size > 100_000

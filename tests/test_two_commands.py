@@ -163,7 +163,7 @@ def test_policies_run_and_are_predicted(
     with FakeCulture(3) as culture:
         gap = run_policies(policies, culture, calibration, tmp_path, episodes=4)
     assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].measured))
-    assert "no-limit" in {finding.name for finding in gap.findings}
+    assert "no-optimum" in {finding.name for finding in gap.findings}
     assert {"silent", "shuffled", "heuristic", "constant 5 Hz"} <= {row.name for row in gap.rows}
 
 
@@ -216,9 +216,9 @@ def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy
 
 
 def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
-    table = evaluate(baseline, None, episodes=40, limit_resolution=0.5)
+    table = evaluate(baseline, None, episodes=40, optimum_resolution=0.5)
     assert [row.name for row in table.rows] == ["policies", "random", "heuristic"]
-    assert table.no_limit is not None and "expected one command for an optimal return, got 2" in table.no_limit
+    assert table.no_optimum is not None and "expected one command for an optimal return, got 2" in table.no_optimum
     # The heuristic policy is the robot's own, for any commands can be given.
     wheels = Wheels(episode_limit=8)
     state = wheels.reset(jax.random.key(4))
@@ -368,7 +368,7 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
     assert main(["train", "my_wheels:Wheels", *few, "--readouts", "halves"]) == 0
     assert "5 Hz: left 0." in capsys.readouterr().out
     asked = ["--recordings", "recordings", "--episodes", "2"]
-    assert main(["evaluate", *asked, "--limit"]) == 0
+    assert main(["evaluate", *asked, "--optimum"]) == 0
     assert "expected one command for an optimal return" in capsys.readouterr().out
     assert main(["run", *asked, "--culture", "replay"]) == 0
     assert main(["live", "my_wheels:Wheels"]) == 1

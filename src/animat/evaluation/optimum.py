@@ -27,7 +27,7 @@ from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
-"""What a limit is asked for: an environment, and the simulator in it (None without neurons)."""
+"""What an optimum is asked for: an environment, and the simulator in it (None without neurons)."""
 
 COARSER = 0.75
 """Steps along each axis of the grid that the value is compared with, as a part of those of the grid in use."""
@@ -116,7 +116,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
             f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution (or the "
             f"{CLASSES} classes of what a memory simulator remembers are)"
         )
-    return (Finding("limit", "warning", told, apart),)
+    return (Finding("optimum", "warning", told, apart),)
 
 
 def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
@@ -141,7 +141,7 @@ def best_returns(
     neurons remember, s holds the class of the past too (`commands_after`). V is kept
     at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
     `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
-    a return that can be had and cannot lie above the true limit by more than chance.
+    a return that can be had and cannot lie above the true optimum by more than chance.
 
     Args:
         cases: environments, all of the same robot, each with its simulator (None without neurons).
@@ -200,7 +200,7 @@ def best_returns(
                     nodes=fine.size,
                 )
             )
-            progress.update(len(optima), len(cases), f"limit {values[case]:.1f}")
+            progress.update(len(optima), len(cases), f"optimum {values[case]:.1f}")
     return tuple(optima)
 
 

@@ -43,7 +43,7 @@ from animat.training.policy import Policy, first_of_alike
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
-LIMIT_RESOLUTION = 0.5
+OPTIMUM_RESOLUTION = 0.5
 """Of the grid of the optimal return: fast and rough, 0.8 of the cartpole's 200."""
 
 
@@ -152,7 +152,7 @@ def run_policies(
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
-        findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
+        findings += (Finding("no-optimum", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
     predicted = predict(
         [agents[: len(policies)], *([control] for control in agents[len(policies) :])],
         environment,
@@ -164,10 +164,10 @@ def run_policies(
         progress=progress,
     )
     # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
-    limit = _meanwhile(lambda: _best_return(environment, simulator)) if why_not is None else None
+    optimum = _meanwhile(lambda: _best_return(environment, simulator)) if why_not is None else None
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
-    if in_real_time and limit is not None:
-        _wait_for(limit, progress)
+    if in_real_time and optimum is not None:
+        _wait_for(optimum, progress)
     of_each = planned_episodes(len(policies), len(agents) - len(policies), episodes)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
@@ -184,11 +184,11 @@ def run_policies(
     )
     best = None
     # Whoever stopped the session does not wait for it.
-    if limit is not None and (limit.done() or session.ending.by == "plan"):
+    if optimum is not None and (optimum.done() or session.ending.by == "plan"):
         try:
-            best = _wait_for(limit, progress)
+            best = _wait_for(optimum, progress)
         except Exception as error:
-            findings += (Finding("no-limit", "note", f"no optimal return: {in_words(error)}"),)
+            findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
     rows = _rows(agents, tuple(policies), predicted, session)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
@@ -225,7 +225,7 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
 
 def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
     """The value alone, which is told as "about": how well it is known would take a third as long again."""
-    grid = grid_for(environment.robot).scaled(LIMIT_RESOLUTION)
+    grid = grid_for(environment.robot).scaled(OPTIMUM_RESOLUTION)
     (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
     return float(value)
 
@@ -245,10 +245,10 @@ def _meanwhile(compute: Callable[[], float]) -> Future[float]:
     return found
 
 
-def _wait_for(limit: Future[float], progress: Progress | None) -> float:
+def _wait_for(optimum: Future[float], progress: Progress | None) -> float:
     if progress is not None:
         progress.update(0, 1, "optimal return")
-    return limit.result()
+    return optimum.result()
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:

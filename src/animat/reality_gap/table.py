@@ -108,7 +108,7 @@ class RealityGap:
         robot, mapping: names.
         loop: the settings of the closed loop.
         calibrated_at_min: of the recording that predicted.
-        limit: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
+        optimum: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
         session: as it ran.
@@ -123,7 +123,7 @@ class RealityGap:
     mapping: str
     loop: Loop
     calibrated_at_min: float
-    limit: float | None
+    optimum: float | None
     rows: tuple[Row, ...]
     session: Session
     account: Account
@@ -140,10 +140,10 @@ class RealityGap:
 
     @property
     def gap_share(self) -> float | None:
-        """The policies' gap as a share of what there is to win: of the range from predicted random to the limit."""
-        if self.limit is None:
+        """The policies' gap as a share of what there is to win: of the range from predicted random to the optimum."""
+        if self.optimum is None:
             return None
-        range_ = self.limit - next(row for row in self.rows if row.name == "random").predicted.mean()
+        range_ = self.optimum - next(row for row in self.rows if row.name == "random").predicted.mean()
         return float(self.rows[0].gap.value / range_) if len(self.rows[0].measured) and range_ > 0 else None
 
     def verdict(self) -> str:
@@ -176,7 +176,7 @@ class RealityGap:
             "mapping": self.mapping,
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
-            "limit": self.limit,
+            "optimum": self.optimum,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
@@ -210,12 +210,14 @@ class RealityGap:
             f"{self.calibrated_at_min:g} min",
             *lined_up(head, cells),
         ]
-        if self.limit is not None:
+        if self.optimum is not None:
             share = ""
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
-            lines.append(f"  the optimal return on this simulator is about {self.limit:.1f}{share}")
-        lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
+            lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
+        lines += [
+            f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")
+        ]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies' returns are no other than this control's; stimulation: {self.account}")

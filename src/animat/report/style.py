@@ -33,7 +33,7 @@ WINDOW = ORANGE
 NON_BURST = BLUE
 BURST = RED
 MEDIAN = RED
-LIMIT = BLACK
+OPTIMUM = BLACK
 
 # Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}

@@ -1,4 +1,4 @@
-"""Where the study departs from the paper: decisions taken, and comparisons that came out otherwise, with the limit."""
+"""Where the study departs from the paper: decisions taken, and comparisons that came out otherwise."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
 def came_out_otherwise(
     rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
 ) -> tuple[tuple[str, str], ...]:
-    """For each comparison that differs from the paper or cannot tell: what came out, and what its limit says to it.
+    """For each comparison that differs from the paper or cannot tell: what came out, and what its optimum says to it.
 
     Args:
         rows: of the table of comparisons.
@@ -136,51 +136,51 @@ def came_out_otherwise(
         loss = (lost or {}).get(row.at_min, 0.0)
         if loss > LARGEST_LOSS:
             words += (
-                f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and limit are those of the "
-                "simulator, and not all that the culture would allow."
+                f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and optimum are those of "
+                "the simulator, and not all that the culture would allow."
             )
         told.append((f"{row.comparison}, {row.robot}", words))
     return tuple(told)
 
 
 def explain(row: ComparedReturns) -> str:
-    """What the limits say to a comparison's outcome."""
+    """What the optima say to a comparison's outcome."""
     n = row.n
     smallest = p_of_u(0.0, n, n)
     if smallest >= LEVEL:
         return f"With {n} policies a side p cannot fall below {smallest:.2g}, however they differ: take more policies."
-    first, second, random = row.limit_first, row.limit_second, row.random_second
+    first, second, random = row.optimum_first, row.optimum_second, row.random_second
     if second is None or random is None:
-        return "There is no limit to compare with."
-    error_second = row.limit_error_second or 0.0
+        return "There is no optimum to compare with."
+    error_second = row.optimum_error_second or 0.0
     if second - random <= error_second:
         return (
             f"The optimal return for {row.second}, {second:.1f}, is not above that of random actions: "
             "there is nothing to learn."
         )
-    limits = f"The optimal return is {second:.1f} for {row.second}"
+    optima = f"The optimal return is {second:.1f} for {row.second}"
     if first is None:
-        # A control has no limit of its own: whatever it chooses, another condition is delivered.
-        limits += f"; {row.first} cannot do better than random actions, {random:.1f}"
+        # A control has no optimum of its own: whatever it chooses, another condition is delivered.
+        optima += f"; {row.first} cannot do better than random actions, {random:.1f}"
     else:
-        limits = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
-        error = (row.limit_error_first or 0.0) + error_second
+        optima = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
+        error = (row.optimum_error_first or 0.0) + error_second
         if first - second > error:
-            return f"{limits}: with these responses the order of the limits is itself the other way round."
+            return f"{optima}: with these responses the order of the optima is itself the other way round."
         if abs(first - second) <= error:
-            limits += ", which is the same within their errors"
+            optima += ", which is the same within their errors"
     # How much more than the first condition the second could have, as a part of all there is to learn.
     room = (second - row.mean_first) / (second - random)
     if room <= 1 - AIM:
         return (
-            f"{limits}, and {row.first} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
+            f"{optima}, and {row.first} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
             "actions and that: no room is left."
         )
     score = row.score_second
     if score is not None and score >= AIM:
-        return f"{limits}; {row.second} is at its limit (score {score:.2f}), so more cannot be had from it."
+        return f"{optima}; {row.second} is at its optimum (score {score:.2f}), so more cannot be had from it."
     scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row.score_first, score))
     return (
-        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, {second - row.mean_first:.1f} "
+        f"{optima}, random {random:.1f}; scores are {scores}. The optimum leaves room, {second - row.mean_first:.1f} "
         f"above {row.first}, so it does not explain this."
     )

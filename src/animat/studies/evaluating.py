@@ -83,7 +83,7 @@ class Control(StudyTask):
         networks = _networks(study, folder, self.body, self.plain) if is_usual(self.plain) else None
         parts = []
         first, last = first_minute(timeline), last_minute(timeline)
-        minutes = study.limit_minutes(first, last) if condition.through_neurons else [last]
+        minutes = study.optimum_minutes(first, last) if condition.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
             answering = setting.simulator(at_min)

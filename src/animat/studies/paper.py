@@ -59,7 +59,7 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
             title="The paper's study on a virtual culture",
             culture=Source(seed=culture_seed),
             # On navigation's grid 0.6 of the steps leave an error of a hundredth.
-            robots=(Body("cartpole"), Body("navigation", limit_resolution=0.6)),
+            robots=(Body("cartpole"), Body("navigation", optimum_resolution=0.6)),
             conditions=CONDITIONS,
             comparisons=COMPARISONS,
             seed=seed,
@@ -73,7 +73,7 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
         comparisons=COMPARISONS,
         policies=4,
         seed=seed,
-        limit_resolution=0.5,
-        limit_episodes=1000,
+        optimum_resolution=0.5,
+        optimum_episodes=1000,
         paper=True,
     )

@@ -41,7 +41,7 @@ from animat.studies.figure_tables import (
     write_paths,
     write_psth,
 )
-from animat.studies.limits import kinds_of, limits_of_all
+from animat.studies.optima import kinds_of, optima_of_all
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
 from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
@@ -149,7 +149,7 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
 
 
 Rough: TypeAlias = dict[tuple[str, str, float], tuple[float, float | None]]
-"""By mapping, percentiles and minute: the mean return of random actions, and the limit on a rough grid if known."""
+"""By mapping, percentiles and minute: the mean return of random actions, and the optimum on a rough grid if known."""
 
 
 def _curves(
@@ -160,14 +160,14 @@ def _curves(
         if not condition.trained:
             continue
         told = learning_of(study, folder, body, condition)
-        random, limit = [], []
+        random, optimum = [], []
         for at_min in _minutes_in_training(study, condition, timeline, told.shape[1]):
-            best = known.limit(condition, at_min)
+            best = known.optimum(condition, at_min)
             near = rough.get((condition.mapping, condition.percentiles, at_min), (None, None))
             random.append(near[0] if condition.through_neurons else known.random(condition, at_min))
             fallback = near[1] if condition.delivery == "chosen" else None
-            limit.append(fallback if best is None else best.best_return)
-        beside = np.array(random, np.float64), np.array(limit, np.float64)
+            optimum.append(fallback if best is None else best.best_return)
+        beside = np.array(random, np.float64), np.array(optimum, np.float64)
         curves.append(LearningCurve(condition.name, told[0, :, 0], told[:, :, 2], *beside))
     return curves
 
@@ -185,12 +185,12 @@ def _minutes_in_training(
 
 
 def _over_time(study: Study, folder: Path, body: Body, table: DataFrame) -> Rough:
-    """Random actions and the limit on a rough grid (None where it was not computed) at every recording."""
+    """Random actions and the optimum on a rough grid (None where it was not computed) at every recording."""
     if not study.needs_neurons:
         return {}
-    limits = {
-        (limit.mapping, limit.percentiles, limit.at_min): limit.best_return
-        for limit in limits_of_all(folder, body.name, "over-time")
+    optima = {
+        (optimum.mapping, optimum.percentiles, optimum.at_min): optimum.best_return
+        for optimum in optima_of_all(folder, body.name, "over-time")
     }
     found: Rough = {}
     random = table[(table["agent"] == RANDOM) & table["over_time"]]
@@ -198,7 +198,7 @@ def _over_time(study: Study, folder: Path, body: Body, table: DataFrame) -> Roug
         of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
         for at_min, returns in of_kind.groupby("at_min")["return"]:
             key = (kind.mapping, kind.percentiles, at_min)
-            found[key] = (float(returns.to_numpy().mean()), limits.get(key))
+            found[key] = (float(returns.to_numpy().mean()), optima.get(key))
     return found
 
 
@@ -208,13 +208,13 @@ def _pairs(study: Study, rows: list[ComparedReturns], table: DataFrame, known: R
         groups = []
         for name, score in ((row.first, row.score_first), (row.second, row.score_second)):
             condition = study.condition(name)
-            limit = known.limit(condition, row.at_min)
+            optimum = known.optimum(condition, row.at_min)
             groups.append(
                 Group(
                     name,
                     performances(table, row.robot, condition, row.at_min, row.episodes),
                     known.random(condition, row.at_min),
-                    None if limit is None else limit.best_return,
+                    None if optimum is None else optimum.best_return,
                     score,
                 )
             )
@@ -237,15 +237,17 @@ def _courses(
                 returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
                 courses.append(Course(condition.name, np.array(every_min), returns))
         at = [rough[kind.mapping, kind.percentiles, at_min] for at_min in every_min]
-        limits = ((at_min, known.limit(kind, at_min)) for at_min in every_min)
+        optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
                 named_mapping(kind.mapping, kind.percentiles),
                 tuple(courses),
                 np.array([random for random, _ in at]),
-                None if at[0][1] is None else np.array([limit for _, limit in at], np.float64),
+                None if at[0][1] is None else np.array([optimum for _, optimum in at], np.float64),
                 tuple(
-                    (at_min, limit.best_return) for at_min, limit in limits if limit and limit.best_return is not None
+                    (at_min, optimum.best_return)
+                    for at_min, optimum in optima
+                    if optimum and optimum.best_return is not None
                 ),
             )
         )
@@ -266,7 +268,7 @@ def _controls(study: Study, rows: list[ControlReturns]) -> list[Controls]:
                 tuple((row.control, row.mean_return, row.standard_error) for row in same),
                 sum(row.control in trained for row in same),
                 same[0].random,
-                same[0].limit,
+                same[0].optimum,
             )
         )
     return panels

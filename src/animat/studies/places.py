@@ -18,7 +18,7 @@ OWN_FOLDERS = (
     "policies",
     "episodes",
     "controls",
-    "limits",
+    "optima",
     "tables",
     "figures",
     RECEIPTS,
@@ -50,9 +50,9 @@ def controls_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
     return folder / "controls" / body.name / condition.thresholds / "episodes.npz"
 
 
-def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:
+def optima_file(folder: Path, robot: str, what: str = "optima") -> Path:
     """The optimal returns on a robot."""
-    return folder / "limits" / f"{robot}-{what}.json"
+    return folder / "optima" / f"{robot}-{what}.json"
 
 
 def results_file(folder: Path) -> Path:

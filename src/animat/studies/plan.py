@@ -52,7 +52,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
         jobs += _beside(study, body, neurons)
         results = [job.name for job in jobs if job.name.split("/")[1:2] == [body.name]]
         jobs.append(Job(f"pictures/{body.name}", RobotPictures(study, body), (*results, *neurons, "tables"), 15))
-    everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "limit", "train")]
+    everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "optimum", "train")]
     jobs.append(Job("tables", Tabulate(study), (*everything, *neurons), 2))
     pictures = [job.name for job in jobs if job.name.startswith("pictures/")]
     jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1))
@@ -60,9 +60,9 @@ def plan_study(study: Study, base: Path) -> list[Job]:
 
 
 def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
-    """Controls and limits on a robot."""
+    """Controls and optima on a robot."""
     from animat.studies.evaluating import Control
-    from animat.studies.limits import FindLimits, kinds_of
+    from animat.studies.optima import FindOptima, kinds_of
     from animat.training.group import split_groups
 
     jobs = []
@@ -71,11 +71,11 @@ def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
         groups = [f"train/{body.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies)]
         name = f"controls/{body.name}/{kind.thresholds}"
         jobs.append(Job(name, Control(study, body, plain), (*groups, *neurons), 6))
-    resolution = body.limit_resolution or study.limit_resolution
+    resolution = body.optimum_resolution or study.optimum_resolution
     cost_s = 40 * resolution ** len(body.robot().quantities) + 10
-    jobs.append(Job(f"limit/{body.name}", FindLimits(study, body), neurons, cost_s))
+    jobs.append(Job(f"optimum/{body.name}", FindOptima(study, body), neurons, cost_s))
     if neurons:
-        jobs.append(Job(f"limit/{body.name}/over-time", FindLimits(study, body, over_time=True), neurons, 12))
+        jobs.append(Job(f"optimum/{body.name}/over-time", FindOptima(study, body, over_time=True), neurons, 12))
     return jobs
 
 

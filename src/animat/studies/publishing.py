@@ -19,7 +19,7 @@ from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
 from animat.studies.heuristic import not_outperforming
-from animat.studies.learned import as_good_as_the_limit_allows, learned_of
+from animat.studies.learned import beside_the_optimum, learned_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
 from animat.studies.results import ComparedReturns, Results, read_typed
 from animat.studies.shown import (
@@ -27,7 +27,7 @@ from animat.studies.shown import (
     controllability_shown,
     controls_shown,
     heuristic_shown,
-    limits_shown,
+    optima_shown,
     returns_shown,
     scores_shown,
 )
@@ -125,17 +125,17 @@ def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
 
 def _scores(study: Study, results: Results) -> Section:
     learned = learned_of(study, results.scores)
-    tables = [scores_shown(results.scores), limits_shown(results.limits)]
+    tables = [scores_shown(results.scores), optima_shown(results.optima)]
     paragraphs = [
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     ]
     if learned:
         paragraphs.append(
-            f"As good as the limit allows: a score of {AIM:g} on the very simulator that policies were trained on is "
+            f"As good as the optimum: a score of {AIM:g} on the very simulator that policies were trained on is "
             "what learning should come to. Conditions whose simulators are refreshed during training are not asked "
             "this, as they are trained on several."
         )
-        tables.insert(0, as_good_as_the_limit_allows(study, learned))
+        tables.insert(0, beside_the_optimum(study, learned))
     return Section("Scores", tuple(paragraphs), tables=tuple(tables))
 
 
@@ -263,7 +263,7 @@ def _noticed(results: Results) -> Section:
     notes = len(results.findings) - len(grave)
     shown = tuple((finding.name, finding.sentence) for finding in grave)
     said = (
-        f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the limits; all "
+        f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the optima; all "
         "are in tables/findings.csv."
     )
     table: tuple[Any, ...] = (

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Limit:
+class StudyOptimum:
     """The optimal return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
 
     Attributes:
@@ -56,7 +56,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Score:
-    """A condition at a minute: means over policies, beside random actions and the limit."""
+    """A condition at a minute: means over policies, beside random actions and the optimum."""
 
     robot: str
     condition: str
@@ -70,11 +70,11 @@ class Score:
     low_95: float | None
     high_95: float | None
     random: float | None
-    limit: float | None
-    limit_grid_error: float | None
-    limit_run: float | None
-    limit_run_standard_error: float | None
-    limit_without_clock: float | None
+    optimum: float | None
+    optimum_grid_error: float | None
+    optimum_run: float | None
+    optimum_run_standard_error: float | None
+    optimum_without_clock: float | None
     normalised_score: float | None
     score_without_clock: float | None
 
@@ -95,10 +95,10 @@ class ComparedReturns:
     score_first: float | None
     score_second: float | None
     random_second: float | None
-    limit_first: float | None
-    limit_second: float | None
-    limit_error_first: float | None
-    limit_error_second: float | None
+    optimum_first: float | None
+    optimum_second: float | None
+    optimum_error_first: float | None
+    optimum_error_second: float | None
     u: float
     p_normal: float
     p_exact: float
@@ -125,7 +125,7 @@ class ControlReturns:
     mean_return: float
     standard_error: float | None
     random: float | None
-    limit: float | None
+    optimum: float | None
     normalised_score: float | None
 
 
@@ -151,7 +151,7 @@ class Results:
     comparisons: tuple[ComparedReturns, ...]
     controls: tuple[ControlReturns, ...]
     heuristic: tuple[BesideHeuristic, ...]
-    limits: tuple[Limit, ...]
+    optima: tuple[StudyOptimum, ...]
     findings: tuple[Finding, ...]
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, AliasChoices, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import AfterValidator, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
 from animat.coding.mapping import Thresholds, mapping_named
 from animat.errors import InvalidArgument, shown
@@ -67,8 +67,7 @@ class Simulators:
     conditions: str = ""
     window_ms: tuple[Number, Number] = (2.0, 10.0)
     burst_threshold: Share | None = None
-    # What it was called in files that are still read.
-    allow: Annotated[tuple[str, ...], LISTED, Field(validation_alias=AliasChoices("allow", "despite"))] = ()
+    allow: Annotated[tuple[str, ...], LISTED] = ()
 
     def __post_init__(self) -> None:
         from animat.neurons.simulator import check_binning
@@ -95,12 +94,12 @@ class Body:
             where to import it from, `my_package.robots:Rover`, which is filled in for robots that are not ours.
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
-        limit_resolution: of its optimal return, in place of the study's.
+        optimum_resolution: of its optimal return, in place of the study's.
     """
 
     name: Name
     iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] | None = None
-    limit_resolution: Resolution | None = None
+    optimum_resolution: Resolution | None = None
     parameters: Numbers = Field(default_factory=dict)
     kind: str = ""
 
@@ -222,8 +221,8 @@ class Study:
         episodes: of each policy where no comparison says otherwise, and of controls.
         episodes_over_time: of each policy at every recording.
         actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
-        limit_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
-        limit_episodes: episodes in which that controller's return is checked.
+        optimum_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
+        optimum_episodes: episodes in which that controller's return is checked.
         algorithm: settings of `animat.training.settings.SAC` in place of its defaults.
         paper: whether the paper's own figures are printed beside comparisons of the same name and robot.
 
@@ -243,8 +242,8 @@ class Study:
     episodes: Episodes = 100
     episodes_over_time: Episodes = 30
     actions: Literal["most probable", "drawn"] = "most probable"
-    limit_resolution: Resolution = 1.0
-    limit_episodes: Annotated[Whole, Field(ge=2, le=MOST_AT_ONCE)] = 4000
+    optimum_resolution: Resolution = 1.0
+    optimum_episodes: Annotated[Whole, Field(ge=2, le=MOST_AT_ONCE)] = 4000
     algorithm: Numbers = Field(default_factory=dict)
     paper: Flag = False
 
@@ -331,7 +330,7 @@ class Study:
             )
         return min(start_min, key=lambda start: (abs(start - at), start))
 
-    def limit_minutes(self, first_min: float, last_min: float) -> list[float]:
+    def optimum_minutes(self, first_min: float, last_min: float) -> list[float]:
         """Minutes at which anything is evaluated, rising."""
         return sorted({at for condition in self.conditions for at in self.minutes_of(condition, first_min, last_min)})
 

@@ -19,16 +19,16 @@ from animat.recordings.findings import Finding
 from animat.studies.episodes import POLICY, RANDOM, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.heuristic import beside_heuristic
-from animat.studies.limits import kinds_of, left_out, limits_of_all, read_limits
+from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
 from animat.studies.results import (
     BesideHeuristic,
     ComparedReturns,
     ControlReturns,
-    Limit,
     Results,
     Score,
+    StudyOptimum,
     write_records,
     write_table,
     write_typed,
@@ -47,7 +47,7 @@ LEVEL = 0.01
 """The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
 
 AIM = 0.97
-"""Normalised score from which a condition counts as being as good as its limit allows."""
+"""Normalised score from which a condition counts as being as good as its optimum allows."""
 
 LEFT_OUT = "left-out"
 """The finding that a robot cannot do something, which the study is without."""
@@ -68,14 +68,14 @@ class Tabulate(StudyTask):
         first, last = first_minute(timeline), last_minute(timeline)
         table = all_episodes(study, folder)
         known = {body.name: References(study, folder, body, table) for body in study.robots}
-        limits = tuple(limit for body in study.robots for limit in read_limits(folder, body.name))
+        optima = tuple(optimum for body in study.robots for optimum in read_optima(folder, body.name))
         results = Results(
             scores=tuple(_scores(study, table, first, last, known)),
             comparisons=tuple(_comparisons(study, table, last, known)),
             controls=tuple(row for body in study.robots for row in _controls(study, table, body, known[body.name])),
             heuristic=tuple(row for body in study.robots for row in beside_heuristic(study, table, body)),
-            limits=limits,
-            findings=tuple(_findings(study, timeline, limits)),
+            optima=optima,
+            findings=tuple(_findings(study, timeline, optima)),
         )
         files = [write_typed(results_file(folder), results)]
         for name, kind in (
@@ -83,7 +83,7 @@ class Tabulate(StudyTask):
             ("comparisons", ComparedReturns),
             ("controls", ControlReturns),
             ("heuristic", BesideHeuristic),
-            ("limits", Limit),
+            ("optima", StudyOptimum),
         ):
             files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
         told = ((finding.severity, finding.name, finding.sentence) for finding in results.findings)
@@ -106,12 +106,12 @@ def all_episodes(study: Study, folder: Path, robots: Iterable[Body] | None = Non
     return read_episodes(files)
 
 
-def _findings(study: Study, timeline: SimulatorTimeline | None, limits: Iterable[Limit]) -> Iterator[Finding]:
+def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable[StudyOptimum]) -> Iterator[Finding]:
     if timeline is not None:
         yield from timeline.findings
-    for limit in limits:
-        where = f"{limit.robot}, {named_mapping(limit.mapping, limit.percentiles)}, at {limit.at_min:g} min"
-        for told in limit.findings():
+    for optimum in optima:
+        where = f"{optimum.robot}, {named_mapping(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
+        for told in optimum.findings():
             yield replace(told, sentence=f"{where}: {told.sentence}")
     for sentence in left_out(study):
         yield Finding(LEFT_OUT, "note", sentence)
@@ -131,8 +131,9 @@ class References:
     """
 
     def __init__(self, study: Study, folder: Path, body: Body, table: DataFrame) -> None:
-        self._limits = {
-            (limit.mapping, limit.percentiles, limit.at_min): limit for limit in limits_of_all(folder, body.name)
+        self._optima = {
+            (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
+            for optimum in optima_of_all(folder, body.name)
         }
         random = table[(table["robot"] == body.name) & (table["agent"] == RANDOM) & ~table["over_time"]]
         self._random: dict[tuple[str, str, float], float] = {}
@@ -145,21 +146,21 @@ class References:
         """The mean return of random actions, delivered as chosen."""
         return self._of(self._random, condition, at_min)
 
-    def limit(self, condition: StudyCondition, at_min: float) -> Limit | None:
+    def optimum(self, condition: StudyCondition, at_min: float) -> StudyOptimum | None:
         """The optimal return and how well it is known.
 
         None for a control, which can do nothing, and where conditions with few responses were left out of it.
         """
         if condition.delivery == "shuffled":
             return None
-        return self._of(self._limits, condition, at_min)
+        return self._of(self._optima, condition, at_min)
 
     def score(
         self, condition: StudyCondition, at_min: float, mean: float, against: str = "best_return"
     ) -> float | None:
-        """The normalised score, against the limit or another of its fields; None where nothing can be learned."""
-        random, limit = self.random(condition, at_min), self.limit(condition, at_min)
-        best = None if limit is None else getattr(limit, against)
+        """The normalised score, against the optimum or another of its fields; None where nothing can be learned."""
+        random, optimum = self.random(condition, at_min), self.optimum(condition, at_min)
+        best = None if optimum is None else getattr(optimum, against)
         if random is None or best is None:
             return None
         try:
@@ -198,7 +199,7 @@ def _scores(
                 means = performances(table, body.name, condition, at_min)
                 mean = float(means.mean())
                 middle = interquartile_mean(means, within=body.robot().return_range)
-                limit = known.limit(condition, at_min)
+                optimum = known.optimum(condition, at_min)
                 yield Score(
                     robot=body.name,
                     condition=condition.name,
@@ -212,11 +213,11 @@ def _scores(
                     low_95=_known(middle.low),
                     high_95=_known(middle.high),
                     random=known.random(condition, at_min),
-                    limit=None if limit is None else limit.best_return,
-                    limit_grid_error=None if limit is None else limit.grid_error,
-                    limit_run=None if limit is None else limit.monte_carlo,
-                    limit_run_standard_error=None if limit is None else limit.standard_error,
-                    limit_without_clock=None if limit is None else limit.without_clock,
+                    optimum=None if optimum is None else optimum.best_return,
+                    optimum_grid_error=None if optimum is None else optimum.grid_error,
+                    optimum_run=None if optimum is None else optimum.monte_carlo,
+                    optimum_run_standard_error=None if optimum is None else optimum.standard_error,
+                    optimum_without_clock=None if optimum is None else optimum.without_clock,
                     normalised_score=known.score(condition, at_min, mean),
                     score_without_clock=known.score(condition, at_min, mean, "without_clock"),
                 )
@@ -241,11 +242,11 @@ def outcome_of(told: Comparison) -> str:
     return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
 
 
-def _limit_error(limit: Limit | None) -> float | None:
+def _optimum_error(optimum: StudyOptimum | None) -> float | None:
     """How far the optimal return may lie from its value: by the grid, or down to the controller's return."""
-    if limit is None or limit.grid_error is None:
+    if optimum is None or optimum.grid_error is None:
         return None
-    return max(limit.grid_error, *(abs(each.value or 0.0) for each in limit.findings()), 0.0)
+    return max(optimum.grid_error, *(abs(each.value or 0.0) for each in optimum.findings()), 0.0)
 
 
 def _comparisons(
@@ -263,7 +264,7 @@ def _comparisons(
         known = references[robot]
         printed = PRINTED.get((compared.name, robot)) if study.paper else None
         outcome = outcome_of(told)
-        limits = [known.limit(condition, at_min) for condition in (first, second)]
+        optima = [known.optimum(condition, at_min) for condition in (first, second)]
         yield ComparedReturns(
             comparison=compared.name,
             robot=robot,
@@ -277,10 +278,10 @@ def _comparisons(
             score_first=known.score(first, at_min, float(a.mean())),
             score_second=known.score(second, at_min, float(b.mean())),
             random_second=known.random(second, at_min),
-            limit_first=None if limits[0] is None else limits[0].best_return,
-            limit_second=None if limits[1] is None else limits[1].best_return,
-            limit_error_first=_limit_error(limits[0]),
-            limit_error_second=_limit_error(limits[1]),
+            optimum_first=None if optima[0] is None else optima[0].best_return,
+            optimum_second=None if optima[1] is None else optima[1].best_return,
+            optimum_error_first=_optimum_error(optima[0]),
+            optimum_error_second=_optimum_error(optima[1]),
             u=told.u,
             p_normal=told.p_normal,
             p_exact=told.p_exact,
@@ -310,7 +311,7 @@ def _controls(study: Study, table: DataFrame, body: Body, known: References) -> 
                 means = mean_returns(of_agent)
                 # Over actors, as each is one sample; a control of one actor has its episodes for samples.
                 rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
-            limit = known.limit(kind, at_min)
+            optimum = known.optimum(kind, at_min)
             for name, actors, samples in rows:
                 mean = float(samples.mean())
                 yield ControlReturns(
@@ -323,7 +324,7 @@ def _controls(study: Study, table: DataFrame, body: Body, known: References) -> 
                     mean_return=mean,
                     standard_error=float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None,
                     random=known.random(kind, at_min),
-                    limit=None if limit is None else limit.best_return,
+                    optimum=None if optimum is None else optimum.best_return,
                     normalised_score=known.score(kind, at_min, mean),
                 )
 

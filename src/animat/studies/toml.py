@@ -15,6 +15,12 @@ from animat.studies.specification import Study
 
 MOST_BYTES = 2**20
 """Of a specification."""
+FORMER = {
+    "": {"limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
+    "robots": {"limit_resolution": "optimum_resolution"},
+    "simulators": {"despite": "allow"},
+}
+"""What keys are called in files of before, table by table (at the top: none)."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
@@ -38,9 +44,30 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
     try:
-        return read_record(Study, data)
+        return read_record(Study, _in_todays_words(data))
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
+
+
+def _in_todays_words(data: dict[str, Any]) -> dict[str, Any]:
+    """The same with former keys by their names of today; whatever else is wrong is left for the checks."""
+    data = _renamed(data, FORMER[""])
+    for name, names in FORMER.items():
+        table = data.get(name)
+        if isinstance(table, dict):
+            data[name] = _renamed(table, names)
+        elif isinstance(table, list):
+            data[name] = [_renamed(each, names) if isinstance(each, dict) else each for each in table]
+    return data
+
+
+def _renamed(table: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
+    found = {}
+    for key, value in table.items():
+        today = names.get(key, key)
+        # Where both are given, the former one is told as a key that is not known.
+        found[key if today in table else today] = value
+    return found
 
 
 def study_to_toml(study: Study) -> str:
