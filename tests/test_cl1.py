@@ -69,7 +69,7 @@ def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         found = other_culture(recording, recording.start_min, culture)
     assert recording.duration_s > 5
     assert found is not None and found.name == "other-culture"
-    assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.sentence
+    assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.message
 
 
 def pulse(*numbers: float) -> Pulse:

@@ -212,7 +212,7 @@ agents = controls(loop.robot, [c.label for c in frequencies], means=None)[:1]
 with CL1Culture(record_to="rig") as culture:
     session = run_session(culture, loop, agents, "session", episodes=2)
 if session.ending.by != "plan":
-    sys.exit(session.ending.sentence)
+    sys.exit(session.ending.message)
 recording = session.recording()
 tell(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
      hz=recording.stimuli.frequency_hz.tolist(), pattern=recording.stimuli.pattern.tolist())

@@ -321,7 +321,7 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
     with FakeCulture() as culture:
         session = run_session(culture, loop, [Agent("fixed", "", Fixed())], tmp_path / "one", episodes=1)
     assert session.ending.by == "controller"
-    assert "Done" in session.ending.sentence
+    assert "Done" in session.ending.message
     assert len(session.ticks) == 15
 
 
@@ -408,12 +408,12 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     loop, findings = Loop.of_policy(RecordedAs(Presentation("blocked", 1)), PERCENTILES)
     assert loop.pulses == 1
     assert [f.severity for f in findings] == ["warning"]
-    assert "blocked" in findings[0].sentence
+    assert "blocked" in findings[0].message
     _, findings = Loop.of_policy(RecordedAs(Presentation("mixed", 5)), PERCENTILES, pulses=2)
-    assert "5 pulse(s) per trial, the loop has 2" in findings[0].sentence
+    assert "5 pulse(s) per trial, the loop has 2" in findings[0].message
     loop, findings = Loop.of_policy(RecordedAs(None), PERCENTILES)
     assert loop.pulses == 1
-    assert "not known" in findings[0].sentence
+    assert "not known" in findings[0].message
     _, findings = Loop.of_policy(RecordedAs(Presentation("mixed")), PERCENTILES, window_ms=(3.0, 9.0))
     assert [f.name for f in findings] == ["other-window"]
     without = RecordedAs(Presentation("mixed"))

@@ -210,7 +210,7 @@ def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tu
     assert not np.any(in_window(found.time_s, traces.stimulus_time_s, (0, 1.4)))
     names = {finding.name: finding for finding in found.findings}
     assert names["blanked"].severity == "note"
-    assert "are saturated on average" in names["saturated-channels"].sentence
+    assert "are saturated on average" in names["saturated-channels"].message
 
 
 def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, ArrayTraces]) -> None:

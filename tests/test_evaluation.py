@@ -212,7 +212,7 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
     elsewhere = replace(held, provenance={**held.provenance, "simulators": {"recorded_at_min": [-10.0, 0.0]}})
     noticed = evaluate({"a": elsewhere}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-percentiles")
-    assert "held from the recording at -10 min, which is not the first of these" in finding.sentence
+    assert "held from the recording at -10 min, which is not the first of these" in finding.message
     with pytest.raises(Mismatch, match="b: expected the same percentiles as a"):
         evaluate({"a": moving, "b": held}, timeline)
 
@@ -239,7 +239,7 @@ def test_simulators_made_otherwise_than_in_training_are_told() -> None:
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
     noticed = evaluate({"a": policy}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
-    assert finding.sentence.endswith("made otherwise: bins 40, here 20")
+    assert finding.message.endswith("made otherwise: bins 40, here 20")
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
     noticed = evaluate({"a": alike}, timeline, episodes=50).findings
     assert "other-simulator" not in {each.name for each in noticed}

@@ -231,7 +231,7 @@ def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path)
             found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert len(found.recordings) == 3
     assert len(found.swaps) == 1
-    assert [line["sentence"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
+    assert [line["message"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
 
 
 class Pressing:
@@ -278,7 +278,7 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
         assert lines(tmp_path / "live")[-1]["budget"]["pulses"] == culture.pulses == 2 * PULSES
     told = lines(tmp_path / "live")
     assert [line["what"] for line in told[-2:]] == ["fault", "end"]
-    assert told[-2]["sentence"] == "DeviceFailed: gone"
+    assert told[-2]["message"] == "DeviceFailed: gone"
     policies = load_policies(tmp_path / "live" / "policies")
     assert list(policies) == ["p0"]
     assert all(len(policy.learning_curve) for policy in policies.values())
@@ -302,7 +302,7 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
         assert culture.is_stopped
     written = lines(tmp_path / "live")
     assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
-    assert told in written[-2]["sentence"]
+    assert told in written[-2]["message"]
     assert f"ended before its time ({told}" in (what_stands(tmp_path / "live") or "")
 
 

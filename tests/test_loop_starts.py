@@ -125,5 +125,5 @@ def test_a_robot_that_cannot_start_ends_the_session(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         session = run_session(culture, loop_of(robot=Lost()), [RANDOM], tmp_path, episodes=1)
         assert session.ending.by == "robot"
-        assert "the robot starts at [nan, " in session.ending.sentence
+        assert "the robot starts at [nan, " in session.ending.message
         assert culture.pulses == 0

@@ -316,8 +316,8 @@ def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> 
         "empirical": "there are none",
         "memory": "similar history is drawn",
     }
-    for other, sentence in words.items():
-        assert any(sentence in text for text in said.values()) == (other == kind)
+    for other, message in words.items():
+        assert any(message in text for text in said.values()) == (other == kind)
 
 
 def test_an_animat_remembers() -> None:

@@ -226,9 +226,9 @@ def test_a_value_that_its_controller_does_not_get_is_told() -> None:
     assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
     assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # nothing is drawn: the two are alike as they are printed
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
-    assert "between the two" in above.sentence and above.value == pytest.approx(2.1)
+    assert "between the two" in above.message and above.value == pytest.approx(2.1)
     (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)
-    assert "too rough" in below.sentence
+    assert "too rough" in below.message
 
 
 def test_a_grid_too_rough_is_noticed() -> None:

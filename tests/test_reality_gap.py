@@ -201,9 +201,9 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
         gap = run_policies({"p0": policy_of(0, series)}, culture, few, tmp_path, episodes=1, with_controls=False)
     told = json.loads(json.dumps(gap.to_dict()))
     assert (told["optimum"], told["gap_share"]) == (None, None)
-    (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-optimum"]
-    assert sentence == "no optimal return: these conditions have too few responses: 80 Hz (3)"
-    assert sentence in gap.to_text() and "optimal return on this" not in gap.to_text()
+    (message,) = [finding.message for finding in gap.findings if finding.name == "no-optimum"]
+    assert message == "no optimal return: these conditions have too few responses: 80 Hz (3)"
+    assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
 @pytest.mark.usefixtures("few_redrawn")
@@ -397,9 +397,9 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
                 episodes=1,
                 with_controls=False,
             )
-        warnings = [f.sentence for f in gap.findings if f.name == "no-memory"]
+        warnings = [f.message for f in gap.findings if f.name == "no-memory"]
         assert len(warnings) == warned
-        assert all("66 %" in sentence and "--simulator memory" in sentence for sentence in warnings)
+        assert all("66 %" in message and "--simulator memory" in message for message in warnings)
         assert not any(f.name == "other-simulator" for f in gap.findings)
     trained = {"simulators": {"kind": "empirical", "bins": None, "range_hz": None}}
     with FakeCulture() as culture:
@@ -407,7 +407,7 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
         gap = run_policies(
             {"p": policy}, culture, Calibration.of_series(found), tmp_path / "other", episodes=1, with_controls=False
         )
-    (other,) = (f.sentence for f in gap.findings if f.name == "other-simulator")
+    (other,) = (f.message for f in gap.findings if f.name == "other-simulator")
     assert "kind empirical, here memory" in other
     with pytest.raises(Mismatch, match="the same fitted as p"):
         check_policies({"p": policy, "q": policy_of(0, series)})
@@ -569,7 +569,7 @@ def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series
         with pytest.raises(Mismatch, match="80 Hz, 40 Hz"):
             run_policies({"a": wrong}, culture, calibration, tmp_path)
         gap = run_policies({"b": other}, culture, calibration, tmp_path, episodes=1, with_controls=False)
-    assert "from a recording presented mixed, 2 pulses" in gap.findings[0].sentence
+    assert "from a recording presented mixed, 2 pulses" in gap.findings[0].message
     assert gap.loop.pulses == 5
 
 

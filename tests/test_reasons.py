@@ -124,7 +124,7 @@ def test_a_reason_is_named_with_its_number_where_the_session_has_it(name: str) -
     assert len(CASES) == len(CHECKS)
     others = []
     for seed in range(20):
-        named = {found.name: found.sentence for found in reasons(session(seed, **changed))}
+        named = {found.name: found.message for found in reasons(session(seed, **changed))}
         assert words in named.pop(name)
         # What is changed may show in the share that passes P50 too.
         others += [other for other in named if other != "answers"]
@@ -210,6 +210,6 @@ def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
     assert check(on_halves(same, same)) is None
     found, alone = check(on_halves(same, other)), check(other)
     assert found is not None and alone is not None
-    assert "80 Hz on right in " in found.sentence and "on left" not in found.sentence
+    assert "80 Hz on right in " in found.message and "on left" not in found.message
     # What is told of it is what would be told of it alone.
-    assert found.sentence.replace(" on right", "") == alone.sentence
+    assert found.message.replace(" on right", "") == alone.message

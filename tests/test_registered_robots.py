@@ -152,8 +152,8 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
     assert read_study(package / "study.toml") == study and study.robots[0].kind == ROVER
     ran = run_study(study, package / "study", workers=1)
     page = ran.report.read_text()
-    for sentence in lacking(robot_named("rover")).values():
-        assert sentence in page
+    for message in lacking(robot_named("rover")).values():
+        assert message in page
     assert not list((package / "study" / "figures").glob("rover-frames*"))
 
 

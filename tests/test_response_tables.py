@@ -260,4 +260,4 @@ def test_rows_without_times_drift_in_their_order(tmp_path: Path) -> None:
         if name == "rising":
             # From 0.5 to 1.5 of the mean.
             assert found["drift"].value == pytest.approx(1.0, abs=0.1)
-            assert "in the order of the rows" in found["drift"].sentence
+            assert "in the order of the rows" in found["drift"].message

@@ -108,7 +108,7 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
     options = [word.replace("{state}", str(series / STATE_FILE)) for word in more]
     assert run(tmp_path / "session", policy_of(0), recordings, *options) == 0
     printed = capsys.readouterr()
-    found = {f["name"]: f["sentence"] for f in json.loads(printed.out.splitlines()[-1])["findings"]}
+    found = {f["name"]: f["message"] for f in json.loads(printed.out.splitlines()[-1])["findings"]}
     assert ("other-culture" in found) == bool(words)
     assert words in found.get("other-culture", "")
     before_the_first_pulse = printed.err.split("the session is planned for")[0]

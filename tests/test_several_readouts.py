@@ -137,7 +137,7 @@ def test_percentiles_and_shares_are_of_each_readout() -> None:
 def test_what_a_range_loses_is_told_with_its_readout() -> None:
     kept = fidelity(of_halves(), fit_simulator(of_halves(), kind="histogram", bins=2, range_hz=200.0))
     (finding,) = [each for each in kept.findings() if each.name == "binning"]
-    assert " Hz on left from " in finding.sentence or " Hz on right from " in finding.sentence
+    assert " Hz on left from " in finding.message or " Hz on right from " in finding.message
 
 
 def test_timelines_stack_them_and_refuse_others() -> None:

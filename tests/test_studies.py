@@ -874,7 +874,7 @@ def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
     Record(study, tmp_path).run(tmp_path / "study", Silent())
     kept, _ = Fit(study).run(tmp_path / "study", Silent())
     (told,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
-    assert told.sentence == "before and after was asked for at 29 min and is made on the recording at 30 min"
+    assert told.message == "before and after was asked for at 29 min and is made on the recording at 30 min"
     with pytest.raises(InvalidArgument, match="at_min"):
         Fit(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
 

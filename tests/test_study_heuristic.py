@@ -34,8 +34,8 @@ def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
         assert np.isclose(row.p, mannwhitneyu(a, b, method="asymptotic").pvalue)
         assert np.isclose(row.mean_return, np.mean(a)) and np.isclose(row.heuristic, np.mean(b))
 
-    sentences = not_outperforming(Results((), (), (), rows, (), ()))
-    assert [sentence.split(": ")[0] for sentence in sentences] == [
+    messages = not_outperforming(Results((), (), (), rows, (), ()))
+    assert [message.split(": ")[0] for message in messages] == [
         "cartpole, 1 threshold, at 10 min",
         "cartpole, 1 threshold, at 20 min",
     ]

@@ -45,7 +45,7 @@ def without_frequencies(source: Recording) -> Recording:
 
 
 def said(source: Recording) -> str | None:
-    return next((f.sentence for f in noticed(source) if f.name == "times-not-in-seconds"), None)
+    return next((f.message for f in noticed(source) if f.name == "times-not-in-seconds"), None)
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -147,14 +147,14 @@ def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
     swapped = of_spikes([(t, 0) for t in few], many, 1, source.duration_s)
     names = {f.name: f for f in noticed(swapped)}
     assert names["more-stimuli-than-spikes"].severity == "refuse"
-    assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].sentence
+    assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].message
     # One unit, of which 70 % of the stimuli have one spike.
     sparse = of_spikes([(t + 0.005, 0) for t in many[:140]], many, 1, source.duration_s + 1)
     assert {f.severity for f in noticed(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
     twice = np.repeat(source.stimuli.time_s, 2)
     spikes = list(zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True))
     names = {f.name: f for f in noticed(of_spikes(spikes, twice, 40, source.duration_s))}
-    assert names["simultaneous-stimuli"].sentence.startswith("120 of 240 stimuli")
+    assert names["simultaneous-stimuli"].message.startswith("120 of 240 stimuli")
     assert names["simultaneous-stimuli"].severity == "refuse"
     # Rows that belong to one presentation are read once.
     one = of_spikes(spikes, twice, 40, source.duration_s, presentation=np.repeat(np.arange(120), 2).tolist())
@@ -165,7 +165,7 @@ def contradicted(stated_hz: np.ndarray) -> str | None:
     source = make_up_recording(1, start_min=0.0, patterns=25, channels=16)
     stimuli = dataclasses.replace(source.stimuli, frequency_hz=stated_hz[: len(source.stimuli)])
     found = noticed(dataclasses.replace(source, stimuli=stimuli))
-    return next((f.sentence for f in found if f.name == "other-frequencies"), None)
+    return next((f.message for f in found if f.name == "other-frequencies"), None)
 
 
 def test_frequencies_of_other_stimuli_are_warned_of() -> None:

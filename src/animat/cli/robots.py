@@ -39,8 +39,8 @@ class Robots:
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
                 print(f"  takes {robot['commands']} commands: train it with as many --readouts, or --mapping none")
-            for sentence in (*robot["lacks"].values(), *robot["caveats"]):
-                print(f"  {sentence}")
+            for message in (*robot["lacks"].values(), *robot["caveats"]):
+                print(f"  {message}")
         for name, why in unusable.items():
             print(f"{name} cannot be used: {why}")
         return {"robots": listed, "unusable": unusable}

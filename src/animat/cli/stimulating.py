@@ -51,6 +51,6 @@ def expect_no_fault(session: Session, folder: Path) -> None:
     if ending.by == "person":
         raise KeyboardInterrupt
     if ending.by != "plan":
-        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
+        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.message}")
     if not session.recording_file.is_file():
-        raise InvalidFile(ending.sentence)
+        raise InvalidFile(ending.message)

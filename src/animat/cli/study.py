@@ -64,8 +64,8 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
     if cells:
         print("\n".join(lined_up(["", "first", "second", "U", "p", ""], cells)))
     beside = not_outperforming(results)
-    for sentence in beside:
-        print(sentence)
+    for message in beside:
+        print(message)
     if ran.done_now:
         print(f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s; report: {ran.report}")
     else:

@@ -33,7 +33,7 @@ class Stop(Exception):
     """The session is over before its plan is done."""
 
     def __init__(self, ending: Ending) -> None:
-        super().__init__(ending.sentence)
+        super().__init__(ending.message)
         self.ending = ending
 
 
@@ -347,7 +347,7 @@ class Driver:
 
     def _note_fault(self, ending: Ending, asked: Asked, **more: Any) -> None:
         """Have it written down that what was asked came to no answer that can be used."""
-        words = {"kind": "event", "what": ending.by, "sentence": ending.sentence, **asked.to_dict(), **more}
+        words = {"kind": "event", "what": ending.by, "message": ending.message, **asked.to_dict(), **more}
         self.records.append(Record(words))
 
     def _expect(self, who: str, in_s: float = 0.0) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-_RECORD = {"contenders": "agents"}
+_RECORD = {"contenders": "agents", "sentence": "message"}
 _LOOP = {"lead_in": "warm_up", "following": "adaptive"}
 _TICK = {"contender": "agent"}
 _HANDLED = {"lead-in": "warm-up"}

@@ -68,7 +68,7 @@ class Gathered:
             "session_description": _described(header),
             "recorded_at": header.recorded_at,
             "closed_loop": header.loop,
-            "closed_loop_ended": f"{ending.by}: {ending.sentence}",
+            "closed_loop_ended": f"{ending.by}: {ending.message}",
             "closed_loop_unanswered_pulses": str(unanswered_pulses(outline)),
         }
         if outline.left_out:

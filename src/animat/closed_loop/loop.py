@@ -227,6 +227,6 @@ class Loop:
 def _differences(policy: Trained, loop: Loop) -> tuple[Finding, ...]:
     findings = list(other_presentation(policy.presentation, loop.presentation))
     if policy.window_ms is not None and policy.window_ms != loop.window_ms:
-        sentence = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
-        findings.append(Finding("other-window", "warning", sentence))
+        message = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
+        findings.append(Finding("other-window", "warning", message))
     return tuple(findings)

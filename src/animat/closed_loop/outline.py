@@ -117,7 +117,7 @@ class Outline:
         elif kind == "start":
             self._starts[words["episode"]] = tuple(words["observation"])
         elif kind == "end":
-            self.ending = Ending(words["by"], words["sentence"])
+            self.ending = Ending(words["by"], words["message"])
             self.left_out = words.get("left_out", {})
 
     def _add_tick(self, tick: Mapping[str, Any]) -> None:

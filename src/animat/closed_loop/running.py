@@ -111,8 +111,8 @@ def run_session(
         except Exception as error:
             # What was measured comes back, whatever its files are like.
             told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
-            sentence = f"{ending.sentence}; and {told} (animat recover {folder} makes them again)"
-            session = replace(session, ending=replace(ending, sentence=sentence))
+            message = f"{ending.message}; and {told} (animat recover {folder} makes them again)"
+            session = replace(session, ending=replace(ending, message=message))
     return session
 
 
@@ -220,8 +220,8 @@ class _Supervisor:
     def _finish(self, ending: Ending) -> Ending:
         """Write what is left, and how it ended."""
         if self._not_halted is not None:
-            sentence = f"{ending.sentence}; BUT {self._not_halted}: see to it that the device gives no more pulses"
-            ending = replace(ending, sentence=sentence)
+            message = f"{ending.message}; BUT {self._not_halted}: see to it that the device gives no more pulses"
+            ending = replace(ending, message=message)
         try:
             # Looked at first: a robot that comes back just now has its tick among those that are written.
             unfinished = self._driver.unfinished
@@ -229,13 +229,13 @@ class _Supervisor:
             if unfinished is not None and unfinished.words["stretch"] > self._seen:
                 self._append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
-            words = {"kind": "end", "by": ending.by, "sentence": ending.sentence, "left_out": left_out}
+            words = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
             self._append(Record(words))
             self._log.sync()
         except OSError as error:
             left = len(self._driver.records)
-            sentence = f"{ending.sentence}; {left} ticks could not be written: {error.strerror or error}"
-            return Ending("disk" if ending.by in ("plan", "budget") else ending.by, sentence)
+            message = f"{ending.message}; {left} ticks could not be written: {error.strerror or error}"
+            return Ending("disk" if ending.by in ("plan", "budget") else ending.by, message)
         return ending
 
     def _stop_for_a_person(self) -> None:
@@ -245,7 +245,7 @@ class _Supervisor:
     def _halt(self, ending: Ending) -> None:
         """Stop the culture, from a thread of its own: a backend that hangs must not hang the end as well."""
         self._not_halted = f"the culture did not say within {_GRACE_S:g} s that it is stopped"
-        halting = threading.Thread(target=self._halt_now, args=(ending.sentence,), daemon=True)
+        halting = threading.Thread(target=self._halt_now, args=(ending.message,), daemon=True)
         halting.start()
         halting.join(_GRACE_S)
 

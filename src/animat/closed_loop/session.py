@@ -157,7 +157,7 @@ class Session:
         outline = self.outline
         return {
             "ended_by": self.ending.by,
-            "ended": self.ending.sentence,
+            "ended": self.ending.message,
             "episodes": len(outline.episodes),
             "ticks": outline.ticks,
             "pulses": outline.pulses,
@@ -199,7 +199,7 @@ def read_session(path: str | os.PathLike[str]) -> Session:
     last = log.records[-1].words if len(log.records) else {}
     with expecting_a_session(file):
         if last.get("kind") == "end":
-            ending = Ending(last["by"], last["sentence"])
+            ending = Ending(last["by"], last["message"])
     return Session(file.parent, log, ending)
 
 

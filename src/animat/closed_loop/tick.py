@@ -87,8 +87,8 @@ class Ending:
         by: `"plan"`, all episodes were run; else what ended it before: the budget, a person (Ctrl-C), a fault of the
             culture, the silence of whoever should have answered (`"hang"`), a late pulse where that should stop, the
             robot, the controller, the disk; `"crash"` where nothing was written about it.
-        sentence: what happened.
+        message: what happened.
     """
 
     by: EndedBy
-    sentence: str
+    message: str

@@ -171,7 +171,7 @@ class Evaluation:
             if self.not_met != (transfer.UNKNOWN,):
                 known = "a closed loop on the culture would not meet these returns"
             lines.append(f"  {known}: see the warnings ({', '.join(self.not_met)})")
-        lines += [f"  {finding.sentence}" for finding in self.findings if finding.name == "no-heuristic"]
+        lines += [f"  {finding.message}" for finding in self.findings if finding.name == "no-heuristic"]
         return "\n".join([*lines, *self._optimum_lines()])
 
     def _optimum_lines(self) -> list[str]:

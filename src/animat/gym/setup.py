@@ -134,7 +134,7 @@ def _simulator_of(
 ) -> tuple[NeuronSimulator, tuple[str, ...]]:
     by = None if conditions is None else conditions_named(conditions)
     timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=readouts), kind=kind)
-    for sentence in warnings_once(timeline.findings):
-        warnings.warn(sentence, stacklevel=3)
+    for message in warnings_once(timeline.findings):
+        warnings.warn(message, stacklevel=3)
     row = 0 if at_min is None else timeline.row_asked_for(at_min)
     return timeline.at(timeline.start_min[row]), tuple(condition.label for condition in timeline.conditions)

@@ -225,7 +225,7 @@ class _Run:
         with suppress(Exception):
             self._culture.stop(told)
         with suppress(InvalidFile):
-            self.write("interrupted" if is_person else "fault", sentence=told)
+            self.write("interrupted" if is_person else "fault", message=told)
 
     def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
         published, in_budget = 0, True
@@ -236,7 +236,7 @@ class _Run:
             try:
                 timeline = self._record(number)
             except BudgetSpent as spent:
-                self.write("budget", sentence=str(spent))
+                self.write("budget", message=str(spent))
                 in_budget = False
                 continue
             if timeline is not None:
@@ -269,7 +269,7 @@ class _Run:
             series = [*self.used, *extract_series([recording])]
             timeline = self._fit(series)
         except (UnusableData, Mismatch) as error:
-            self.write("unusable", file=file.name, sentence=str(error))
+            self.write("unusable", file=file.name, message=str(error))
             return None
         self.used = series
         self.write(

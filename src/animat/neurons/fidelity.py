@@ -58,8 +58,8 @@ class Fidelity:
             changed = f"changes P(x >= P50) of {of} from {self.in_data[worst]:.2f} to {self.in_simulator[worst]:.2f}"
             value = float(loss[worst])
             if of_memory:
-                sentence = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
-                found.append(Finding("few-neighbours", "warning", sentence, value))
+                message = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
+                found.append(Finding("few-neighbours", "warning", message, value))
             else:
                 remedy = (
                     "leave the range out (edges are then percentiles), or take more bins or the empirical simulator"

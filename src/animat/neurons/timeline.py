@@ -160,7 +160,7 @@ def fit_timeline(
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(
-        replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}", at_min=responses.start_min)
+        replace(finding, message=f"at {responses.start_min:g} min: {finding.message}", at_min=responses.start_min)
         for responses, kept in zip(ordered, fidelities, strict=True)
         for finding in (*responses.findings, *kept.findings(of_memory=kind == "memory"))
     )

@@ -91,11 +91,11 @@ def bursts(evidence: Evidence) -> Finding | None:
     count, n = int(is_burst.sum()), len(is_burst)
     if count < max(_FEWEST_BURSTS, LEAST_BURSTS * n):
         return None
-    sentence = (
+    message = (
         f"{100 * count / n:.0f} % of {n} responses were bursts ({100 * evidence.calibration.burst_share:.0f} % in the "
         "recording), which the prediction leaves out"
     )
-    return _reason("bursts", sentence, count / n)
+    return _reason("bursts", message, count / n)
 
 
 def trend(evidence: Evidence) -> Finding | None:
@@ -134,11 +134,11 @@ def trend(evidence: Evidence) -> Finding | None:
             )
     if not told:
         return None
-    sentence = (
+    message = (
         f"the culture changed over the session's {answers.span_min:.0f} min: responses {', '.join(told)} (of their "
         f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
-    return _reason("trend", sentence, most)
+    return _reason("trend", message, most)
 
 
 def memory(evidence: Evidence) -> Finding | None:
@@ -146,7 +146,7 @@ def memory(evidence: Evidence) -> Finding | None:
     if evidence.calibration.simulator.has_memory:
         return None
     found = next(memory_findings(evidence.answered.responses), None)
-    return None if found is None else _reason("memory", found.sentence, found.value)
+    return None if found is None else _reason("memory", found.message, found.value)
 
 
 def answers(evidence: Evidence) -> Finding | None:
@@ -213,5 +213,5 @@ def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
     return evidence.answered.responses.conditions
 
 
-def _reason(name: str, sentence: str, value: float | None = None) -> Finding:
-    return Finding(name, "note", sentence, value)
+def _reason(name: str, message: str, value: float | None = None) -> Finding:
+    return Finding(name, "note", message, value)

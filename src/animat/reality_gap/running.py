@@ -105,23 +105,23 @@ def run_policies(
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":
-        sentence = (
+        message = (
             "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
             "what they choose is delivered"
         )
-        findings += (Finding("trained-as-control", "warning", sentence),)
+        findings += (Finding("trained-as-control", "warning", message),)
     if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
-        sentence = (
+        message = (
             "episodes begin after a rest (--warm-up 0), and those of the simulator as after stimuli of all conditions: "
             "the measured return will be less than predicted"
         )
-        findings += (Finding("no-warm-up", "warning", sentence),)
+        findings += (Finding("no-warm-up", "warning", message),)
     if adaptive and first.percentiles == "first":
-        sentence = (
+        message = (
             "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
             "--thresholds fixed they are as in training"
         )
-        findings += (Finding("moving-percentiles", "warning", sentence),)
+        findings += (Finding("moving-percentiles", "warning", message),)
     findings += (
         *other_simulator(first.fitted, calibration.fitted),
         *old_calibration(calibration.start_min, culture.now_s / 60),
@@ -176,8 +176,8 @@ def run_policies(
     findings = (*noticed, *findings, *calibration.findings)
     if tell is not None:
         # Before the first pulse: whoever stands at the rig may think better of it.
-        for sentence in warnings_once(findings):
-            tell(f"warning: {sentence}")
+        for message in warnings_once(findings):
+            tell(f"warning: {message}")
         tell(str(ahead))
     session = run_session(
         culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=progress

@@ -166,7 +166,7 @@ class RealityGap:
             )
         said = f"; their measured return is {_more_or_less(row.gap.value)} than predicted"
         if self.reasons:
-            return f"{said}: {'; '.join(reason.sentence for reason in self.reasons)}"
+            return f"{said}: {'; '.join(reason.message for reason in self.reasons)}"
         return f"{said}, and nothing in the session's data explains it (looked for: {', '.join(CHECKS)})"
 
     def to_dict(self) -> dict[str, Any]:
@@ -215,9 +215,7 @@ class RealityGap:
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
             lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
-        lines += [
-            f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")
-        ]
+        lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies' returns are no other than this control's; stimulation: {self.account}")

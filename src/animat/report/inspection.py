@@ -57,7 +57,7 @@ def inspection_text(inspection: Inspection) -> str:
         )
         lines += ["", *_table(inspection)]
     if inspection.findings:
-        lines += ["", *(f"  {_MARK[finding.severity]} {finding.sentence}" for finding in inspection.findings)]
+        lines += ["", *(f"  {_MARK[finding.severity]} {finding.message}" for finding in inspection.findings)]
     return "\n".join(lines)
 
 

@@ -252,7 +252,7 @@ def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> t
     """
     in_responses = [f for f in responses.findings if f.name != "no-stimuli"]
     names = {finding.name for finding in in_responses}
-    findings = {f.name + f.sentence: f for f in in_responses}
-    findings |= {f.name + f.sentence: f for f in noticed(source) if f.name not in names}
+    findings = {f.name + f.message: f for f in in_responses}
+    findings |= {f.name + f.message: f for f in noticed(source) if f.name not in names}
     gravity = {"refuse": 0, "warning": 1, "note": 2}
     return tuple(sorted(findings.values(), key=lambda finding: gravity[finding.severity]))

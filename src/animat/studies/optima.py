@@ -51,13 +51,13 @@ def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOp
 
 def left_out(study: Study) -> list[str]:
     """What its robots cannot do, and the study is without: a sentence each."""
-    sentences: list[str] = []
+    messages: list[str] = []
     for robot in dict.fromkeys(body.robot() for body in study.robots):
         lacks = lacking(robot)
         if (why_not := no_grid(robot)) is not None:
             lacks.setdefault("value_grid", f"no optimal return: {why_not}")
-        sentences += lacks.values()
-    return sentences
+        messages += lacks.values()
+    return messages
 
 
 @final

@@ -221,7 +221,7 @@ def _done(study: Study, results: Results) -> Section:
         ),
     ]
     points.append(("Evaluation", _ACTIONS[study.actions]))
-    points += [("Left out", f"{finding.sentence}.") for finding in results.findings if finding.name == LEFT_OUT]
+    points += [("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT]
     for condition in study.conditions:
         said = [f"mapping {condition.mapping}" if condition.through_neurons else "the robot is moved directly"]
         if condition.through_neurons:
@@ -261,7 +261,7 @@ def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity])
 def _noticed(results: Results) -> Section:
     grave = [finding for finding in results.findings if finding.severity != "note"]
     notes = len(results.findings) - len(grave)
-    shown = tuple((finding.name, finding.sentence) for finding in grave)
+    shown = tuple((finding.name, finding.message) for finding in grave)
     said = (
         f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the optima; all "
         "are in tables/findings.csv."

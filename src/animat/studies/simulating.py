@@ -144,7 +144,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             window_ms=tuple(told["window_ms"]),
             presentation=None if presentation is None else Presentation(**presentation),
             fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n) for a, b, n in kept),
-            findings=tuple(Finding(**each) for each in told["findings"]),
+            findings=tuple(Finding.from_dict(each) for each in told["findings"]),
             fitted=told["fitted"],
         )
     except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:

@@ -86,8 +86,8 @@ class Tabulate(StudyTask):
             ("optima", StudyOptimum),
         ):
             files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
-        told = ((finding.severity, finding.name, finding.sentence) for finding in results.findings)
-        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "sentence"), told))
+        told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
+        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
@@ -112,9 +112,9 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
     for optimum in optima:
         where = f"{optimum.robot}, {named_mapping(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
         for told in optimum.findings():
-            yield replace(told, sentence=f"{where}: {told.sentence}")
-    for sentence in left_out(study):
-        yield Finding(LEFT_OUT, "note", sentence)
+            yield replace(told, message=f"{where}: {told.message}")
+    for message in left_out(study):
+        yield Finding(LEFT_OUT, "note", message)
 
 
 def _controllability(timeline: SimulatorTimeline) -> Iterator[tuple[Any, ...]]:
