@@ -24,8 +24,8 @@ from animat.closed_loop.agents import (
     controls,
     interleaved,
 )
-from animat.closed_loop.body import Body
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.closed_loop.tick import Tick
@@ -489,10 +489,10 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
     """Commands of full power by the rule, and by the rule turned round."""
     lasted = {}
     for sign in (1, -1):
-        body = Body(robot, np.random.default_rng(1))
-        observation, total = body.reset(0), 0.0
+        runner = RobotRunner(robot, np.random.default_rng(1))
+        observation, total = runner.reset(0), 0.0
         for _ in range(robot.episode_limit):
-            moved = body.step(sign * robot.heuristic(observation))
+            moved = runner.step(sign * robot.heuristic(observation))
             observation, total = moved.observation, total + moved.reward
             if moved.terminated:
                 break

@@ -353,12 +353,12 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
 
     broken = Broken(how)
 
-    class BrokenBody(driver.Body):
+    class BrokenRunner(driver.RobotRunner):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             self.step = broken(self.step)  # type: ignore[method-assign]
 
-    monkeypatch.setattr(driver, "Body", BrokenBody)
+    monkeypatch.setattr(driver, "RobotRunner", BrokenRunner)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "robot"
@@ -375,7 +375,7 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
 
     released, steps = threading.Event(), [0]
 
-    class StuckBody(driver.Body):
+    class StuckRunner(driver.RobotRunner):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             step = self.step
@@ -388,7 +388,7 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
 
             self.step = stuck  # type: ignore[method-assign]
 
-    monkeypatch.setattr(driver, "Body", StuckBody)
+    monkeypatch.setattr(driver, "RobotRunner", StuckRunner)
     monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
     with FakeCulture() as culture:
         try:

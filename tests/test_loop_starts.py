@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import kstest
 
 from animat.closed_loop.agents import Agent, InTurn
-from animat.closed_loop.body import Body
+from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
 from animat.robots import Navigation, Robot
@@ -97,9 +97,9 @@ def test_each_episode_starts_where_the_robot_draws_it(tmp_path: Path) -> None:
 
 
 def test_the_starts_are_those_of_the_robots_own_distribution() -> None:
-    body = Body(Anywhere(), np.random.default_rng(1))
-    starts = np.array([body.reset(number) for number in range(400)])
-    np.testing.assert_array_equal(body.reset(7), starts[7])
+    runner = RobotRunner(Anywhere(), np.random.default_rng(1))
+    starts = np.array([runner.reset(number) for number in range(400)])
+    np.testing.assert_array_equal(runner.reset(7), starts[7])
     for column, (low, width) in zip(starts.T, ((0, 1), (0, 1), (-np.pi, 2 * np.pi)), strict=True):
         assert kstest(column, "uniform", (low, width)).pvalue > 1e-3
 

@@ -108,9 +108,12 @@ allow = ["dead-window"]
 [[robots]]
 name = "navigation"
 optimum_resolution = 0.4
+[[arms]]
+name = "linear"
+mapping = "linear"
 """
     today.write_text(text)
-    former.write_text(text.replace("optimum", "limit").replace("allow", "despite"))
+    former.write_text(text.replace("optimum", "limit").replace("allow", "despite").replace("arms", "conditions"))
     assert read_study(former) == read_study(today)
     former.write_text("limit_resolution = 0.5\noptimum_resolution = 0.5\n")
     with pytest.raises(InvalidFile, match="limit_resolution: no such setting at the top"):

@@ -37,7 +37,7 @@ from animat.robots import (
 from animat.robots.capabilities import WITHOUT, lacking
 from animat.studies.run import run_study
 from animat.studies.source import Source
-from animat.studies.specification import Body, Study
+from animat.studies.specification import RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -142,7 +142,7 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
     robot_named(ROVER)
     study = Study(
         culture=Source("made-up", sessions=1, presentations=40, channels=16),
-        robots=(Body("rover", iterations=240),),
+        robots=(RobotSpec("rover", iterations=240),),
         policies=1,
         episodes=2,
         episodes_over_time=2,
@@ -288,7 +288,7 @@ def test_a_bad_robot_ends_in_a_line_before_anything_is_read_or_recorded(
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1 and re.search(words, said[0])
     with pytest.raises(InvalidArgument, match=words):
-        run_study(Study(robots=(Body("rover", kind=at),)), package / "study")
+        run_study(Study(robots=(RobotSpec("rover", kind=at),)), package / "study")
     assert not list((package / "study").glob("recordings/*"))
 
 

@@ -26,7 +26,7 @@ from animat.studies.publishing import _as_in_paper
 from animat.studies.results import ComparedReturns, Score, StudyOptimum, write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.source import Source
-from animat.studies.specification import Body, Simulators, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
@@ -85,7 +85,7 @@ def test_a_comparison_knows_what_its_optimum_says() -> None:
     assert "leaves room" in explain(replace(ROW, optimum_second=100.0))
 
 
-def test_there_is_room_as_long_as_the_second_optimum_is_far_above_the_first_condition() -> None:
+def test_there_is_room_as_long_as_the_second_optimum_is_far_above_the_first_arm() -> None:
     """The first is near its own optimum of 60; the second could have 100, and has a third of the way."""
     row = replace(ROW, optimum_first=60.0, optimum_second=100.0, mean_first=56.0, score_first=0.97, score_second=0.3)
     assert "no room" not in explain(row)
@@ -133,12 +133,12 @@ def test_decisions_follow_a_changed_study() -> None:
     changed = replace(
         paper_study(),
         robots=(
-            Body("cartpole", parameters={"pole_mass_kg": 0.55, "angle_limit_rad": 0.4}),
-            Body("navigation", parameters={"episode_limit": 20}),
+            RobotSpec("cartpole", parameters={"pole_mass_kg": 0.55, "angle_limit_rad": 0.4}),
+            RobotSpec("navigation", parameters={"episode_limit": 20}),
         ),
         culture=Source("files", files=("mine",)),
         simulators=Simulators(bins=40, range_hz=60.0),
-        conditions=paper_study().conditions[:2],
+        arms=paper_study().arms[:2],
         comparisons=(),
         actions="drawn",
     )
@@ -153,7 +153,7 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "Nine levels without zero" not in told and "Most probable actions" not in told
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
-    alone = dict(decisions(replace(changed, robots=(Body("navigation"),))))
+    alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
     assert "Pole mass" not in alone
 
 
@@ -162,25 +162,25 @@ def test_decisions_follow_a_changed_study() -> None:
 
 def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
     """The pole mass as printed beside the simulator's, in one study."""
-    printed = Body("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
-    study = Study(robots=(Body("cartpole"), printed))
+    printed = RobotSpec("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
+    study = Study(robots=(RobotSpec("cartpole"), printed))
     assert printed.robot() == Cartpole(pole_mass_kg=0.55)
     assert printed.trained_for == Cartpole().paper_iterations
     (tmp_path / "study.toml").write_text(study_to_toml(study))
     assert read_study(tmp_path / "study.toml") == study
     names = [job.name for job in plan_study(study, tmp_path)]
     assert len(set(names)) == len(names) and "train/as printed/1-threshold/p0" in names
-    assert training_of(study, printed, StudyCondition("a", mapping="none")).commands == (-1.0, 1.0)
+    assert training_of(study, printed, Arm("a", mapping="none")).commands == (-1.0, 1.0)
     told = [words for name, words in decisions(study) if name == "Pole mass"]
     assert len(told) == 2 and "0.55 kg, chosen" in told[1]
     with pytest.raises(InvalidArgument, match="expected each name once"):
-        Study(robots=(Body("cartpole"), Body("cartpole", parameters={"pole_mass_kg": 0.55})))
+        Study(robots=(RobotSpec("cartpole"), RobotSpec("cartpole", parameters={"pole_mass_kg": 0.55})))
     with pytest.raises(InvalidArgument, match=r"^name: expected letters"):
-        Body("a/b", kind="cartpole")
+        RobotSpec("a/b", kind="cartpole")
     with pytest.raises(InvalidArgument, match="culture"):
-        Body("culture", kind="cartpole")
+        RobotSpec("culture", kind="cartpole")
     with pytest.raises(InvalidArgument, match="cartpole, navigation"):
-        Body("as printed")
+        RobotSpec("as printed")
 
 
 # --- learning as good as the optimum allows ---------------------------------------------------------------------------
@@ -188,16 +188,16 @@ def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
 
 def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     study = paper_study()
-    assert study.minutes_of(study.condition("without shadowing"), 0.0, 140.0) == {140.0: 100, 0.0: 100}
-    assert study.minutes_of(study.condition("9 thresholds"), 0.0, 140.0) == {140.0: 100}
-    assert study.minutes_of(study.condition("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
+    assert study.minutes_of(study.arm("without shadowing"), 0.0, 140.0) == {140.0: 100, 0.0: 100}
+    assert study.minutes_of(study.arm("9 thresholds"), 0.0, 140.0) == {140.0: 100}
+    assert study.minutes_of(study.arm("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
     assert study.optimum_minutes(0.0, 140.0) == [0.0, 140.0]
-    control = StudyCondition("c", shadowing=False, delivery="shuffled")
+    control = Arm("c", shadowing=False, delivery="shuffled")
     assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
 
 
 LEARNED = Score(
-    robot="cartpole", condition="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
+    robot="cartpole", arm="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
     mean_return=96.0, standard_deviation=3.0, interquartile_mean=96.0, low_95=95.0, high_95=97.0, random=-80.0,
     optimum=110.0, optimum_grid_error=0.1, optimum_run=105.0, optimum_run_standard_error=0.1,
     optimum_without_clock=100.0, normalised_score=0.88, score_without_clock=0.9,
@@ -205,7 +205,7 @@ LEARNED = Score(
 
 
 def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
-    rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, condition="1 threshold")]
+    rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, arm="1 threshold")]
     assert learned_of(paper_study(), rows) == [LEARNED]
 
 
@@ -217,24 +217,24 @@ def test_what_was_learned_stands_between_random_actions_and_the_optimum() -> Non
 
 
 def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
-    body = Body("cartpole")
-    assert known_of(replace(LEARNED, normalised_score=0.98), body) == "reached"
-    assert known_of(replace(LEARNED, normalised_score=None), body).startswith("nothing to learn")
-    assert known_of(replace(LEARNED, optimum=None, normalised_score=None), body).startswith(
+    spec = RobotSpec("cartpole")
+    assert known_of(replace(LEARNED, normalised_score=0.98), spec) == "reached"
+    assert known_of(replace(LEARNED, normalised_score=None), spec).startswith("nothing to learn")
+    assert known_of(replace(LEARNED, optimum=None, normalised_score=None), spec).startswith(
         "no optimum: conditions with few"
     )
-    assert known_of(LEARNED, body).endswith("short by 0.09, which neither the clock nor the grid explains")
-    assert "short by the clock" in known_of(replace(LEARNED, score_without_clock=0.99), body)
-    assert "its controller was seen to get" in known_of(replace(LEARNED, optimum_run=100.0), body)
-    assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, Body("cartpole", iterations=60_000))
+    assert known_of(LEARNED, spec).endswith("short by 0.09, which neither the clock nor the grid explains")
+    assert "short by the clock" in known_of(replace(LEARNED, score_without_clock=0.99), spec)
+    assert "its controller was seen to get" in known_of(replace(LEARNED, optimum_run=100.0), spec)
+    assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, RobotSpec("cartpole", iterations=60_000))
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
 
 
 def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path: Path) -> None:
-    study = Study(robots=(Body("cartpole"),), conditions=(StudyCondition("linear", mapping="linear"),
-                                                         StudyCondition("1 threshold")))  # fmt: skip
+    study = Study(robots=(RobotSpec("cartpole"),), arms=(Arm("linear", mapping="linear"),
+                                                         Arm("1 threshold")))  # fmt: skip
     labels = tuple(f"{i} Hz" for i in range(13))
     in_data, in_simulator = np.full((2, 13), 0.5), np.full((2, 13), 0.5)
     in_data[1, [0, 12]], in_simulator[1, [0, 12]] = (0.13, 0.9), (0.28, 0.88)
@@ -291,7 +291,7 @@ def test_the_optimum_steps_with_the_simulator_in_use() -> None:
     assert np.asarray(line.get_ydata()).tolist() == [1, 1, 1, 7]
 
 
-def test_optima_over_time_are_said_to_be_rough_and_no_condition_is_lost_unsaid() -> None:
+def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> None:
     minutes = np.array([0.0, 10.0])
     courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(6))
     panels = [
@@ -307,7 +307,7 @@ def test_optima_over_time_are_said_to_be_rough_and_no_condition_is_lost_unsaid()
         "linear",
         "c5",
     } <= said
-    assert "2 more conditions" in figure.axes[0].get_title(loc="left")
+    assert "2 more arms" in figure.axes[0].get_title(loc="left")
     colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
     (dashed,) = [line for line in figure.axes[0].lines if "rough" in str(line.get_label())]
     assert len(colours) == 6 and dashed.get_color() not in colours

@@ -55,7 +55,7 @@ from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
 from animat.studies.simulating import Fit, load_timeline
 from animat.studies.source import Source
-from animat.studies.specification import Body, Compared, Simulators, Study, StudyCondition
+from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.policy import Policy
@@ -63,7 +63,7 @@ from animat.writing import LOCK, alone_in
 from cultures import small_culture
 
 TINY = Path(__file__).parent / "tiny_study.toml"
-CONTROLS = [condition.name for condition in read_study(TINY).conditions if condition.delivery == "shuffled"]
+CONTROLS = [arm.name for arm in read_study(TINY).arms if arm.delivery == "shuffled"]
 
 
 @pytest.fixture(scope="module")
@@ -403,7 +403,7 @@ def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     made = tmp_path / "made"
     write_made_up_series(1, made, sessions=2, patterns=5, channels=16)
-    study = Study(culture=Source("files", files=("made",)), robots=(Body("navigation", iterations=100),))
+    study = Study(culture=Source("files", files=("made",)), robots=(RobotSpec("navigation", iterations=100),))
     with pytest.raises(AnimatError, match="fit: halted"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
     written = tmp_path / "study" / "study.toml"
@@ -441,9 +441,9 @@ def episodes_in(folder: Path, **columns: str) -> list[dict[str, str]]:
 def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
     (told,) = rows(finished / "tables/comparisons.csv")
     means = []
-    for condition in ("before training", "1 threshold"):
+    for arm in ("before training", "1 threshold"):
         returns = defaultdict(list)
-        for row in episodes_in(finished, arm=condition, agent="policy", at_min="0.0", over_time="False"):
+        for row in episodes_in(finished, arm=arm, agent="policy", at_min="0.0", over_time="False"):
             returns[row["actor"]].append(float(row["return"]))
         assert {len(of_policy) for of_policy in returns.values()} == {5}
         means.append([np.mean(of_policy) for of_policy in returns.values()])
@@ -473,8 +473,8 @@ def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path)
     for row in scores:
         mapping, at_min = row["mapping"], float(row["at_min"])
         random_ = returns_of(arm_of[mapping], "random", row["at_min"]).mean()
-        policies = returns_of(row["condition"], "policy", row["at_min"])
-        if row["condition"] in CONTROLS:
+        policies = returns_of(row["arm"], "policy", row["at_min"])
+        if row["arm"] in CONTROLS:
             # Whatever it chooses is as good as random: it has no optimum of its own.
             assert (row["optimum"], row["normalised_score"]) == ("", "")
             continue
@@ -488,7 +488,7 @@ def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path)
     assert {"random", "silent", "shuffled", "heuristic", "constant 80 Hz"} <= names
 
 
-def test_optima_have_intervals_where_conditions_are_evaluated_through_thresholds(finished: Path) -> None:
+def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(finished: Path) -> None:
     for row in rows(finished / "tables/optima.csv"):
         assert row["left_out"] == ""
         evaluated = row["mapping"] != "none" and (row["mapping"] == "1-threshold" or float(row["at_min"]) == 140)
@@ -509,10 +509,10 @@ def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
     assert before.probabilities(np.zeros(3, np.float32)) == pytest.approx(np.full(5, 0.2), abs=0.01)
 
 
-def test_no_two_conditions_start_from_the_same_networks() -> None:
+def test_no_two_arms_start_from_the_same_networks() -> None:
     study = paper_study()
-    pairs = [(body, condition) for body in study.robots for condition in study.conditions]
-    assert len({training_of(study, body, condition).seed for body, condition in pairs}) == len(pairs)
+    pairs = [(spec, arm) for spec in study.robots for arm in study.arms]
+    assert len({training_of(study, spec, arm).seed for spec, arm in pairs}) == len(pairs)
 
 
 def test_simulators_are_kept_whole(finished: Path) -> None:
@@ -556,7 +556,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
             assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
         assert f'href="figures/{stem}.svg"' in page
     assert page.count("<img ") == page.count("data:image/png;base64,") == len(expected)
-    tables = ("Comparisons", "Every condition", "Optimal returns", "Controllability of every recording")
+    tables = ("Comparisons", "Every arm", "Optimal returns", "Controllability of every recording")
     for title in (*tables, "Controls"):
         assert f"<caption>{title}</caption>" in page
     assert "<dt>Pole mass</dt>" not in page, "there is no cartpole in this study"
@@ -616,11 +616,11 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
 def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path) -> None:
     curves: dict[tuple[str, str], list[float]] = defaultdict(list)
     for row in rows(finished / "tables/learning-curves.csv"):
-        curves[row["condition"], row["iterations"]] += [float(row["mean_return"])] if row["mean_return"] else []
+        curves[row["arm"], row["iterations"]] += [float(row["mean_return"])] if row["mean_return"] else []
     learning = rows(finished / "tables/navigation-learning.csv")
-    assert [(row["condition"], row["iterations"]) for row in learning] == list(curves)
+    assert [(row["arm"], row["iterations"]) for row in learning] == list(curves)
     for row in learning:
-        of = curves[row["condition"], row["iterations"]]
+        of = curves[row["arm"], row["iterations"]]
         assert int(row["policies"]) == len(of)
         if not of:
             assert row["mean_return"] == row["low_95"] == row["high_95"] == ""
@@ -630,10 +630,10 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
         # other.
         assert [float(row["low_95"]), float(row["high_95"])] == pytest.approx([min(of), max(of)])
     course = rows(finished / "tables/navigation-over-time.csv")
-    assert {row["condition"] for row in course} == {"before training", "1 threshold", "control"}
+    assert {row["arm"] for row in course} == {"before training", "1 threshold", "control"}
     for row in course:
         returns = defaultdict(list)
-        for each in episodes_in(finished, arm=row["condition"], at_min=row["at_min"], over_time="True"):
+        for each in episodes_in(finished, arm=row["arm"], at_min=row["at_min"], over_time="True"):
             returns[each["actor"]].append(float(each["return"]))
         means = [np.mean(of_policy) for of_policy in returns.values()]
         told = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
@@ -698,16 +698,16 @@ def test_a_study_written_as_toml_is_read_as_the_same(study: Study, tmp_path: Pat
 def test_the_paper_is_kept_to() -> None:
     study = paper_study()
     assert (study.policies, study.culture.sessions, study.culture.interval_min) == (10, 15, 10.0)
-    assert [body.trained_for for body in study.robots] == [800_000, 500_000]
+    assert [spec.trained_for for spec in study.robots] == [800_000, 500_000]
     assert {(c.at_min, c.episodes) for c in study.comparisons} == {(0.0, 30), (140.0, 100)}
-    assert {(c.name, body.name) for c in study.comparisons for body in study.robots} == set(PRINTED)
+    assert {(c.name, spec.name) for c in study.comparisons for spec in study.robots} == set(PRINTED)
     assert {job.name.split("/")[0] for job in plan_study(paper_study(quick=True), Path())} == {
         job.name.split("/")[0] for job in plan_study(study, Path())
     }
 
 
 COMPARED = (
-    "[[conditions]]\nname = '1 threshold'\n[[conditions]]\nname = 'b'\n"
+    "[[arms]]\nname = '1 threshold'\n[[arms]]\nname = 'b'\n"
     "[[comparisons]]\nname = 'a'\nfirst = '1 threshold'\nsecond = 'b'\nat_min = {}"
 )
 
@@ -721,21 +721,21 @@ COMPARED = (
         ("policies = ", "expected TOML"),
         ("# nothing yet", "expected the settings of a study, got none"),
         ("seed = true", "seed: expected a whole number, got True"),
-        ("conditions = []", "conditions: expected at least one"),
+        ("arms = []", "arms: expected at least one"),
         ("robots = 'cartpole'", "robots: expected a list"),
         ("[[robots]]\nname = 'cart'", "robot: expected one of cartpole, navigation, got 'cart'"),
         ("[[robots]]\niterations = 3", "robots.name: expected to be given"),
         ("[[robots]]\nname = 'cartpole'\nparameters = { mass = 1 }", "expected parameters among"),
-        ("[[conditions]]\nname = 'a/b'", "conditions.name: expected letters"),
-        ("[[conditions]]\nname = '10'", "which in a table would be a number"),
-        ("[[conditions]]\nname = 'a'\n[[conditions]]\nname = 'A'", "expected each name once"),
-        ("[[conditions]]\nname = 'a'\nmapping = '2'", "conditions.mapping: expected one of"),
+        ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
+        ("[[arms]]\nname = '10'", "which in a table would be a number"),
+        ("[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'", "expected each name once"),
+        ("[[arms]]\nname = 'a'\nmapping = '2'", "arms.mapping: expected one of"),
         (
-            "[[conditions]]\nname = 'a'\ndelivery = 'none'",
-            "conditions.delivery: expected 'chosen' or 'shuffled', got 'none'",
+            "[[arms]]\nname = 'a'\ndelivery = 'none'",
+            "arms.delivery: expected 'chosen' or 'shuffled', got 'none'",
         ),
-        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the conditions"),
-        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another condition"),
+        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the arms"),
+        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another arm"),
         ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual', 'made-up' or 'files', got 'alive'"),
         ("[culture]\nkind = 'files'", "culture.files: expected some"),
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
@@ -778,7 +778,7 @@ COMPARED = (
         ],
         ("policies = 1000\nepisodes = 5001", "episodes: expected at most 5,000,000 of all policies together"),
         (
-            "policies = 1000\nconditions = [{name = 'a'}, {name = 'b'}]\nrobots = ["
+            "policies = 1000\narms = [{name = 'a'}, {name = 'b'}]\nrobots = ["
             + ", ".join(f"{{name = 'r{i}', kind = 'cartpole'}}" for i in range(11))
             + "]",
             "policies: expected at most 20,000 in a study, got 22,000",
@@ -793,7 +793,7 @@ COMPARED = (
         (f"title = {'{a=' * 20_000}", "nested without end"),
         (f"{'a.' * 20_000}b = 1", "a: no such setting at the top"),
         ("'a\\nb' = 1", "a\\nb"),
-        (f"conditions = [{'{name = 1},' * 1001}]", "conditions.name: expected text, got 1"),
+        (f"arms = [{'{name = 1},' * 1001}]", "arms.name: expected text, got 1"),
         (f"culture = {{files = {['a'] * 1001}}}", "culture.files: expected at most 1,000 entries, got "),
         ("#" * 2**20 + "\n", "expected at most 1,048,576 bytes"),
         ("[culture]\nkind = 'files'\nfiles = ['']", "culture.files: expected names of files, got ''"),
@@ -838,20 +838,20 @@ def test_choices_are_checked_from_python_too() -> None:
     for make in (
         lambda: Source(kind="alive"),  # type: ignore[arg-type]
         lambda: Simulators(kind="exact"),  # type: ignore[arg-type]
-        lambda: StudyCondition("a", delivery="none"),  # type: ignore[arg-type]
+        lambda: Arm("a", delivery="none"),  # type: ignore[arg-type]
         lambda: Study(actions="best"),  # type: ignore[arg-type]
     ):
         with pytest.raises(InvalidArgument, match=r"(kind|delivery|actions): expected '\w"):
             make()
 
 
-PAIR = (StudyCondition("1 threshold"), StudyCondition("control", delivery="shuffled"))
+PAIR = (Arm("1 threshold"), Arm("control", delivery="shuffled"))
 
 
 def test_comparisons_are_made_at_the_nearest_recording() -> None:
     def at(minutes: list[float | None], start_min: list[float]) -> list[float | None]:
         compared = tuple(Compared(f"c{i}", "1 threshold", "control", at) for i, at in enumerate(minutes))
-        study = Study(culture=Source("files", files=("a.nwb",)), conditions=PAIR, comparisons=compared)
+        study = Study(culture=Source("files", files=("a.nwb",)), arms=PAIR, comparisons=compared)
         return [each.at_min for each in study.at_recordings(start_min).comparisons]
 
     start_min = [0.0, 10.02, 60.0]
@@ -868,7 +868,7 @@ def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
     moved = Compared("before and after", "1 threshold", "control", at_min=29.0)
     study = Study(
         culture=Source("files", files=("made",)),
-        conditions=PAIR,
+        arms=PAIR,
         comparisons=(moved, replace(moved, name="b", at_min=30.0)),
     )
     Record(study, tmp_path).run(tmp_path / "study", Silent())
@@ -890,14 +890,12 @@ def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> 
     assert len(load_timeline(kept).conditions) == 1
 
 
-def test_no_two_conditions_or_controls_share_a_file(tmp_path: Path) -> None:
+def test_no_two_arms_or_controls_share_a_file(tmp_path: Path) -> None:
     names = ("a", "a paths", "a over-time", "controls", "controls-1-threshold", "over-time")
-    body = Body("navigation")
-    conditions = [StudyCondition(name, percentiles=held) for name in names for held in ("moving", "first")]
-    places = {
-        of(tmp_path, body, condition) for condition in conditions for of in (episodes_file, controls_file, paths_file)
-    }
-    # A condition's name is its own, however its percentiles are held; controls are of a way to hold them.
+    spec = RobotSpec("navigation")
+    arms = [Arm(name, percentiles=held) for name in names for held in ("moving", "first")]
+    places = {of(tmp_path, spec, arm) for arm in arms for of in (episodes_file, controls_file, paths_file)}
+    # An arm's name is its own, however its percentiles are held; controls are of a way to hold them.
     assert len(places) == 2 * len(names) + 2
 
 
@@ -917,14 +915,14 @@ def test_the_specifications_on_the_page_are_read(tmp_path: Path) -> None:
     assert len(blocks) == 2
     for block in blocks:
         (tmp_path / "study.toml").write_text(block)
-        assert read_study(tmp_path / "study.toml").conditions
+        assert read_study(tmp_path / "study.toml").arms
 
 
 # --- jobs -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_need_of_a_plan_is_a_job_of_it() -> None:
-    for study in (paper_study(), read_study(TINY), Study(conditions=(StudyCondition("direct", mapping="none"),))):
+    for study in (paper_study(), read_study(TINY), Study(arms=(Arm("direct", mapping="none"),))):
         jobs = in_order(plan_study(study, Path()))
         names = [job.name for job in jobs]
         assert len(set(names)) == len(names)
@@ -956,7 +954,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
     study = replace(
         read_study(TINY),
         culture=Source("files", files=("made",)),
-        conditions=(StudyCondition("held", percentiles="first"),),
+        arms=(Arm("held", percentiles="first"),),
         comparisons=(),
         policies=1,
         paper=False,
@@ -964,7 +962,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
     ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
     assert len(ran.done_now) == ran.jobs
     page = ran.report.read_text()
-    assert "The study compares no conditions" in page
+    assert "The study compares no arms" in page
     assert "Differences from the paper" not in page
 
 

@@ -34,7 +34,7 @@ from animat.studies.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.studies.shown import optima_shown
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
-from animat.studies.specification import Body, Compared, Study, StudyCondition, named_mapping
+from animat.studies.specification import Arm, Compared, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import References, Tabulate, _known
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -42,9 +42,9 @@ from animat.wrappers import ShuffledDelivery
 
 # --- which side is better -------------------------------------------------------------------------------------------
 
-WORSE = StudyCondition("worse", mapping="none", trained=False)
-BETTER = StudyCondition("better", mapping="none", trained=False)
-LIKE = StudyCondition("like", mapping="none", trained=False)
+WORSE = Arm("worse", mapping="none", trained=False)
+BETTER = Arm("better", mapping="none", trained=False)
+LIKE = Arm("like", mapping="none", trained=False)
 RETURNS = {
     "worse": [-80.0, -75.0, -70.0, -72.0, -78.0, -74.0],
     "better": [10.0, 12.0, 8.0, 15.0, 9.0, 11.0],
@@ -55,21 +55,21 @@ RETURNS = {
 def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedReturns, ...]:
     """The comparisons of made-up returns of six policies: two episodes each, one below and one above."""
     study = Study(
-        robots=(Body("cartpole"), Body("navigation")),
-        conditions=(WORSE, BETTER, LIKE),
+        robots=(RobotSpec("cartpole"), RobotSpec("navigation")),
+        arms=(WORSE, BETTER, LIKE),
         comparisons=comparisons,
         policies=6,
         episodes=2,
     )
-    for body in study.robots:
-        for condition in study.conditions:
+    for spec in study.robots:
+        for arm in study.arms:
             # A third episode, that no comparison asks for, would turn every order around.
-            returns = np.array([[mean - 1.0, mean + 1.0, -4.0 * mean] for mean in RETURNS[condition.name]])
-            table = tabulated(episodes_of(returns), robot=body.name, arm=condition.name, at_min=0.0)
-            write_episodes(episodes_file(folder, body, condition), [table])
-        write_random(folder, body, LIKE, 0.0)
-        optimum = StudyOptimum(body.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
-        write_typed(optima_file(folder, body.name), [optimum])
+            returns = np.array([[mean - 1.0, mean + 1.0, -4.0 * mean] for mean in RETURNS[arm.name]])
+            table = tabulated(episodes_of(returns), robot=spec.name, arm=arm.name, at_min=0.0)
+            write_episodes(episodes_file(folder, spec, arm), [table])
+        write_random(folder, spec, LIKE, 0.0)
+        optimum = StudyOptimum(spec.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
+        write_typed(optima_file(folder, spec.name), [optimum])
     Tabulate(study).run(folder, Silent())
     results = read_typed(results_file(folder), Results)
     with table_file(folder, "comparisons").open(newline="") as file:
@@ -77,11 +77,11 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
     return results.comparisons
 
 
-def write_random(folder: Path, body: Body, condition: StudyCondition, *minutes: float) -> None:
+def write_random(folder: Path, spec: RobotSpec, arm: Arm, *minutes: float) -> None:
     """Controls of which only random is there: one episode a minute, with a return of -80."""
-    ran, arm = episodes_of(np.array([[-80.0]])), named_mapping(condition.mapping, condition.percentiles)
-    tables = [tabulated(ran, robot=body.name, arm=arm, agent=RANDOM, at_min=at_min) for at_min in minutes]
-    write_episodes(controls_file(folder, body, condition), tables)
+    ran, through = episodes_of(np.array([[-80.0]])), named_mapping(arm.mapping, arm.percentiles)
+    tables = [tabulated(ran, robot=spec.name, arm=through, agent=RANDOM, at_min=at_min) for at_min in minutes]
+    write_episodes(controls_file(folder, spec, arm), tables)
 
 
 def episodes_of(returns: np.ndarray) -> Episodes:
@@ -154,26 +154,26 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
 
 @pytest.mark.parametrize("delivery", [pytest.param("chosen", marks=pytest.mark.oracle), "shuffled"])
 def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(tmp_path: Path, delivery: Any) -> None:
-    condition = StudyCondition("control", delivery=delivery, trained=False)
+    arm = Arm("control", delivery=delivery, trained=False)
     study = Study(
         culture=Source("made-up", sessions=2, interval_min=140.0, presentations=20, channels=32),
-        robots=(Body("navigation", parameters={"episode_limit": 60}),),
-        conditions=(condition, StudyCondition("other")),
+        robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
+        arms=(arm, Arm("other")),
         comparisons=(Compared("with another", "control", "other", at_min=0.0, episodes=7),),
         policies=2,
         episodes=7,
         episodes_over_time=3,
         actions="drawn",
     )
-    (body,) = study.robots
+    (spec,) = study.robots
     for task in (
         Record(study, tmp_path),
         Fit(study),
-        TrainGroup(study, body, condition, (0, 1)),
-        Evaluate(study, body, condition),
+        TrainGroup(study, spec, arm, (0, 1)),
+        Evaluate(study, spec, arm),
     ):
         task.run(tmp_path, Silent())
-    got = read_episodes([episodes_file(tmp_path, body, condition)])
+    got = read_episodes([episodes_file(tmp_path, spec, arm)])
     got = got[~got["over_time"]]
 
     timeline = fit_timeline(extract_series(read_recordings(tmp_path / "recordings")))
@@ -200,8 +200,8 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
 
 FEW = Study(
     culture=Source(kind="made-up", sessions=2, interval_min=140, presentations=40, channels=32),
-    robots=(Body("navigation", parameters={"episode_limit": 60}),),
-    conditions=(StudyCondition("1 threshold", trained=False), StudyCondition("without neurons", mapping="none")),
+    robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
+    arms=(Arm("1 threshold", trained=False), Arm("without neurons", mapping="none")),
     comparisons=(Compared("c", "without neurons", "1 threshold", at_min=0.0, episodes=2),),
     optimum_resolution=0.25,
     optimum_episodes=20,
@@ -245,12 +245,12 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
     environment = Animat(Navigation(episode_limit=60), Thresholds(1), 5 - len(few))
     assert at_first.best_return == best_return(environment, simulator, resolution=0.25, episodes=0).value
 
-    for condition in FEW.conditions:
-        write_random(recorded, FEW.robots[0], condition, 0.0, 140.0)
-    random = read_episodes(controls_file(recorded, FEW.robots[0], condition) for condition in FEW.conditions)
-    known, condition = References(FEW, recorded, FEW.robots[0], random), FEW.conditions[0]
-    assert known.optimum(condition, 0.0) is None is known.score(condition, 0.0, 5.0)
-    assert known.optimum(condition, 140.0) is not None is not known.score(condition, 140.0, 5.0)
+    for arm in FEW.arms:
+        write_random(recorded, FEW.robots[0], arm, 0.0, 140.0)
+    random = read_episodes(controls_file(recorded, FEW.robots[0], arm) for arm in FEW.arms)
+    known, arm = References(FEW, recorded, FEW.robots[0], random), FEW.arms[0]
+    assert known.optimum(arm, 0.0) is None is known.score(arm, 0.0, 5.0)
+    assert known.optimum(arm, 140.0) is not None is not known.score(arm, 140.0, 5.0)
     rough = optima_of(recorded, "over-time")
     assert [row.left_out for row in rough] == [at_first.left_out, None]
     assert {row.low_95 for row in rough} == {None}
@@ -274,7 +274,7 @@ def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
 
 # --- a real recording -----------------------------------------------------------------------------------------------
 
-TWO_CONDITIONS = """
+TWO_ARMS = """
 title = "An organoid's answers to two intervals"
 policies = 2
 episodes = 20
@@ -294,10 +294,10 @@ conditions = "interval:5,10+-25%"
 name = "navigation"
 iterations = 2000
 
-[[conditions]]
+[[arms]]
 name = "1 threshold"
 
-[[conditions]]
+[[arms]]
 name = "9 thresholds"
 mapping = "9-thresholds"
 
@@ -313,7 +313,7 @@ def test_a_study_of_a_real_recording_with_two_conditions(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = real_data / "organoid_cartpole_maxone.npz"
-    (tmp_path / "study.toml").write_text(TWO_CONDITIONS.format(file=file))
+    (tmp_path / "study.toml").write_text(TWO_ARMS.format(file=file))
     folder = tmp_path / "study"
     assert main(["study", str(tmp_path / "study.toml"), "--out", str(folder), "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["comparisons"]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A study of one's own from a TOML file: recordings, robots, conditions. Goes on where it stopped."""
+    """A study of one's own from a TOML file: recordings, robots, arms. Goes on where it stopped."""
 
     specification: Positional[Path]
     """The TOML file; animat reproduce leaves one to start from in its folder"""
@@ -44,8 +44,8 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
     from animat.studies.results import Results, read_typed
     from animat.studies.run import run_study
 
-    for body in study.robots:
-        for caveat in body.robot().caveats():
+    for spec in study.robots:
+        for caveat in spec.robot().caveats():
             print(f"warning: {caveat}", file=sys.stderr)
     cores = len(os.sched_getaffinity(0))
     if workers is not None and workers > cores:

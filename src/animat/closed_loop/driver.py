@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.answers import wrong_with
-from animat.closed_loop.body import Body
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.stretch import Asked, Stretch, rows_of
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
@@ -70,7 +70,7 @@ class Driver:
         self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
         self._rng = np.random.default_rng([seed, 21])
-        self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
+        self._runner = RobotRunner(loop.robot, np.random.default_rng([seed, 22]))
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
@@ -143,7 +143,7 @@ class Driver:
         """Put the robot where it starts: in a round of all agents each meets the same start."""
         self._expect("the robot")
         try:
-            observation = self._body.reset(turn)
+            observation = self._runner.reset(turn)
         except Exception as error:
             raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not np.all(np.isfinite(observation)):
@@ -258,7 +258,7 @@ class Driver:
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
         self._expect("the robot")
         try:
-            moved = self._body.step(self._last_command)
+            moved = self._runner.step(self._last_command)
         except Exception as error:
             raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):

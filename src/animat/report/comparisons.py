@@ -21,7 +21,7 @@ class Group:
     """One side of a comparison.
 
     Attributes:
-        name: the condition.
+        name: the arm.
         returns: each policy's mean return, shape (policies,).
         random, optimum: of random actions, and the optimal return; None where not known.
         score: the normalised score of the policies' mean; None where not known.
@@ -89,7 +89,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
 
 
 def _name(group: Group) -> str:
-    """The condition in two lines, and its score in a third."""
+    """The arm in two lines, and its score in a third."""
     name = group.name if " " in group.name else f"{group.name} "
     return name.replace(" ", "\n", 1) + ("" if group.score is None else f"\nscore {group.score:.2f}")
 

@@ -19,10 +19,10 @@ _RESAMPLES = 2000
 
 @dataclass(frozen=True, eq=False)
 class LearningCurve:
-    """One condition's.
+    """One arm's.
 
     Attributes:
-        name: the condition.
+        name: the arm.
         iterations: done at the end of each part of training, shape (parts,).
         returns: mean return of the episodes that ended in it, NaN where none did, shape (policies, parts).
         random, optimum: of random actions and optimal with the simulator in use in each part, NaN where not
@@ -37,7 +37,7 @@ class LearningCurve:
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
-    """A panel a condition: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum.
+    """A panel for each arm: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum.
 
     Args:
         curves: of one robot.

@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
 
 MOST = len(_COLOURS)
-"""Conditions that a panel has colours for."""
+"""Arms that a panel has colours for."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """One condition's returns.
+    """One arm's returns.
 
     Attributes:
-        name: the condition.
+        name: the arm.
         minutes: of the recordings, shape (recordings,).
         returns: mean return of each policy at each, shape (policies, recordings).
     """
@@ -54,7 +54,7 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The conditions of one mapping, which share random actions and the optimal return.
+    """The arms of one mapping, which share random actions and the optimal return.
 
     Attributes:
         title: the mapping.
@@ -62,7 +62,7 @@ class Courses:
         random: of random actions at the same minutes; None where not known.
         optimum: the optimal return on a rough grid at the same minutes; None where not known.
         fine_optimum: minutes and the optimal return on a fine grid at some of them.
-        left_out: conditions that there is no room for.
+        left_out: arms that there is no room for.
     """
 
     title: str
@@ -74,7 +74,7 @@ class Courses:
 
 
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
-    """A panel a mapping: median over policies of each condition with its quartiles, against the recording's minute.
+    """A panel a mapping: median over policies of each arm with its quartiles, against the recording's minute.
 
     Args:
         panels_of: of one robot.
@@ -111,7 +111,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
                 fontsize=8,
                 color=GREY,
             )
-        more = f" ({of.left_out} more conditions in the tables)" if of.left_out else ""
+        more = f" ({of.left_out} more arms in the tables)" if of.left_out else ""
         style_axes(axes, f"{of.title}{more}", "recording that answers (min)", "return")
     add_common_legend(figure, panels, columns=3)
     return figure

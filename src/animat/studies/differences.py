@@ -34,14 +34,14 @@ def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
 
 
 def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
-    if any(condition.mapping == "9-thresholds" for condition in study.conditions):
+    if any(arm.mapping == "9-thresholds" for arm in study.arms):
         yield (
             "Nine levels without zero",
             "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
             "eleven. Zero is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
         )
-    for body in study.robots:
-        yield from body.robot().departures()
+    for spec in study.robots:
+        yield from spec.robot().departures()
 
 
 def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
@@ -74,12 +74,12 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
             "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into "
             "the last bin, and is reported.",
         )
-    held = any(condition.percentiles == "first" for condition in study.conditions)
+    held = any(arm.percentiles == "first" for arm in study.arms)
     yield (
         "Percentiles",
         "The paper does not say which recording the thresholds are taken from. Here they come from the recording whose "
         "simulator is in use, so "
-        + ("they move, except in the conditions that hold the first recording's." if held else "they move with it."),
+        + ("they move, except in the arms that hold the first recording's." if held else "they move with it."),
     )
 
 
@@ -102,7 +102,7 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
             "Drawn actions",
             "The paper does not say whether policies draw their actions when they are evaluated. Here they do.",
         )
-    if any(not condition.trained for condition in study.conditions):
+    if any(not arm.trained for arm in study.arms):
         yield (
             "Before training",
             "The policies before training are networks as training starts from them, drawn at random: all actions are "
@@ -169,7 +169,7 @@ def explain(row: ComparedReturns) -> str:
             return f"{optima}: with these responses the order of the optima is itself the other way round."
         if abs(first - second) <= error:
             optima += ", which is the same within their errors"
-    # How much more than the first condition the second could have, as a part of all there is to learn.
+    # How much more than the first arm the second could have, as a part of all there is to learn.
     room = (second - row.mean_first) / (second - random)
     if room <= 1 - AIM:
         return (

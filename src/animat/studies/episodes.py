@@ -19,7 +19,7 @@ COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "
 """Of the table:
 
 - robot: its name in the study.
-- arm: what it was run in: a condition's name, or of controls what they act through (`named_mapping`).
+- arm: what it was run in: an arm's name, or of controls what they act through (`named_mapping`).
 - agent: `POLICY`, or the control's name.
 - actor: which of several, from 0: of policies p0, p1, ...
 - at_min: the recording that answers.

@@ -89,7 +89,7 @@ def write_array(folder: Path, recording: Recording) -> Path:
 
 def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) -> Path:
     """Learning curves as means over policies with their 95 % intervals, random actions and the optimum beside."""
-    head = ("condition", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "optimum")
+    head = ("arm", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "optimum")
     rows: list[tuple[Any, ...]] = []
     for curve in curves:
         ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
@@ -101,8 +101,8 @@ def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) ->
 
 
 def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
-    """Quartiles over policies of every condition at every recording, random actions and the optima beside."""
-    head = ("mapping", "condition", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
+    """Quartiles over policies of every arm at every recording, random actions and the optima beside."""
+    head = ("mapping", "arm", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
     rows = []
     for panel in panels:
         fine = dict(panel.fine_optimum)
@@ -117,14 +117,14 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
 
 
 def write_paths(folder: Path, robot: str, quantities: Sequence[str], paths: Mapping[str, Paths]) -> Path:
-    """One episode of each policy of every condition: what is observed, and the command that led there."""
+    """One episode of each policy of every arm: what is observed, and the command that led there."""
     rows = (
-        (condition, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
-        for condition, of in paths.items()
+        (arm, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
+        for arm, of in paths.items()
         for actor, (observations, commands) in enumerate(of.whole())
         for i, observed in enumerate(observations)
     )
-    return _write(folder, f"{robot}-paths", ("condition", "policy", "iteration", *quantities, "command"), rows)
+    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *quantities, "command"), rows)
 
 
 def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:

@@ -1,4 +1,4 @@
-"""Learning as good as the optimum allows: how conditions that are trained on one recording do on that very one."""
+"""Learning as good as the optimum allows: how arms that are trained on one recording do on that very one."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from collections.abc import Sequence
 
 from animat.report.html import Table, with_error
 from animat.studies.results import Score
-from animat.studies.specification import Body, Study
+from animat.studies.specification import RobotSpec, Study
 from animat.studies.tabulating import AIM
 
 
 def learned_of(study: Study, scores: Sequence[Score]) -> list[Score]:
-    """Of the table of scores, the rows of conditions on the one recording that they were trained on, the first."""
-    learned = {condition.name for condition in study.conditions if condition.learns_one_recording}
+    """Of the table of scores, the rows of arms on the one recording that they were trained on, the first."""
+    learned = {arm.name for arm in study.arms if arm.learns_one_recording}
     first: dict[tuple[str, str], Score] = {}
     for row in scores:
-        if row.condition in learned:
-            known = first.setdefault((row.robot, row.condition), row)
+        if row.arm in learned:
+            known = first.setdefault((row.robot, row.arm), row)
             if row.at_min < known.at_min:
-                first[row.robot, row.condition] = row
+                first[row.robot, row.arm] = row
     return list(first.values())
 
 
 def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
     """Scores beside `AIM`, with what is known of the difference."""
-    bodies = {body.name: body for body in study.robots}
+    bodies = {spec.name: spec for spec in study.robots}
     head = (
         "robot",
-        "condition",
+        "arm",
         "mapping",
         "at (min)",
         "mean ± s.e.",
@@ -48,7 +48,7 @@ def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
         cells.append(
             (
                 row.robot,
-                row.condition,
+                row.arm,
                 row.mapping,
                 row.at_min,
                 with_error(row.mean_return, error),
@@ -73,7 +73,7 @@ def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
     )
 
 
-def known_of(row: Score, body: Body) -> str:
+def known_of(row: Score, spec: RobotSpec) -> str:
     """What is known of a score: that it is reached, or what stands between it and the optimum."""
     score, without_clock = row.normalised_score, row.score_without_clock
     if row.optimum is None:
@@ -88,7 +88,7 @@ def known_of(row: Score, body: Body) -> str:
     if without_clock is not None and without_clock >= AIM:
         return "short by the clock: reached against the same controller without knowing the time left"
     known = f"short by {AIM - score:.2f}, which neither the clock nor the grid explains"
-    usual = body.robot().paper_iterations
-    if body.trained_for < usual:
-        known += f"; trained for {body.trained_for:,} iterations, not {usual:,}"
+    usual = spec.robot().paper_iterations
+    if spec.trained_for < usual:
+        known += f"; trained for {spec.trained_for:,} iterations, not {usual:,}"
     return known

@@ -16,7 +16,7 @@ from animat.studies.evaluating import as_recorded, first_minute, last_minute, se
 from animat.studies.places import optima_file
 from animat.studies.results import StudyOptimum, read_typed, write_typed
 from animat.studies.simulating import read_series
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 
 ROUGH = 0.5
@@ -25,16 +25,16 @@ COARSER = 0.8
 """Steps of the grid of redrawn responses along each axis, at most, as a part of the optimum's."""
 
 
-def kinds_of(study: Study) -> list[StudyCondition]:
-    """One condition for each mapping and way to hold percentiles, delivered as chosen: each has its own optimum."""
-    kinds: dict[tuple[str, str], StudyCondition] = {}
-    for condition in study.conditions:
-        optimum = StudyCondition("optimum", mapping=condition.mapping, percentiles=condition.percentiles)
-        kinds.setdefault((condition.mapping, condition.percentiles), optimum)
+def kinds_of(study: Study) -> list[Arm]:
+    """One arm for each mapping and way to hold percentiles, delivered as chosen: each has its own optimum."""
+    kinds: dict[tuple[str, str], Arm] = {}
+    for arm in study.arms:
+        optimum = Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles)
+        kinds.setdefault((arm.mapping, arm.percentiles), optimum)
     return list(kinds.values())
 
 
-def rough_kinds(study: Study) -> list[StudyCondition]:
+def rough_kinds(study: Study) -> list[Arm]:
     """Of `kinds_of`, those whose optimum is computed at every recording; of mappings without steps that is long."""
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
@@ -52,7 +52,7 @@ def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOp
 def left_out(study: Study) -> list[str]:
     """What its robots cannot do, and the study is without: a sentence each."""
     messages: list[str] = []
-    for robot in dict.fromkeys(body.robot() for body in study.robots):
+    for robot in dict.fromkeys(spec.robot() for spec in study.robots):
         lacks = lacking(robot)
         if (why_not := no_grid(robot)) is not None:
             lacks.setdefault("value_grid", f"no optimal return: {why_not}")
@@ -74,17 +74,17 @@ class FindOptima(StudyTask):
 
     sizes = ("optimum_resolution", "optimum_episodes")
 
-    body: Body
+    spec: RobotSpec
     over_time: bool = False
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        file = optima_file(folder, self.body.name, "over-time" if self.over_time else "optima")
-        if no_grid(self.body.robot()) is not None:
+        file = optima_file(folder, self.spec.name, "over-time" if self.over_time else "optima")
+        if no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
         study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
-        resolution, episodes = self.body.optimum_resolution or study.optimum_resolution, study.optimum_episodes
+        resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:
             kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
             resolution, episodes = min(ROUGH, resolution), 0
@@ -96,7 +96,7 @@ class FindOptima(StudyTask):
             series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
             timeline = replace(timeline, responses=tuple(series))
         for i, (kind, at) in enumerate(asked):
-            environment = setting_of(study, self.body, kind, timeline).environment
+            environment = setting_of(study, self.spec, kind, timeline).environment
             if timeline is None or not isinstance(environment, Animat):
                 cases[i] = environment, None
                 continue
@@ -126,19 +126,19 @@ class FindOptima(StudyTask):
         for i, (kind, at) in enumerate(asked):
             few = "; ".join(left_out.get(i, ())) or None
             optima.append(
-                StudyOptimum(self.body.name, kind.mapping, kind.percentiles, at, **_known(found.get(i)), left_out=few)
+                StudyOptimum(self.spec.name, kind.mapping, kind.percentiles, at, **_known(found.get(i)), left_out=few)
             )
         return [write_typed(file, optima)]
 
 
-def _compared(study: Study, first: float, last: float) -> list[tuple[StudyCondition, float]]:
-    """Threshold mappings at the minutes that conditions of theirs are evaluated at: whose optima have an interval."""
+def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]]:
+    """Threshold mappings at the minutes that arms of theirs are evaluated at: whose optima have an interval."""
     return [
         (kind, at)
         for kind in rough_kinds(study)
-        for condition in study.conditions
-        if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles)
-        for at in study.minutes_of(condition, first, last)
+        for arm in study.arms
+        if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles)
+        for at in study.minutes_of(arm, first, last)
     ]
 
 

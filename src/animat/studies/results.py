@@ -56,10 +56,10 @@ class StudyOptimum:
 
 @dataclass(frozen=True)
 class Score:
-    """A condition at a minute: means over policies, beside random actions and the optimum."""
+    """An arm at a minute: means over policies, beside random actions and the optimum."""
 
     robot: str
-    condition: str
+    arm: str
     mapping: str
     at_min: float
     policies: int
@@ -81,7 +81,7 @@ class Score:
 
 @dataclass(frozen=True)
 class ComparedReturns:
-    """Two conditions on a robot: the test, its outcome, and the paper's where it printed one."""
+    """Two arms on a robot: the test, its outcome, and the paper's where it printed one."""
 
     comparison: str
     robot: str
@@ -134,7 +134,7 @@ class BesideHeuristic:
     """Trained policies beside the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
 
     robot: str
-    condition: str
+    arm: str
     at_min: float
     mean_return: float
     heuristic: float

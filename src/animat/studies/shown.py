@@ -82,14 +82,14 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
 
 
 def scores_shown(rows: Sequence[Score]) -> Table:
-    """Every condition at every minute it was evaluated at."""
+    """Every arm at every minute it was evaluated at."""
     return Table(
-        "Every condition",
+        "Every arm",
         *_columns(
             rows,
             [
                 ("robot", "robot"),
-                ("condition", "condition"),
+                ("arm", "arm"),
                 ("at (min)", "at_min"),
                 ("policies", "policies"),
                 ("episodes", "episodes"),
@@ -130,7 +130,7 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
         "Optimal returns",
         *_columns(optima, columns),
         note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses "
-        "determine the value, bootstrapped 39 times; for threshold mappings, where a condition is evaluated. "
+        "determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its "
         "standard error: a return that can be had. The optimal return lies between the two; scores keep to "
         "the value, the upper end. Highlighted: they part by more than 3 standard errors and the grid's "
@@ -149,12 +149,12 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
     """
     kinds = rough_kinds(study)[:1]
     optima = {
-        body.name: {
+        spec.name: {
             optimum.at_min: optimum.best_return
-            for optimum in optima_of_all(folder, body.name, "over-time")
+            for optimum in optima_of_all(folder, spec.name, "over-time")
             if (optimum.mapping, optimum.percentiles) == (kinds[0].mapping, kinds[0].percentiles)
         }
-        for body in study.robots
+        for spec in study.robots
         if kinds
     }
     labels = next(iter(kept.values())).labels
@@ -219,7 +219,7 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
         + (
             " Without neurons, where any command can be chosen, none is held constant."
             if any(row.mapping == "none" for row in rows)
-            and any(body.robot().baseline_commands is None for body in study.robots)
+            and any(spec.robot().baseline_commands is None for spec in study.robots)
             else ""
         ),
         beside="tables/controls.csv",
@@ -235,7 +235,7 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
             rows,
             [
                 ("robot", "robot"),
-                ("condition", "condition"),
+                ("arm", "arm"),
                 ("at (min)", "at_min"),
                 ("policies", "mean_return"),
                 ("heuristic", "heuristic"),

@@ -16,7 +16,7 @@ from animat.studies.specification import Study
 MOST_BYTES = 2**20
 """Of a specification."""
 FORMER = {
-    "": {"limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
+    "": {"conditions": "arms", "limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
     "robots": {"limit_resolution": "optimum_resolution"},
     "simulators": {"despite": "allow"},
 }
