@@ -149,7 +149,7 @@ def algorithm() -> Any:
     from animat.training.settings import SAC
 
     default = SAC()
-    return replace(default, updates=max(1, default.environments // 8))
+    return replace(default, gradient_steps=max(1, default.environments // 8))
 
 
 def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
@@ -205,12 +205,12 @@ def rate(policies: int, repeats: int) -> dict[str, Any]:
     iterations = rounds * settings.environments * policies
     return {
         "environments": settings.environments,
-        "updates": settings.updates,
+        "gradient_steps": settings.gradient_steps,
         "batch": settings.batch,
         "hidden": settings.hidden,
         "best_per_s": iterations / min(seconds),
         "median_per_s": iterations / statistics.median(seconds),
-        "update_us": 1e6 * min(seconds) / (rounds * settings.updates * policies),
+        "update_us": 1e6 * min(seconds) / (rounds * settings.gradient_steps * policies),
     }
 
 

@@ -47,7 +47,7 @@ from fake_culture import FakeCulture
 
 pytestmark = pytest.mark.usefixtures("few_redrawn")
 
-SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
+SMALL = SAC(environments=8, gradient_steps=1, batch=16, replay=1024, hidden=8)
 TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iterations=6000, seed=3, algorithm=SMALL)
 ONE = replace(TRAINING, policies=1)
 """In one process: for what has nothing to do with how many train."""

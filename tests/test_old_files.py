@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,17 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import read_session
+from animat.differences import fingerprint_of
 from animat.errors import InvalidFile, Mismatch
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.studies.plan import plan_study
 from animat.studies.run import run_study
 from animat.studies.toml import read_study
+from animat.training.folder import describe, expect_folder_for, is_ours
 from animat.training.policy import Policy
+from animat.training.settings import FORMER, SAC
+from animat.training.specification import Training
 from test_studies import Halts
 
 pytestmark = pytest.mark.usefixtures("in_this_process", "few_redrawn")
@@ -108,13 +113,40 @@ allow = ["dead-window"]
 [[robots]]
 name = "navigation"
 optimum_resolution = 0.4
+[algorithm]
+gradient_steps = 1
+tau = 0.5
 [[arms]]
 name = "linear"
 mapping = "linear"
 """
     today.write_text(text)
-    former.write_text(text.replace("optimum", "limit").replace("allow", "despite").replace("arms", "conditions"))
+    for now, before in (
+        ("optimum", "limit"),
+        ("allow", "despite"),
+        ("arms", "conditions"),
+        ("gradient_steps", "updates"),
+        ("tau", "follow"),
+    ):
+        text = text.replace(now, before)
+    former.write_text(text)
     assert read_study(former) == read_study(today)
     former.write_text("limit_resolution = 0.5\noptimum_resolution = 0.5\n")
     with pytest.raises(InvalidFile, match="limit_resolution: no such setting at the top"):
         read_study(former)
+
+
+def test_a_trainings_folder_goes_on_by_the_former_names_of_its_settings(tmp_path: Path) -> None:
+    training = Training("cartpole", None, policies=1, iterations=100)
+    manifest = describe(training, None)
+    settings = manifest["training"]["algorithm"]
+    former = {before: settings.pop(today) for before, today in FORMER.items()}
+    settings |= former
+    # The fingerprint that 0.1.0 made is over the former names.
+    told = {name: value for name, value in manifest.items() if name not in ("sources", "fingerprint")}
+    assert manifest["fingerprint"] == fingerprint_of(told)
+    (tmp_path / "training.json").write_text(json.dumps(manifest))
+    expect_folder_for(training, tmp_path)
+    assert is_ours(tmp_path, describe(training, None))
+    with pytest.raises(Mismatch, match=r"training\.algorithm\.tau: 0\.005 there, 0\.1 now"):
+        expect_folder_for(replace(training, algorithm=SAC(tau=0.1)), tmp_path)

@@ -125,7 +125,7 @@ def test_a_study_has_conditions_with_it(package: Path) -> None:
         policies=1,
         episodes=2,
         episodes_over_time=2,
-        algorithm={"environments": 8, "updates": 1, "batch": 16, "replay": 256, "hidden": 8},
+        algorithm={"environments": 8, "gradient_steps": 1, "batch": 16, "replay": 256, "hidden": 8},
     )
     (package / "study.toml").write_text(study_to_toml(study))
     assert read_study(package / "study.toml") == study

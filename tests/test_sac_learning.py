@@ -37,7 +37,7 @@ from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit
 from sac_toys import Follower, FollowerOfTwo, Payer
 
-SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)
+SMALL = SAC(environments=2, gradient_steps=2, batch=8, replay=10, hidden=8)
 DISCRETE = (-1.0, 1.0)
 
 compiled_begin = jax.jit(begin, static_argnums=(0, 1))
@@ -114,7 +114,7 @@ def test_returns_are_counted_in_the_tasks_own_units() -> None:
 
 
 def test_only_what_was_written_is_learned_from() -> None:
-    settings = SAC(environments=2, updates=4, batch=64, replay=2000, hidden=8)
+    settings = SAC(environments=2, gradient_steps=4, batch=64, replay=2000, hidden=8)
     environment = WithoutNeurons(Cartpole(), DISCRETE)
     learner = start(environment, settings, jax.random.key(0))
     poisoned = learner._replace(replay=jnp.full_like(learner.replay, jnp.nan))
@@ -130,7 +130,7 @@ def test_only_what_was_written_is_learned_from() -> None:
 @pytest.mark.parametrize("commands", [DISCRETE, None])
 def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[float, ...] | None) -> None:
     # One transition remembered, so the batch is known: that row, over and over.
-    settings = SAC(environments=1, updates=1, batch=4, replay=10, hidden=8, follow=0.25, learning_rate=0.01)
+    settings = SAC(environments=1, gradient_steps=1, batch=4, replay=10, hidden=8, tau=0.25, learning_rate=0.01)
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
     after, _ = trained_for(environment, settings, 1, learner=before)
@@ -164,8 +164,8 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
 # --- what it converges to -------------------------------------------------------------------------------------------
 
 CLOSED_FORM = SAC(
-    environments=4, updates=4, batch=32, replay=1024, hidden=16, learning_rate=3e-3, discount=0.6, follow=0.05,
-    reward_scale=0.5, entropy_share=0.5,
+    environments=4, gradient_steps=4, batch=32, replay=1024, hidden=16, learning_rate=3e-3, discount=0.6, tau=0.05,
+    reward_scale=0.5, target_entropy_ratio=0.5,
 )  # fmt: skip
 
 
@@ -175,7 +175,7 @@ def soft_solution(pay: float) -> tuple[float, float, float]:
     Critics differ by their rewards alone, so pi = softmax(rewards / alpha), alpha such that H(pi) is what is wanted,
     and V = sum pi r + alpha H(pi) + discount V.
     """
-    wanted = CLOSED_FORM.entropy_share * math.log(2)
+    wanted = CLOSED_FORM.target_entropy_ratio * math.log(2)
     p = brentq(lambda p: -p * math.log(p) - (1 - p) * math.log(1 - p) - wanted, 0.5, 1 - 1e-9)
     alpha = 2 * pay / math.log(p / (1 - p))
     return alpha, p, ((2 * p - 1) * pay + alpha * wanted) / (1 - CLOSED_FORM.discount)
@@ -210,8 +210,8 @@ def test_critics_converge_to_the_closed_form(limit: int, ends: bool) -> None:
 
 
 TRIVIAL = SAC(
-    environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=1.0,
-    entropy_nats=-2.0,
+    environments=8, gradient_steps=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5,
+    reward_scale=1.0, entropy_nats=-2.0,
 )  # fmt: skip
 
 

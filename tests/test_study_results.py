@@ -281,7 +281,7 @@ episodes = 20
 episodes_over_time = 2
 optimum_resolution = 0.4
 optimum_episodes = 400
-algorithm = {{ environments = 8, updates = 1, batch = 16, replay = 1024, hidden = 8 }}
+algorithm = {{ environments = 8, gradient_steps = 1, batch = 16, replay = 1024, hidden = 8 }}
 
 [culture]
 kind = "files"

@@ -30,7 +30,7 @@ from animat.training.specification import CHUNKS, Training
 from animat.writing import alone_in
 from test_simulator import responses_of
 
-SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
+SMALL = SAC(environments=8, gradient_steps=1, batch=16, replay=1024, hidden=8)
 SHORT = Training(Cartpole(), Thresholds(1), policies=2, iterations=6_000, duration_min=60.0, algorithm=SMALL)
 """Two groups of one policy each, which are one program."""
 

@@ -12,6 +12,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
 from animat.records import read_record
 from animat.studies.specification import Study
+from animat.training.settings import FORMER as FORMER_SETTINGS
 
 MOST_BYTES = 2**20
 """Of a specification."""
@@ -19,6 +20,7 @@ FORMER = {
     "": {"conditions": "arms", "limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
     "robots": {"limit_resolution": "optimum_resolution"},
     "simulators": {"despite": "allow"},
+    "algorithm": FORMER_SETTINGS,
 }
 """What keys are called in files of before, table by table (at the top: none)."""
 
