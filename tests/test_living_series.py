@@ -35,7 +35,7 @@ from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.selection import Selection
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 from fake_culture import FakeCulture
 
 SHORT = Protocol((20.0, 80.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
@@ -89,7 +89,7 @@ def test_a_culture_that_fails_leaves_what_was_recorded_before(tmp_path: Path) ->
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused_before_any_stimulus(tmp_path: Path) -> None:
-    with replay() as culture, alone_in(tmp_path):
+    with replay() as culture, exclusive_lock(tmp_path):
         with pytest.raises(Mismatch, match="another run is at work in this folder"):
             record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         assert culture.delivered == 0
@@ -104,10 +104,10 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
     @contextmanager
     def ended_in_between(folder: Path) -> Iterator[None]:
         shutil.copytree(file.parent, folder)
-        with alone_in(folder):
+        with exclusive_lock(folder):
             yield
 
-    monkeypatch.setattr("animat.cultures.living_series.alone_in", ended_in_between)
+    monkeypatch.setattr("animat.cultures.living_series.exclusive_lock", ended_in_between)
     with replay() as culture:
         with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* got another \(protocol\."):
             record_living_series(culture, replace(SHORT, pulses=2), tmp_path / "series", sessions=2, interval_min=2.0)

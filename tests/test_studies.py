@@ -59,7 +59,7 @@ from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, S
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.policy import Policy
-from animat.writing import LOCK, alone_in
+from animat.writing import LOCK, exclusive_lock
 from cultures import small_culture
 
 TINY = Path(__file__).parent / "tiny_study.toml"
@@ -210,7 +210,7 @@ def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused(finished: Path) -> None:
-    with alone_in(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
+    with exclusive_lock(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
         run_study(read_study(TINY), finished, base=TINY.parent)
     assert run_study(read_study(TINY), finished, base=TINY.parent).done_now == {}
 

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.live.shadowing import LiveRun
@@ -106,7 +106,7 @@ class Live(Stimulating):
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
             ExitStack() as told,
-            alone_in(self.out),
+            exclusive_lock(self.out),
             polite_kill_as_ctrl_c(),
             Bar("live") as progress,
             culture_of(

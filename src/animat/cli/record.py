@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.progress import Progress
@@ -100,7 +100,7 @@ class Record:
                 "--order, --pulses, --presentations, --places, --protocol: made-up recordings are blocked, with one "
                 "pulse, 100 presentations and no places; --culture virtual takes others"
             )
-        with alone_in(self.out):
+        with exclusive_lock(self.out):
             return write_made_up_series(
                 self.seed, self.out, sessions=self._sessions, interval_min=self._interval_min, progress=progress
             )
@@ -131,7 +131,7 @@ class Record:
         recordings = read_recordings(self.recordings) if self.recordings else []
         with (
             # Held before a device is opened, which stops whatever another run has it do.
-            alone_in(self.out),
+            exclusive_lock(self.out),
             polite_kill_as_ctrl_c(),
             culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
         ):

@@ -15,7 +15,7 @@ from tyro.conf import Positional
 from animat.cli.responses import fit_as, policies_for
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.closed_loop.loop import Loop
@@ -229,7 +229,7 @@ def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
     from animat.closed_loop.session import expect_no_file, expect_no_session
 
     expect_no_file(folder, "the session")
-    with alone_in(folder):
+    with exclusive_lock(folder):
         expect_no_session(folder)
         if is_recording and (there := folder / CALIBRATION_FILE).exists():
             raise InvalidArgument(

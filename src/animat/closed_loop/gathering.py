@@ -18,7 +18,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
@@ -106,7 +106,7 @@ class SessionFiles:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        beside = self._stack.enter_context(written_whole(self._folder / TICKS_FILE))
+        beside = self._stack.enter_context(atomic_write(self._folder / TICKS_FILE))
         file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
         self._table = TickTable(file, self._header.conditions, self._header.observed, self._header.readouts)
         return self

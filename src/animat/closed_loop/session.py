@@ -28,7 +28,7 @@ from animat.closed_loop.tick import Ending, Tick
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress
 from animat.recordings.recording import Recording
-from animat.writing import alone_in, clear_away, is_unfinished
+from animat.writing import clear_away, exclusive_lock, is_unfinished
 
 _TOLD_EVERY = 1000
 
@@ -245,7 +245,7 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
         Mismatch: if the session still runs.
     """
     # What is no session is told before its folder is held.
-    with alone_in(read_session(path).folder):
+    with exclusive_lock(read_session(path).folder):
         session = read_session(path)
         for leftover in session.folder.glob(".*"):
             # What the killed program was just writing.

@@ -19,7 +19,7 @@ from animat.evaluation.commands import CLASSES, class_of, commands_after, layers
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.statistics import Interval
-from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
+from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import AT_FIRST, NeuronSimulator
 from animat.progress import Progress, Silent
@@ -292,7 +292,7 @@ class _Programme:
             self.bounds = lowest, highest
             if tables is not None:
                 tables.keep(remaining, values.reshape(shape))
-            step_back(
+            bellman_backup(
                 values,
                 landings.rows,
                 landings.row_places,

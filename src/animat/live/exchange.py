@@ -8,7 +8,7 @@ from typing import Any
 
 from animat.execution.task import tell, told
 from animat.neurons.simulator import NeuronSimulator
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 _FINISH = "finish"
 
@@ -30,7 +30,7 @@ class Exchange:
         Raises:
             InvalidFile: if it cannot be written.
         """
-        with written_whole(self.folder / f"{number:06}.simulator") as beside:
+        with atomic_write(self.folder / f"{number:06}.simulator") as beside:
             beside.write_bytes(pickle.dumps((number, start_min, simulator)))
 
     def newest(self, known: int) -> tuple[int, float, NeuronSimulator] | None:

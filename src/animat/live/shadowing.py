@@ -37,7 +37,7 @@ from animat.stimulation.protocol import Protocol
 from animat.training.folder import describe, groups_of
 from animat.training.policy import Policy
 from animat.training.specification import Training
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 _POLL_S = 0.1
 
@@ -131,7 +131,7 @@ def live(
         if training.percentiles == "first":
             calibration = calibration.with_percentiles(pooled_percentiles(run.used[0]))
         # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
-        with alone_in(run.folder / SESSION):
+        with exclusive_lock(run.folder / SESSION):
             gap = run_policies(
                 policies,
                 culture,

@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.optimum import bracket_findings
 from animat.recordings.findings import Finding
 from animat.records import read_record
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 T = TypeVar("T")
 
@@ -157,7 +157,7 @@ class Results:
 
 def write_typed(path: Path, value: Any) -> Path:
     """Write records, complete or absent: `read_typed` reads them."""
-    with written_whole(path) as beside:
+    with atomic_write(path) as beside:
         plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
         beside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
     return path
@@ -177,7 +177,7 @@ def read_typed(path: Path, kind: type[T]) -> T:
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Write arrays by name as NumPy's npz, complete or absent; the same bytes always."""
-    with written_whole(path) as beside, beside.open("wb") as file:
+    with atomic_write(path) as beside, beside.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return path
 
@@ -197,7 +197,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
     """Write a CSV file, complete or absent; numbers with all their digits, None as nothing."""
-    with written_whole(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(head)
         writer.writerows(rows)

@@ -28,7 +28,7 @@ from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
 from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator, MemorySimulator)}
 
@@ -117,7 +117,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "findings": [asdict(finding) for finding in timeline.findings],
         "fitted": timeline.fitted,
     }
-    with written_whole(path) as beside:
+    with atomic_write(path) as beside:
         beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
 
 

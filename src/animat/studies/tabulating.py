@@ -36,7 +36,7 @@ from animat.studies.results import (
 from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -92,7 +92,7 @@ class Tabulate(StudyTask):
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             files.append(write_table(table_file(folder, "controllability"), head, _controllability(timeline)))
-        with written_whole(table_file(folder, "episodes")) as beside:
+        with atomic_write(table_file(folder, "episodes")) as beside:
             table.to_csv(beside, index=False, lineterminator="\n")
         return [*files, table_file(folder, "episodes")]
 

@@ -22,7 +22,7 @@ from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.group import Group, split_groups
 from animat.training.settings import FORMER
 from animat.training.specification import Training
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 MANIFEST = "training.json"
 _NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
@@ -100,7 +100,7 @@ def is_finished(training: Training, folder: Path) -> bool:
 
 def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
     """Make a folder this training's."""
-    with written_whole(folder / MANIFEST) as beside:
+    with atomic_write(folder / MANIFEST) as beside:
         beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
     return folder / MANIFEST
 

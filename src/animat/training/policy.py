@@ -32,7 +32,7 @@ from animat.robots.registry import REGISTRY as ROBOTS
 from animat.robots.registry import robot_from_dict, robot_to_dict
 from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 FORMAT = "animat-policy-1"
 HIDDEN_ACTIVATION = "relu"
@@ -251,7 +251,7 @@ class Policy:
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
         data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
-        with written_whole(path) as beside:
+        with atomic_write(path) as beside:
             beside.write_bytes(data)
 
     @staticmethod
