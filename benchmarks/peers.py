@@ -120,7 +120,7 @@ def train_peer(name: str, seed: int, wanted: float, cap_s: float) -> dict[str, A
 
 
 def make() -> Any:
-    """The environment, with the culture that is made up."""
+    """The environment, with the synthetic culture."""
     import gymnasium
 
     return gymnasium.make("animat:Animat/Cartpole-v0", mapping="9-thresholds")

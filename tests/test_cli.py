@@ -27,8 +27,8 @@ from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import with_intervals
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
-from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recordings
+from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
@@ -41,7 +41,7 @@ QUICK = ["--policies", "2", "--iterations", "2000"]
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("series") / "recordings"
-    write_made_up_series(1, folder, sessions=2, patterns=40, channels=64)
+    write_synthetic_series(1, folder, sessions=2, patterns=40, channels=64)
     return folder
 
 
@@ -101,7 +101,7 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
 
 def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
-    record = ["record", "--culture", "made-up", "--sessions", "2", "--out", str(series)]
+    record = ["record", "--culture", "synthetic", "--sessions", "2", "--out", str(series)]
     assert main([*record, "--json"]) == 0
     assert len(last_json(capsys.readouterr().out)["recordings"]) == 2  # type: ignore[arg-type]
 
@@ -325,7 +325,7 @@ BAD = {
         )
         for command, more, option in (
             ("record", [], "--sessions"),
-            ("record", ["--culture", "made-up"], "--sessions"),
+            ("record", ["--culture", "synthetic"], "--sessions"),
             ("record", [], "--presentations"),
             ("record", [], "--pulses"),
             ("train", ["cartpole", "--recordings", "{recordings}"], "--policies"),
@@ -358,7 +358,7 @@ BAD = {
     "a name that is too long": (nothing, ["inspect", "a" * 5000], ["File name too long"]),
     "zero sessions": (
         nothing,
-        ["record", "--culture", "made-up", "--sessions", "0", "--out", "{folder}/r"],
+        ["record", "--culture", "synthetic", "--sessions", "0", "--out", "{folder}/r"],
         ["sessions"],
     ),
 }

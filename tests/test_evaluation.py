@@ -19,8 +19,8 @@ from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import fit_histogram, silenced
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
@@ -58,7 +58,7 @@ def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int 
 
 
 def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
-    simulator = silenced(made_up_simulator())
+    simulator = silenced(synthetic_simulator())
     episodes = roll_out(
         Animat(Cartpole(force_noise=0.0), Thresholds(1), 5), simulator, Uniform(), 1, episodes=5, seed=0
     )
@@ -78,7 +78,7 @@ def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
 
 def test_truncated_episodes_count_to_the_limit_and_are_not_terminated() -> None:
     episodes = roll_out(
-        Animat(Navigation(episode_limit=20), Linear(), 5), made_up_simulator(), Uniform(), 3, episodes=7, seed=0
+        Animat(Navigation(episode_limit=20), Linear(), 5), synthetic_simulator(), Uniform(), 3, episodes=7, seed=0
     )
     assert np.all(episodes.lengths == 20)
     assert not episodes.terminated.any()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import SyntheticCulture
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.inspection import draw_inspection, inspection_text
 from animat.report.psth import draw_psth
@@ -54,7 +54,7 @@ def message(source: Recording, name: str, **options: object) -> str:
 
 
 def test_nothing_is_wrong_with_a_good_recording() -> None:
-    source = MadeUpCulture(seed=1).record(0.0)
+    source = SyntheticCulture(seed=1).record(0.0)
     inspection = inspect_recording(source)
     assert inspection.verdict == "usable"
     assert {f.severity for f in inspection.findings} == {"note"}
@@ -239,7 +239,7 @@ def test_brainoware_is_refused_and_shown_the_way(real_data: Path) -> None:
 
 
 def test_to_dict_is_json_and_says_what_the_text_says() -> None:
-    inspection = inspect_recording(MadeUpCulture(seed=2).record(0.0), name="culture.nwb")
+    inspection = inspect_recording(SyntheticCulture(seed=2).record(0.0), name="culture.nwb")
     data = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
     text = inspection_text(inspection)
     assert text.startswith(f"culture.nwb: {data['verdict']}")
@@ -256,7 +256,7 @@ def axes_of(figure):  # type: ignore[no-untyped-def]
 
 
 def test_figures_name_units_and_conditions() -> None:
-    source = MadeUpCulture(seed=1).record(0.0)
+    source = SyntheticCulture(seed=1).record(0.0)
     responses = extract_responses(source)
     labels = [condition.label for condition in responses.conditions]
     raster = draw_raster(source, responses)

@@ -23,7 +23,7 @@ from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import Task, carry_out, told
 from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from worker_tasks import Die, Fail, Join, Starve, Stumble
 
 CORE = min(os.sched_getaffinity(0))
@@ -207,7 +207,7 @@ def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
 
 def test_a_recording_is_known_by_what_it_says_not_by_what_nwb_adds(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("again", 1), ("other", 2)):
-        write_nwb(make_up_recording(seed, patterns=5, channels=16), tmp_path / f"{name}.nwb")
+        write_nwb(synthetic_recording(seed, patterns=5, channels=16), tmp_path / f"{name}.nwb")
     made, again, other = (tmp_path / f"{name}.nwb" for name in ("a", "again", "other"))
     assert made.read_bytes() != again.read_bytes()
     assert digest_of(made) == digest_of(again) != digest_of(other)

@@ -31,7 +31,7 @@ from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
 from animat.live.shadowing import LiveRun, live
-from animat.neurons.made_up import made_up_simulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.reading import read_recordings
@@ -458,7 +458,7 @@ def test_what_cannot_be_is_refused_before_a_culture_is_opened(
 def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None:
     exchange = Exchange(tmp_path / "exchange")
     assert exchange.newest(-1) is None
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     for number in (0, 1, 2):
         exchange.publish(number, 10.0 * number, simulator)
     newest = exchange.newest(0)

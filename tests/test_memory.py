@@ -32,7 +32,7 @@ from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
@@ -576,9 +576,9 @@ def test_training_tells_what_is_remembered() -> None:
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:
-    write_nwb(make_up_recording(1, channels=32), tmp_path / "made-up.nwb")
+    write_nwb(synthetic_recording(1, channels=32), tmp_path / "synthetic.nwb")
     with pytest.warns(UserWarning, match="presented in blocks"):
-        environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "made-up.nwb", kind="memory")
+        environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "synthetic.nwb", kind="memory")
     environment.reset(seed=1)
     rates_hz = [environment.step(0)[4]["rate_hz"] for _ in range(20)]
     assert len(set(rates_hz)) > 1

@@ -108,6 +108,8 @@ def test_a_studys_former_keys_are_read_by_their_names_of_today(tmp_path: Path) -
     former, today = tmp_path / "former.toml", tmp_path / "today.toml"
     text = """optimum_resolution = 0.5
 optimum_episodes = 7
+[culture]
+kind = "synthetic"
 [simulators]
 allow = ["dead-window"]
 [[robots]]
@@ -127,6 +129,7 @@ mapping = "linear"
         ("arms", "conditions"),
         ("gradient_steps", "updates"),
         ("tau", "follow"),
+        ("synthetic", "made-up"),
     ):
         text = text.replace(now, before)
     former.write_text(text)

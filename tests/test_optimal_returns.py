@@ -23,8 +23,8 @@ from animat.evaluation.resampling import _rough, with_intervals
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.extraction import extract_responses
@@ -37,7 +37,7 @@ ROBOT = Cartpole(episode_limit=60)
 
 @pytest.mark.oracle
 def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_stimuli() -> None:
-    responses = extract_responses(make_up_recording(1, patterns=40, channels=64))
+    responses = extract_responses(synthetic_recording(1, patterns=40, channels=64))
     (found,) = optimal_returns(responses, ROBOT, [Thresholds(9)], resolution=0.25, resamples=0)
     simulator = fit_histogram(responses)
     environment = Animat(ROBOT, Thresholds(9), 5)
@@ -58,7 +58,7 @@ def test_inspect_tells_the_optimum(
 ) -> None:
     rough = partial(optimal_returns, resolution=0.25, episodes=20, resamples=4)
     monkeypatch.setattr("animat.evaluation.optimal_returns.optimal_returns", rough)
-    write_nwb(make_up_recording(1, patterns=40, channels=64), tmp_path / "a.nwb")
+    write_nwb(synthetic_recording(1, patterns=40, channels=64), tmp_path / "a.nwb")
     assert main(["inspect", str(tmp_path / "a.nwb"), "--optimum", "cartpole", "--json"]) == 0
     said = capsys.readouterr().out.splitlines()
     (inspected,) = json.loads(said[-1])["recordings"]
@@ -73,7 +73,7 @@ def test_inspect_tells_the_optimum(
 
 
 def test_where_there_is_no_optimum_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_nwb(make_up_recording(1, patterns=5, channels=16), tmp_path / "a.nwb")
+    write_nwb(synthetic_recording(1, patterns=5, channels=16), tmp_path / "a.nwb")
     command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--optimum", "navigation", "--json"]
     assert main(command) == 1
     said = capsys.readouterr().out
@@ -134,7 +134,7 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
 
 
 def test_conditions_left_out_leave_the_others_and_their_past_alone() -> None:
-    source = extract_responses(make_up_recording(1, patterns=10, channels=16))
+    source = extract_responses(synthetic_recording(1, patterns=10, channels=16))
     kept = source.only([3, 1])
     assert [c.label for c in kept.conditions] == [source.conditions[3].label, source.conditions[1].label]
     assert kept.rates_of(0).tolist() == source.rates_of(3).tolist()

@@ -19,15 +19,15 @@ from animat.evaluation.commands import commands_of
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import cubic
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import EmpiricalSimulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
 from animat.robots.grid import Axis, Grid, grid_for
 from animat.robots.navigation import Navigation, NavigationState
 from animat.wrappers import ShuffledDelivery
 
-SIMULATOR = made_up_simulator()
+SIMULATOR = synthetic_simulator()
 
 
 def coins(*heads: int) -> EmpiricalSimulator:
@@ -189,7 +189,7 @@ def test_a_pole_is_balanced_without_neurons() -> None:
 def test_more_separated_conditions_allow_more() -> None:
     robot = Navigation()
     means = [[42.0 + spread * (i - 2) for i in range(5)] for spread in (0.0, 3.0, 6.0, 9.0)]
-    cases = [(Animat(robot, Thresholds(1), 5), made_up_simulator(m)) for m in means]
+    cases = [(Animat(robot, Thresholds(1), 5), synthetic_simulator(m)) for m in means]
     found = best_returns(cases, resolution=0.5, episodes=0)
     values = [optimum.value for optimum in found]
     assert values == sorted(values)

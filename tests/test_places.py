@@ -17,8 +17,8 @@ from animat.cli.record import Record
 from animat.cli.responses import Fitting
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.conditions import conditions_named
 from animat.stimulation.places import check_places, electrodes_of, read_places
 from animat.stimulation.protocol import Protocol
@@ -136,7 +136,7 @@ def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixtur
     file.write_text("[[1, 2]")
     assert main(["record", "--places", str(file), "--out", str(out)]) == 1
     assert "places.json: places: expected JSON" in capsys.readouterr().err
-    assert main(["record", "--culture", "made-up", "--places", "halves", "--out", str(out)]) == 1
+    assert main(["record", "--culture", "synthetic", "--places", "halves", "--out", str(out)]) == 1
     assert "no places; --culture virtual takes others" in capsys.readouterr().err
     assert not out.exists()
 
@@ -152,7 +152,7 @@ def test_the_command_says_how_to_train_on_places(
 
 
 def test_recordings_of_places_that_are_mixed_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (file,) = write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    (file,) = write_synthetic_series(0, tmp_path / "recordings", sessions=1)
     write_nwb(replace(read_recording(file), protocol=Protocol(places="halves")), tmp_path / "places.nwb")
     for path, is_told in ((file, False), (tmp_path / "places.nwb", True)):
         Fitting().timeline([path])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from animat.recordings.findings import Finding
-from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import SyntheticCulture
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from test_inspection import answering
@@ -59,7 +59,7 @@ def test_an_artefact_counted_as_spikes(until_ms: float, severity: str) -> None:
 
 def test_a_strong_response_is_no_artefact() -> None:
     assert "artefact-spikes" not in findings(answering({5: 60.0, 10: 90.0}))
-    assert "artefact-spikes" not in findings(MadeUpCulture(seed=2).record(0.0))
+    assert "artefact-spikes" not in findings(SyntheticCulture(seed=2).record(0.0))
 
 
 @pytest.mark.parametrize("peak_ms", [2.6, 3.0, 4.0])

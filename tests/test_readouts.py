@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.response_table import ResponseTable
+from animat.recordings.synthetic import SyntheticCulture
 from animat.responses.extraction import extract_responses, responses_of
 from animat.responses.readouts import ALL, Readouts, count_readouts, read_readouts, readouts_on
 from animat.responses.series import extract_series
@@ -24,7 +24,7 @@ WINDOW_MS = (2.0, 10.0)
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    return MadeUpCulture(1, patterns=12, channels=32, burst_share=0.1).record()
+    return SyntheticCulture(1, patterns=12, channels=32, burst_share=0.1).record()
 
 
 @pytest.fixture(scope="module")

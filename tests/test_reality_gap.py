@@ -33,8 +33,8 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
 from animat.neurons.kinds import Kind
-from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
+from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
@@ -414,7 +414,7 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
 
 
 def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
-    """n made-up responses to each of five conditions; of culture and recording alike."""
+    """n synthetic responses to each of five conditions; of culture and recording alike."""
     return Responses(
         condition=np.repeat(np.arange(5), n),
         rate_hz=np.concatenate([rng.gamma(6, mean_hz / 6, n) for mean_hz in MEANS_HZ]),

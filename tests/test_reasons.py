@@ -1,4 +1,4 @@
-"""Why a return differs from its prediction: each reason is named where made-up sessions have it, and else rarely."""
+"""Why a return differs from its prediction: each reason is named where synthetic sessions have it, and else rarely."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EVERY = np.arange(EPISODES * ACTIONS)
 
 
 def session(seed: int, *, gap: int = -1, **changed: Any) -> Evidence:
-    """A made-up one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
+    """A synthetic one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
     one condition more or less; what is told of it is changed by functions of the arrays."""
     rng = np.random.default_rng(seed)
     recorded = rng.normal(MEANS_HZ[:, None], 4.0, (2, RECORDED))

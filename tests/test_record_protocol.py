@@ -17,8 +17,8 @@ from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
 from animat.cultures.series import check_interval
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.schedule import make_schedule
@@ -28,16 +28,16 @@ MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.
 
 
 @pytest.fixture(scope="module")
-def made_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("made-up") / "made-up.nwb"
-    write_nwb(make_up_recording(1, patterns=6, channels=16), file)
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("synthetic") / "synthetic.nwb"
+    write_nwb(synthetic_recording(1, patterns=6, channels=16), file)
     return file
 
 
 @pytest.fixture
-def replayed(made_up: Path, tmp_path: Path) -> list[str]:
-    """The command that records a replay of a made-up recording, as far as the protocol."""
-    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(made_up), "--out",
+def replayed(synthetic: Path, tmp_path: Path) -> list[str]:
+    """The command that records a replay of a synthetic recording, as far as the protocol."""
+    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(synthetic), "--out",
             str(tmp_path / "out")]  # fmt: skip
 
 
@@ -157,7 +157,7 @@ def test_pulses_faster_than_the_response_window_are_warned_of(
         ({"protocol": Path("mine.json")}, 10.0),
         ({"presentations": 800}, 10.0),
         ({"places": "halves"}, 10.0),
-        ({"culture": "made-up"}, 10.0),
+        ({"culture": "synthetic"}, 10.0),
     ],
 )
 def test_recordings_are_as_far_apart_as_the_usual_ones_take(options: dict[str, Any], interval_min: float) -> None:
@@ -169,12 +169,12 @@ def test_halves_fit_into_the_usual_interval() -> None:
     check_interval(record._protocol(), 2, record._interval_min)
 
 
-def test_made_up_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_synthetic_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.json").write_text(MINE.to_json())
-    command = ["record", "--culture", "made-up", "--out", str(tmp_path / "out")]
+    command = ["record", "--culture", "synthetic", "--out", str(tmp_path / "out")]
     for more in (["--protocol", str(tmp_path / "mine.json")], ["--pulses", "0"], ["--order", "mixed"]):
         assert main([*command, *more]) == 1
-        assert "--protocol: made-up recordings are blocked" in capsys.readouterr().err
+        assert "--protocol: synthetic recordings are blocked" in capsys.readouterr().err
 
 
 def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from animat.coding.mapping import REGISTRY, mapping_from_data, mapping_named, ma
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.recordings.made_up import write_made_up_series
+from animat.recordings.synthetic import write_synthetic_series
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, RobotSpec, Study
@@ -102,7 +102,7 @@ def test_its_commands_are_those_that_the_robot_gets(package: Path) -> None:
 
 @pytest.mark.oracle
 def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: Any) -> None:
-    write_made_up_series(0, "recordings", sessions=1)
+    write_synthetic_series(0, "recordings", sessions=1)
     few = ["--recordings", "recordings", "--policies", "1", "--iterations", "256", "--workers", "1"]
     assert main(["train", "cartpole", *few, "--mapping", STEEP]) == 0
     forget()
@@ -119,7 +119,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 @pytest.mark.oracle
 def test_a_study_has_conditions_with_it(package: Path) -> None:
     study = Study(
-        culture=Source("made-up", sessions=1, presentations=40, channels=16),
+        culture=Source("synthetic", sessions=1, presentations=40, channels=16),
         robots=(RobotSpec("cartpole", iterations=240),),
         arms=(Arm("steep", mapping=STEEP), Arm("one threshold")),
         policies=1,

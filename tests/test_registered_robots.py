@@ -22,7 +22,7 @@ from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.recordings.made_up import write_made_up_series
+from animat.recordings.synthetic import write_synthetic_series
 from animat.robots import (
     ROBOTS,
     Cartpole,
@@ -116,7 +116,7 @@ def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path)
 
 @pytest.mark.oracle
 def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: Any) -> None:
-    write_made_up_series(0, "recordings", sessions=1)
+    write_synthetic_series(0, "recordings", sessions=1)
     few = ["--recordings", "recordings", "--policies", "1", "--iterations", "256", "--workers", "1"]
     assert main(["train", ROVER, *few, "--parameters", "episode_limit=12"]) == 0
     forget()
@@ -141,7 +141,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
-        culture=Source("made-up", sessions=1, presentations=40, channels=16),
+        culture=Source("synthetic", sessions=1, presentations=40, channels=16),
         robots=(RobotSpec("rover", iterations=240),),
         policies=1,
         episodes=2,

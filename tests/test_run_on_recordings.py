@@ -20,8 +20,8 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.series import extract_series
@@ -118,8 +118,8 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
 def test_recordings_of_no_virtual_culture_are_told(
     tmp_path: Path, small_ones: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_nwb(make_up_recording(1, patterns=40, channels=32), tmp_path / "made-up.nwb")
-    assert run(tmp_path / "session", policy_of(0), tmp_path / "made-up.nwb") == 0
+    write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
+    assert run(tmp_path / "session", policy_of(0), tmp_path / "synthetic.nwb") == 0
     assert "the recordings are of no virtual culture, and this is virtual culture 1" in capsys.readouterr().err
 
 

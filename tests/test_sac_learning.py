@@ -16,8 +16,8 @@ from scipy.optimize import brentq
 
 from animat.coding.mapping import mapping_named
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.training.sac import (
@@ -241,7 +241,7 @@ def test_two_commands_each_follow_their_own() -> None:
 @pytest.mark.oracle
 def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
     """Where gradients are all but 0, steps of their noise put units out: two of three with Adam's usual epsilon."""
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     environment = Animat(Navigation(), mapping_named("1-threshold"), simulator.n_conditions)
     settings = SAC(replay=16_384)
     keys = jax.random.split(jax.random.key(1), 8)
@@ -262,7 +262,7 @@ def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
 
 
 def animat() -> tuple[Environment[Any], NeuronSimulator]:
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     return Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions), simulator
 
 
@@ -309,6 +309,6 @@ def test_another_simulator_is_data_and_compiles_nothing() -> None:
     environment, simulator = animat()
     learner, _ = trained_for(environment, SMALL, 2, seed=7, simulator=simulator)
     compiled = compiled_chunk._cache_size()  # type: ignore[attr-defined]
-    other = made_up_simulator((50, 40, 30, 20, 10))
+    other = synthetic_simulator((50, 40, 30, 20, 10))
     chunk(environment, SMALL, learner, other, 2, 3)
     assert compiled_chunk._cache_size() == compiled  # type: ignore[attr-defined]

@@ -35,12 +35,12 @@ from animat.evaluation.heuristic import heuristic_policy
 from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
-from animat.neurons.made_up import made_up_simulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.progress import Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
-from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.report.html import cell, with_error
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
@@ -353,7 +353,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
         assert record("killed") == undisturbed
 
 
-@pytest.mark.parametrize("kind", ["virtual", "made-up"])
+@pytest.mark.parametrize("kind", ["virtual", "synthetic"])
 def test_a_study_of_a_virtual_culture_is_one_of_its_tissue_s_revision(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -385,7 +385,7 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, mo
     monkeypatch.setattr("animat.studies.pictures.save_figure", lambda figure, path: path)
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
-        made = make_up_recording(1, patterns=20, channels=channels)
+        made = synthetic_recording(1, patterns=20, channels=channels)
         write_nwb(replace(made, start_min=minute), folder / "recordings" / recording_name(minute))
     study = Study(culture=Source("files", files=("recordings",)))
     CulturePictures(study).run(folder, Silent())
@@ -394,7 +394,7 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, mo
 
 def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
     for i, start_min in enumerate((1234567.0, 1234567.25)):
-        write_nwb(make_up_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
+        write_nwb(synthetic_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
     study = Study(culture=Source("files", files=("0.nwb", "1.nwb")))
     with pytest.raises(InvalidFile, match=r"two that would both be recording_1\.23457e"):
         Record(study, tmp_path).run(tmp_path / "study", Silent())
@@ -402,14 +402,14 @@ def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None
 
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     made = tmp_path / "made"
-    write_made_up_series(1, made, sessions=2, patterns=5, channels=16)
+    write_synthetic_series(1, made, sessions=2, patterns=5, channels=16)
     study = Study(culture=Source("files", files=("made",)), robots=(RobotSpec("navigation", iterations=100),))
     with pytest.raises(AnimatError, match="fit: halted"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
     written = tmp_path / "study" / "study.toml"
     assert read_study(written) == study
     assert written.read_text().startswith("# files: as seen from where the specification lay.")
-    write_nwb(make_up_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
+    write_nwb(synthetic_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
 
@@ -577,7 +577,7 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
     since_s = (first.spike_times_s[:, None] - first.stimuli.time_s)[:, first.stimuli.is_last_of_presentation]
     for row in psth:
         low_s, high_s = float(row["from_ms"]) * 1e-3, float(row["to_ms"]) * 1e-3
-        # Spikes of made-up recordings lie on no edge.
+        # Spikes of synthetic recordings lie on no edge.
         spikes = np.count_nonzero((since_s > low_s) & (since_s < high_s))
         assert int(row["spikes"]) == spikes
         exposure_s = (high_s - low_s) * since_s.shape[1] * 32
@@ -736,7 +736,7 @@ COMPARED = (
         ),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the arms"),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another arm"),
-        ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual', 'made-up' or 'files', got 'alive'"),
+        ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual', 'synthetic' or 'files', got 'alive'"),
         ("[culture]\nkind = 'files'", "culture.files: expected some"),
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
         ("[culture]\ninterval_min = inf", "culture.interval_min: expected a finite number, got inf"),
@@ -770,7 +770,7 @@ COMPARED = (
                 ("", "optimum_episodes"),
                 ("[culture]\n", "sessions"),
                 ("[culture]\n", "presentations"),
-                ("[culture]\nkind = 'made-up'\n", "channels"),
+                ("[culture]\nkind = 'synthetic'\n", "channels"),
                 ("[[robots]]\nname = 'cartpole'\n", "iterations"),
                 ("[algorithm]\n", "hidden"),
                 ("[algorithm]\n", "environments"),
@@ -785,7 +785,7 @@ COMPARED = (
         ),
         ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2.0, got 3.0"),
         ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
-        ("[culture]\nkind = 'made-up'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
+        ("[culture]\nkind = 'synthetic'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
         (f"policies = {'9' * 5000}", "expected TOML, got a mistake: Exceeds the limit (4300 digits)"),
         (f"policies = 0x{'f' * 5000}", "policies: expected at most 1,000, got a number of 20,000 bits"),
         (f"training_min = 0x{'f' * 5000}", "training_min: expected a number, got a number of 20,000 bits"),
@@ -864,7 +864,7 @@ def test_comparisons_are_made_at_the_nearest_recording() -> None:
 
 
 def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     moved = Compared("before and after", "1 threshold", "control", at_min=29.0)
     study = Study(
         culture=Source("files", files=("made",)),
@@ -880,7 +880,7 @@ def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
 
 
 def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     one = Study(culture=Source("files", files=("made",)), simulators=Simulators(conditions="all"))
     Record(one, tmp_path).run(tmp_path / "study", Silent())
     with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more .* got one \(all\)"):
@@ -931,7 +931,7 @@ def test_every_need_of_a_plan_is_a_job_of_it() -> None:
 
 
 def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     study = Study(culture=Source("files", files=("made",)), simulators=Simulators(kind="empirical"))
     folder = tmp_path / "study"
     copies = Record(study, tmp_path).run(folder, Silent())
@@ -950,7 +950,7 @@ def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
 
 @pytest.mark.oracle
 def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     study = replace(
         read_study(TINY),
         culture=Source("files", files=("made",)),
@@ -968,7 +968,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
 
 @pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
 def test_the_heuristic_policy_goes_where_it_should(mapping: str) -> None:
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     for robot, lean_right in (
         (Cartpole(), [0.0, 0.0, 0.05, 0.0]),
         # At the top, looking right: the goal is below, which is clockwise.
@@ -982,5 +982,5 @@ def test_the_heuristic_policy_goes_where_it_should(mapping: str) -> None:
         else:
             seen[1, 1] = 0.95  # below the goal
         actor = jax.tree.map(lambda leaf: leaf[0], rule)
-        # The made-up means rise with the frequency.
+        # The synthetic means rise with the frequency.
         assert actor.act(environment, seen, np.zeros((2, 1))).tolist() == [4, 0]

@@ -34,8 +34,8 @@ from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.answered import answered
-from animat.recordings.made_up import write_made_up_series
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
@@ -333,7 +333,7 @@ def test_the_file_of_the_page_is_short() -> None:
 
 @pytest.mark.oracle
 def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
-    write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    write_synthetic_series(0, tmp_path / "recordings", sessions=1)
     text, n = re.subn(r"iterations=\d[\d_]*", "iterations=1_000", FILE)
     assert n == 1 and "episode_limit: int = 60" in text
     (tmp_path / "two_wheels.py").write_text(text.replace("episode_limit: int = 60", "episode_limit: int = 8"))
@@ -347,7 +347,7 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
 
 @pytest.mark.oracle
 def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    write_synthetic_series(0, tmp_path / "recordings", sessions=1)
     (tmp_path / "my_wheels.py").write_text(FILE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

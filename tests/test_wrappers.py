@@ -22,8 +22,8 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Actor, Constant, Networks, Seen, Uniform, Uniforms, roll_out
 from animat.evaluation.table import evaluate
 from animat.live.plan import Timetable, check_plan
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.memory import MemorySimulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole
 from animat.stimulation.protocol import Protocol
 from animat.training.group import programs
@@ -63,7 +63,7 @@ def test_the_episode_limit_cuts_off_what_has_not_ended_by_itself() -> None:
 def test_shuffled_delivery_draws_every_condition_as_often_and_changes_nothing_else() -> None:
     shuffled, n = ShuffledDelivery(ANIMAT), 20_000
     uniforms = jax.random.uniform(jax.random.key(3), (n, shuffled.noise_size))
-    state, simulator = ANIMAT.reset(jax.random.key(0)), made_up_simulator()
+    state, simulator = ANIMAT.reset(jax.random.key(0)), synthetic_simulator()
     every = jax.jit(jax.vmap(lambda u, a, of: of.advance(u, state, a, simulator), (0, 0, None)), static_argnums=2)
     chosen = jnp.arange(n) % 5
     after = every(uniforms, chosen, shuffled)

@@ -22,8 +22,8 @@ _PRESENTED = ("order", "pulses", "presentations", "places")
 class Record:
     """Record a culture: one NWB file a recording. Goes on where it stopped."""
 
-    culture: Literal["virtual", "made-up", "replay", "cl1", "maxone"] = "virtual"
-    """virtual: simulated neurons on a simulated array; made-up: responses of known distributions, no neurons; replay:
+    culture: Literal["virtual", "synthetic", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; synthetic: responses of known distributions, no neurons; replay:
     answers from recordings; cl1 and maxone: the devices"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
@@ -75,12 +75,12 @@ class Record:
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
-        protocol = None if self.culture == "made-up" else self._protocol()
+        protocol = None if self.culture == "synthetic" else self._protocol()
         if protocol is not None and self.protocol is not None:
             _say_too_fast(protocol)
         with Bar("recording") as progress:
-            if self.culture == "made-up":
-                files = self._made_up(progress)
+            if self.culture == "synthetic":
+                files = self._synthetic(progress)
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
@@ -91,17 +91,17 @@ class Record:
             )
         return {"recordings": [str(file) for file in files]}
 
-    def _made_up(self, progress: Progress) -> list[Path]:
-        from animat.recordings.made_up import write_made_up_series
+    def _synthetic(self, progress: Progress) -> list[Path]:
+        from animat.recordings.synthetic import write_synthetic_series
 
         usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.presentations in (None, 100)
         if not usual or self.places is not None or self.protocol is not None:
             raise InvalidArgument(
-                "--order, --pulses, --presentations, --places, --protocol: made-up recordings are blocked, with one "
+                "--order, --pulses, --presentations, --places, --protocol: synthetic recordings are blocked, with one "
                 "pulse, 100 presentations and no places; --culture virtual takes others"
             )
         with exclusive_lock(self.out):
-            return write_made_up_series(
+            return write_synthetic_series(
                 self.seed, self.out, sessions=self._sessions, interval_min=self._interval_min, progress=progress
             )
 
@@ -125,7 +125,7 @@ class Record:
         from animat.cultures.series import check_interval
         from animat.recordings.reading import read_recordings
 
-        assert self.culture != "made-up"
+        assert self.culture != "synthetic"
         # What can be refused is refused before a culture is opened, whose patterns are not known until then.
         check_interval(self._protocol(), self._sessions, self._interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
@@ -146,15 +146,15 @@ class Record:
     def _sessions(self) -> int:
         if self.sessions is not None:
             return self.sessions
-        # Made-up recordings are the paper's.
-        return 15 if self.paper or self.culture == "made-up" else 2
+        # Synthetic recordings are the paper's.
+        return 15 if self.paper or self.culture == "synthetic" else 2
 
     @property
     def _interval_min(self) -> float:
         if self.interval_min is not None:
             return self.interval_min
         # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
-        usual = not self.paper and self.culture != "made-up" and self.protocol is None
+        usual = not self.paper and self.culture != "synthetic" and self.protocol is None
         return 5.0 if usual and all(getattr(self, name) is None for name in _PRESENTED) else 10.0
 
     def _protocol(self, patterns: int = 100) -> Protocol:
@@ -163,7 +163,7 @@ class Record:
         from animat.stimulation.places import read_places
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER, read_protocol
 
-        assert self.culture != "made-up"
+        assert self.culture != "synthetic"
         # What a file leaves out is the paper's: it stands alone.
         paper = self.paper or self.protocol is not None
         usual = replace(PAPER if paper else CLOSED_LOOP, patterns=min(100, patterns), pulse=pulse_for(self.culture))

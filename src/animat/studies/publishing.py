@@ -73,7 +73,7 @@ class Publish(StudyTask):
 
 def _lead(study: Study) -> str:
     robots = " and ".join(spec.name for spec in study.robots)
-    neurons = {"virtual": "a virtual culture", "made-up": "made-up responses", "files": "recordings"}[
+    neurons = {"virtual": "a virtual culture", "synthetic": "synthetic responses", "files": "recordings"}[
         study.culture.kind
     ]
     return (

@@ -36,7 +36,7 @@ class Record(StudyTask):
         out = folder / RECORDINGS
         _remove_changed(folder)
         kind = self.study.culture.kind
-        make = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[kind]
+        make = {"virtual": _virtual, "synthetic": _synthetic, "files": self._copies}[kind]
         files = make(self.study, out, progress)
         kept = (SELECTION_FILE, STATE_FILE) if kind == "virtual" else ()
         return [*files, *(out / name for name in kept)]
@@ -82,11 +82,11 @@ def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     )
 
 
-def _made_up(study: Study, out: Path, progress: Progress) -> list[Path]:
-    from animat.recordings.made_up import write_made_up_series
+def _synthetic(study: Study, out: Path, progress: Progress) -> list[Path]:
+    from animat.recordings.synthetic import write_synthetic_series
 
     culture = study.culture
-    return write_made_up_series(
+    return write_synthetic_series(
         culture.seed,
         out,
         sessions=culture.sessions,

@@ -23,6 +23,8 @@ FORMER = {
     "algorithm": FORMER_SETTINGS,
 }
 """What keys are called in files of before, table by table (at the top: none)."""
+FORMER_KINDS = {"made-up": "synthetic"}
+"""Of cultures."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
@@ -60,6 +62,9 @@ def _in_todays_words(data: dict[str, Any]) -> dict[str, Any]:
             data[name] = _renamed(table, names)
         elif isinstance(table, list):
             data[name] = [_renamed(each, names) if isinstance(each, dict) else each for each in table]
+    culture = data.get("culture")
+    if isinstance(culture, dict) and isinstance(kind := culture.get("kind"), str):
+        data["culture"] = {**culture, "kind": FORMER_KINDS.get(kind, kind)}
     return data
 
 
