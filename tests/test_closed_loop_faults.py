@@ -585,7 +585,7 @@ def test_a_session_comes_back_whatever_its_files_are_like(
 
 
 def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again(
-    few_redrawn: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    few_bootstraps: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cultures = []
 

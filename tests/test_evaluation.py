@@ -44,11 +44,11 @@ WITHOUT_NEURONS = Policy(
 def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int = 0) -> Policy:  # type: ignore[type-arg]  # noqa: B008
     """A policy with random weights."""
     rng = np.random.default_rng(seed)
-    sizes = (len(robot.quantities), 16, 16, len(timeline.conditions))
+    sizes = (len(robot.observation_spec), 16, 16, len(timeline.conditions))
     return Policy(
         weights=tuple(rng.normal(0, 1, size).astype(np.float32) for size in itertools.pairwise(sizes)),
         biases=tuple(rng.normal(0, 1, size).astype(np.float32) for size in sizes[1:]),
-        scales=np.array([quantity.scale for quantity in robot.quantities], np.float32),
+        scales=np.array([quantity.scale for quantity in robot.observation_spec], np.float32),
         robot=robot,
         mapping=Thresholds(1),
         conditions=timeline.conditions,

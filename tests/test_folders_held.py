@@ -19,7 +19,7 @@ from fake_culture import FakeCulture
 from test_live import ONE, PROTOCOL
 from test_run_on_recordings import policy_of
 
-pytestmark = pytest.mark.usefixtures("few_redrawn")
+pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
 OPENING = ["record cl1", "record replay", "run", "run on recordings", "live"]
 

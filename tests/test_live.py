@@ -45,7 +45,7 @@ from animat.training.specification import Training
 from cultures import small_culture
 from fake_culture import FakeCulture
 
-pytestmark = pytest.mark.usefixtures("few_redrawn")
+pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
 SMALL = SAC(environments=8, gradient_steps=1, batch=16, replay=1024, hidden=8)
 TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iterations=6000, seed=3, algorithm=SMALL)

@@ -36,8 +36,8 @@ class Anywhere(Robot[NavigationState]):
     paper_iterations: ClassVar[int] = 1000
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        return COURSE.quantities
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return COURSE.observation_spec
 
     def reset(self, key: Array) -> NavigationState:
         x, y, heading = jax.random.uniform(key, (3,))

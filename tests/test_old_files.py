@@ -26,7 +26,7 @@ from animat.training.settings import FORMER, SAC
 from animat.training.specification import Training
 from test_studies import Halts
 
-pytestmark = pytest.mark.usefixtures("in_this_process", "few_redrawn")
+pytestmark = pytest.mark.usefixtures("in_this_process", "few_bootstraps")
 
 ARCHIVE = Path(__file__).parent / "data" / "commit_5e75c96.tar.xz"
 

@@ -133,7 +133,7 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     )
 
 
-def test_conditions_left_out_leave_the_others_and_their_past_alone() -> None:
+def test_conditions_left_out_leave_the_others_and_their_history_alone() -> None:
     source = extract_responses(synthetic_recording(1, patterns=10, channels=16))
     kept = source.only([3, 1])
     assert [c.label for c in kept.conditions] == [source.conditions[3].label, source.conditions[1].label]
@@ -156,13 +156,13 @@ def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None
         assert -100 <= known.interval.low <= best.value <= known.interval.high <= SHORT.episode_limit
 
 
-def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_redrawn() -> None:
+def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_bootstrapped() -> None:
     """That is what 95 % of 39 are: a value drawn anew falls outside of so many once in twenty."""
     environment, responses = Animat(SHORT, Thresholds(1), 5), answers([40] * 5, 3)
     best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
     (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25)
     rng = np.random.default_rng(1)
-    simulators = [fit_histogram(each) for each in (responses, *(responses.redrawn(rng) for _ in range(39)))]
+    simulators = [fit_histogram(each) for each in (responses, *(responses.bootstrapped(rng) for _ in range(39)))]
     grid = _rough(grid_for(SHORT), 0.25)
     values, _ = rough_values([(environment, each) for each in simulators], grid, 1)
     moved = values[1:] - values[0]

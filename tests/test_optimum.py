@@ -52,7 +52,7 @@ class Stairs(Robot[StairState]):
     paper_iterations: ClassVar[int] = 0
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("step", "1", 1.0),)
 
     def reset(self, key: Any) -> StairState:

@@ -50,7 +50,7 @@ class Slider(Robot[At]):
     paper_iterations: ClassVar[int] = 1000
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("x", "m", 1.0),)
 
     def reset(self, key: Any) -> At:
@@ -158,10 +158,10 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"noise_size": -1}, "noise_size: expected a whole number"),
         ({"episode_limit": 0}, "episode_limit: expected a whole number"),
         ({"name": None}, "name: expected a text"),
-        ({"quantities": ()}, "quantities: expected a tuple of Quantity"),
-        ({"quantities": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
-        ({"quantities": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
-        ({"quantities": (Quantity("x", "m", np.nan),)}, "x: expected a scale from 1e-12 to 1e.12, got nan"),
+        ({"observation_spec": ()}, "observation_spec: expected a tuple of Quantity"),
+        ({"observation_spec": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
+        ({"observation_spec": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
+        ({"observation_spec": (Quantity("x", "m", np.nan),)}, "x: expected a scale from 1e-12 to 1e.12, got nan"),
         ({"__hash__": None}, "expected a frozen dataclass"),
     ],
 )
@@ -178,7 +178,9 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
 @pytest.mark.parametrize("scale", [1e-12, 1e12, *(pytest.param(x, marks=pytest.mark.oracle) for x in (1e-7, 1e7))])
 def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
     # In the unit that the robot is observed in, it moves as far as the scale says.
-    robot = slider(quantities=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale]))
+    robot = slider(
+        observation_spec=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale])
+    )
     for policy in train(training(robot, "1-threshold"), timeline_of(), None).values():
         assert np.all(np.isfinite(policy.act_greedily(np.array([scale], np.float32))))
 

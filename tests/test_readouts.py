@@ -101,7 +101,7 @@ def test_responses_that_are_chosen_keep_their_readouts(recording: Recording, hal
     some = responses.only([3, 1])
     np.testing.assert_array_equal(some.read_of(0), responses.read_of(3))
     # Each response that is drawn anew is one of its condition, with both of its readouts.
-    anew = responses.redrawn(np.random.default_rng(0))
+    anew = responses.bootstrapped(np.random.default_rng(0))
     for condition in range(len(responses.conditions)):
         known = set(map(tuple, responses.read_of(condition).tolist()))
         assert set(map(tuple, anew.read_of(condition).tolist())) <= known

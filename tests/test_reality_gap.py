@@ -75,7 +75,7 @@ def series(recordings: list[Recording]) -> list[Responses]:
 def policy_of(seed: int, series: list[Responses], robot: Robot[Any] | None = None, **changed: Any) -> Policy:
     rng = np.random.default_rng(seed)
     robot = robot or Navigation(episode_limit=8)
-    inputs = len(robot.quantities)
+    inputs = len(robot.observation_spec)
     sizes = ((inputs, 16), (16, 16), (16, 5))
     given: dict[str, Any] = {
         "weights": tuple(rng.standard_normal(s).astype(np.float32) for s in sizes),
@@ -105,14 +105,14 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
     """A run with random stimuli as its only control, its policies and what was told."""
     told: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("animat.reality_gap.calibration.REDRAWN", 4)
+        patch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
         return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, tell=told.append), told
 
 
 def test_the_table_holds_what_the_simulator_and_the_session_say(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 40)
+    monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 40)
     gap, policies = run(tmp_path, series)
     rows = {row.name: row for row in gap.rows}
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
@@ -137,7 +137,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     calibration = Calibration.of_series(series)
     environment = Animat(policies["p0"].robot, Thresholds(1), 5)
     both = networks_of(list(policies.values()), greedy=True)
-    simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.redrawn]
+    simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.bootstraps]
     rolled = [
         roll_out(environment, simulator, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, i))
         for i, simulator in enumerate(simulators)
@@ -191,7 +191,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     assert gap.verdict() in text
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     tmp_path: Path, series: list[Responses]
 ) -> None:
@@ -206,7 +206,7 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -351,16 +351,16 @@ def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> 
 
 
 @pytest.mark.oracle
-def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, series: list[Responses]) -> None:
+def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
-    moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.redrawn}
+    moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.bootstraps}
     assert len(moving) > 50
     fixed = calibration.with_percentiles(calibration.simulator.percentiles)
-    for each in (fixed.simulator, *fixed.redrawn):
+    for each in (fixed.simulator, *fixed.bootstraps):
         np.testing.assert_array_equal(each.percentiles, calibration.simulator.percentiles)
     policy = policy_of(0, series, provenance={"training": {"percentiles": "first"}})
     first = Calibration.of_series(series, policy, at_min=series[-1].start_min)
-    for each in (first.simulator, *first.redrawn):
+    for each in (first.simulator, *first.bootstraps):
         np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
     for adaptive in (True, False):
         with FakeCulture() as culture:
@@ -381,7 +381,7 @@ def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, serie
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
     tmp_path: Path, series: list[Responses]
 ) -> None:
@@ -429,12 +429,12 @@ def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
 
 
 @pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])
-def test_simulators_of_redrawn_responses_have_the_shape_of_the_recordings(kind: Kind, few_redrawn: None) -> None:
+def test_simulators_of_bootstrapped_responses_have_the_recordings_shape(kind: Kind, few_bootstraps: None) -> None:
     rng = np.random.default_rng(1)
     series = [drawn_responses(rng, 40), replace(drawn_responses(rng, 90), start_min=10.0)]
     calibration = Calibration.of_series(series, at_min=0.0, kind=kind)
     shapes = {
-        tuple(leaf.shape for leaf in jax.tree.leaves(each)) for each in (calibration.simulator, *calibration.redrawn)
+        tuple(leaf.shape for leaf in jax.tree.leaves(each)) for each in (calibration.simulator, *calibration.bootstraps)
     }
     assert len(shapes) == 1
 
@@ -475,7 +475,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
             gap.rows[0],
             predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),
             predicted_anew=np.array(
-                [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.redrawn)]
+                [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.bootstraps)]
             ),
             measured=returns(living, 40, 1000 + seed),
         )
@@ -491,15 +491,17 @@ def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
     rule = heuristic_policy(environment, fit_empirical(drawn_responses(rng, 5_000)))
     for n in (50, 800):
         calibration = Calibration.of_series([drawn_responses(rng, n)])
-        means = [roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.redrawn]
+        means = [
+            roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.bootstraps
+        ]
         widths.append(np.std(means))
-        percentiles = [np.asarray(s.percentiles) for s in calibration.redrawn]
+        percentiles = [np.asarray(s.percentiles) for s in calibration.bootstraps]
         assert np.ptp(percentiles, axis=0).min() > 0
     # As the square root of sixteen times as many.
     assert 2.5 < widths[0] / widths[1] < 6
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
     simulator = Calibration.of_series(series).simulator
     rng = np.random.default_rng(1)
@@ -540,7 +542,7 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     )
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 @pytest.mark.parametrize(("rest_min", "warned"), [(20.0, False), (45.0, True)])
 def test_a_recording_much_older_than_the_culture_is_said_to_be(
     tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
@@ -556,7 +558,7 @@ def test_a_recording_much_older_than_the_culture_is_said_to_be(
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     one, other = policy_of(0, series), policy_of(0, series, presentation=Presentation("mixed", 5))
@@ -573,7 +575,7 @@ def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series
     assert gap.loop.pulses == 5
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_a_budget_that_ends_early_leaves_what_was_measured(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, account=Account(Budget(pulses=60)), with_controls=False)
     assert gap.session.ending.by == "budget"
@@ -586,7 +588,7 @@ def test_a_budget_that_ends_early_leaves_what_was_measured(tmp_path: Path, serie
     gap.to_text()
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 class TestCommand:
     """`animat run` and `animat recover`, on a replay of recordings: quick, and with no culture but theirs."""
 

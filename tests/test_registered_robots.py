@@ -241,10 +241,10 @@ def test_robots_are_listed_with_what_each_can_do(
     assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
     assert "  no heuristic policy among the controls: rover has no method `heuristic`" in said
     assert "ModuleNotFoundError" in told["unusable"]["tank"] and "tank cannot be used: " in said
-    quantities = property(lambda self: ("x",))
-    monkeypatch.setattr(type(robot_named("rover")), "quantities", quantities)
+    observation_spec = property(lambda self: ("x",))
+    monkeypatch.setattr(type(robot_named("rover")), "observation_spec", observation_spec)
     assert main(["robots"]) == 1
-    assert "rover cannot be used: Rover.quantities: expected a tuple of Quantity" in capsys.readouterr().out
+    assert "rover cannot be used: Rover.observation_spec: expected a tuple of Quantity" in capsys.readouterr().out
     assert main(["robots", "my_nowhere:Tank"]) == 1
     assert capsys.readouterr().err.startswith("animat: robot: expected my_nowhere:Tank to be importable")
 

@@ -31,7 +31,7 @@ from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
 
-pytestmark = pytest.mark.usefixtures("few_redrawn")
+pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
 RULE = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=8)
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=20, setup_s=0.1)
@@ -40,11 +40,11 @@ FIVE_HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 
 def policy_of(seed: int, frequencies_hz: tuple[float, ...] = FIVE_HZ) -> Policy:
     rng, robot, n = np.random.default_rng(seed), Navigation(episode_limit=8), len(frequencies_hz)
-    sizes = ((len(robot.quantities), 16), (16, 16), (16, n))
+    sizes = ((len(robot.observation_spec), 16), (16, 16), (16, n))
     return Policy(
         weights=tuple(rng.standard_normal(size).astype(np.float32) for size in sizes),
         biases=tuple(np.zeros(size[1], np.float32) for size in sizes),
-        scales=np.ones(len(robot.quantities), np.float32),
+        scales=np.ones(len(robot.observation_spec), np.float32),
         robot=robot,
         mapping=Thresholds(1),
         conditions=tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in frequencies_hz),
@@ -197,7 +197,7 @@ def test_the_simulator_that_predicts_is_made_as_the_policies_unless_asked_otherw
 
     def take(policies: Any, culture: Any, calibration: Calibration, *_: Any, **__: Any) -> None:
         assert type(calibration.simulator) is kind
-        assert all(type(each) is kind for each in calibration.redrawn)
+        assert all(type(each) is kind for each in calibration.bootstraps)
         if numbers is not None:
             assert calibration.simulator.edges_hz.shape == (numbers,)  # type: ignore[attr-defined]
         raise Taken

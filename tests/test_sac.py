@@ -202,7 +202,7 @@ def test_actions_are_valid_and_possible_at_both_ends_of_the_uniforms(logits: lis
 
 def test_continuous_actions_follow_the_squashed_normal() -> None:
     environment = WithoutNeurons(Navigation(), None)
-    n = len(environment.quantities)
+    n = len(environment.observation_spec)
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 2)), jnp.array([[0.4, -0.7]])))
     uniforms = jax.random.uniform(jax.random.key(12), (20_000, 1))
     drawn = np.asarray(draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
@@ -212,7 +212,7 @@ def test_continuous_actions_follow_the_squashed_normal() -> None:
 
 def test_each_of_several_commands_follows_its_own_squashed_normal() -> None:
     environment = WithoutNeurons(Wheels(), None)
-    n = len(environment.quantities)
+    n = len(environment.observation_spec)
     outputs = jnp.array([[0.4, -1.0, -0.7, 0.2]])  # two means, then two log deviations
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 4)), outputs))
     uniforms = jax.random.uniform(jax.random.key(13), (20_000, 2))

@@ -134,7 +134,7 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
     after, _ = trained_for(environment, settings, 1, learner=before)
-    n = len(environment.quantities) + 1
+    n = len(environment.observation_spec) + 1
     rows = jnp.tile(after.replay[:1], (4, 1))
     action = rows[:, 2 * n] if commands is not None else rows[:, 2 * n : 2 * n + 1]
     batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, 2 * n + 1], rows[:, 2 * n + 2])
@@ -250,7 +250,7 @@ def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
     learners, _ = run(learners, simulator, jnp.int32(0), jnp.int32(400))
 
     def alive(actor: Network, replay: jax.Array) -> jax.Array:
-        hidden = replay[:8_000, : len(environment.quantities)]
+        hidden = replay[:8_000, : len(environment.observation_spec)]
         for layer in actor[:-1]:
             hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
         return jnp.mean(jnp.any(hidden > 0, axis=0))

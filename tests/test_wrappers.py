@@ -85,7 +85,7 @@ def test_wrappers_go_together_in_any_order() -> None:
         for i in range(2):
             state = environment.step(jax.random.key(i), state, jnp.int32(0), simulator)
             leaves += [environment.observe(state), *jax.tree.leaves(state)]
-        assert [quantity.name for quantity in environment.quantities] == ["step", "past"]
+        assert [quantity.name for quantity in environment.observation_spec] == ["step", "history"]
         assert len(environment.scales) == len(leaves[0]) == 2
         seen.append([np.asarray(leaf).tolist() for leaf in leaves])
     assert all(each == seen[0] for each in seen)

@@ -62,7 +62,7 @@ def _told(name: str) -> dict[str, Any]:
     lacks = lacking(robot)
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],
-        "observes": [{"name": each.name, "unit": each.unit} for each in robot.quantities],
+        "observes": [{"name": each.name, "unit": each.unit} for each in robot.observation_spec],
         "parameters": robot_to_dict(robot)["parameters"],
         "commands": robot.n_commands,
         "can": [name for name in WITHOUT if name not in lacks],

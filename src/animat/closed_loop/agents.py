@@ -70,7 +70,7 @@ class HeuristicController:
 
     def __post_init__(self) -> None:
         # Now: what JAX compiles for a first call would come late in a loop.
-        self.act(np.zeros(len(self.robot.quantities)), np.random.default_rng())
+        self.act(np.zeros(len(self.robot.observation_spec)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
         """The nearest."""

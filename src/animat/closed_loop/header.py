@@ -54,7 +54,7 @@ class Header:
 
 def observed_columns(robot: Robot[Any]) -> list[str]:
     """The numbers of a robot's observation, each by its name and unit: `cart_velocity_m_per_s`."""
-    return [f"{q.name}_{q.unit.replace('/', '_per_')}" if q.unit else q.name for q in robot.quantities]
+    return [f"{q.name}_{q.unit.replace('/', '_per_')}" if q.unit else q.name for q in robot.observation_spec]
 
 
 def read_header(file: Path, words: Mapping[str, Any]) -> Header:

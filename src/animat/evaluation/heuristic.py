@@ -50,7 +50,7 @@ class Heuristic(Actor):
 
 def _wanted(environment: Environment[Any], observation: Seen) -> Array:
     """The commands of the robot's `heuristic`, which sees the robot alone."""
-    of_robot = (observation * environment.scales)[:, : len(environment.robot.quantities)]
+    of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
     commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
     return commands
 

@@ -63,7 +63,7 @@ def bellman_backup(
         best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))),    (k, m) = outcomes_l(o)
 
     There is one layer of values for each case; for one whose neurons remember, a layer for each class of the
-    past. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
+    history. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
     once, node by node, which is fast, and what is left to do for each node is to interpolate along the row.
 
     Args:

@@ -50,8 +50,8 @@ class Setup:
     @property
     def observation_space(self) -> spaces.Box:
         """What is observed, in its own units, within the bounds that no episode passes."""
-        quantities = self.environment.quantities
-        low, high = (np.array([getattr(q, end) for q in quantities], np.float32) for end in ("low", "high"))
+        spec = self.environment.observation_spec
+        low, high = (np.array([getattr(q, end) for q in spec], np.float32) for end in ("low", "high"))
         return spaces.Box(low, high, dtype=np.float32)
 
     @property

@@ -124,7 +124,7 @@ def fit_timeline(
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
         kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one that was measured
-            after a past like the present one); None: `"memory"`, but `"histogram"` where stimuli were presented in
+            after a similar history); None: `"memory"`, but `"histogram"` where stimuli were presented in
             blocks, which hold nothing of what a culture answers after another condition.
         bins: of a histogram.
         range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own

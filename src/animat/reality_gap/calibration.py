@@ -21,7 +21,7 @@ from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import FITTED, Policy
 
-REDRAWN = 100
+BOOTSTRAPS = 100
 """Bootstrap samples of the recording's responses."""
 
 
@@ -31,7 +31,7 @@ class Calibration:
 
     Attributes:
         simulator: of the recording.
-        redrawn: simulators of bootstrap samples of its responses: what so many could as well have been.
+        bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
         responses_hz: non-burst responses of each condition, in the order of time, shape (responses,); of several
             readouts (responses, readouts).
         burst_threshold: ratio of active channels above which its responses were bursts.
@@ -45,7 +45,7 @@ class Calibration:
     """
 
     simulator: NeuronSimulator
-    redrawn: tuple[NeuronSimulator, ...]
+    bootstraps: tuple[NeuronSimulator, ...]
     responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
     burst_threshold: float
     burst_share: float
@@ -102,7 +102,7 @@ class Calibration:
         fit |= {"memory": memory, "room": room_for(series)}
         calibration = cls(
             simulator=simulator,
-            redrawn=tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN)),
+            bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
@@ -125,4 +125,4 @@ class Calibration:
         def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
-        return replace(self, simulator=fixed(self.simulator), redrawn=tuple(map(fixed, self.redrawn)))
+        return replace(self, simulator=fixed(self.simulator), bootstraps=tuple(map(fixed, self.bootstraps)))

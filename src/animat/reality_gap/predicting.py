@@ -23,7 +23,7 @@ from animat.reality_gap.passes import Passes
 EPISODES = 200
 """Of each policy and control in one roll-out."""
 ROLL_OUTS = 5
-"""On the recording's simulator; one on each simulator of redrawn responses."""
+"""On the recording's simulator; one on each simulator of bootstrapped responses."""
 
 
 class Predicted(NamedTuple):
@@ -31,14 +31,14 @@ class Predicted(NamedTuple):
 
     Attributes:
         returns: of its episodes on the simulator of the recording, shape (episodes,).
-        anew: its mean return on each simulator of the recording's responses drawn anew, shape (redrawn,): it spreads
+        anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
             as the recording's responses and, a little, as 200 episodes do.
         passes: in all its episodes on the simulator of the recording, shape (conditions,).
-        passes_anew: on each simulator of redrawn responses, shape (redrawn, conditions).
+        passes_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
     """
 
     returns: Float64[np.ndarray, " episodes"]
-    anew: Float64[np.ndarray, " redrawn"]
+    anew: Float64[np.ndarray, " bootstraps"]
     passes: Passes
     passes_anew: Passes
 
@@ -87,7 +87,7 @@ def predict(
         By the agent's name.
     """
     progress = progress or Silent()
-    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.redrawn)
+    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps)
     acting = [_actor(group, rule, greedy=greedy) for group in groups]
 
     def rolled(group: int, on: int) -> Episodes:

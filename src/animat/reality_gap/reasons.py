@@ -61,7 +61,7 @@ def presentation(evidence: Evidence) -> Finding | None:
 
 
 def few_samples(evidence: Evidence) -> Finding | None:
-    """A condition has fewer responses in the recording than redrawing them tells the truth of."""
+    """A condition has fewer responses in the recording than bootstrapping them tells the truth of."""
     n = [len(each) for each in evidence.calibration.responses_hz]
     if min(n) >= FEW_SAMPLES:
         return None

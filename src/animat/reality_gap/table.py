@@ -32,7 +32,7 @@ class Row:
     Attributes:
         name, meaning: who acted.
         predicted: returns on the simulator, shape (episodes,).
-        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (redrawn,).
+        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
         measured: returns of whole episodes on the culture, shape (episodes,).
         pulses_per_action: that the culture was given, without the warm-up; so are the next three.
         seconds_per_action: of the culture's time.
@@ -44,7 +44,7 @@ class Row:
     name: str
     meaning: str
     predicted: Float64[np.ndarray, " predicted"]
-    predicted_anew: Float64[np.ndarray, " redrawn"]
+    predicted_anew: Float64[np.ndarray, " bootstraps"]
     measured: Float64[np.ndarray, " measured"]
     pulses_per_action: float
     seconds_per_action: float

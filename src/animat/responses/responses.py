@@ -190,7 +190,7 @@ class Responses:
         """x of the non-burst responses of one condition, in Hz."""
         return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
 
-    def redrawn(self, rng: np.random.Generator) -> Responses:
+    def bootstrapped(self, rng: np.random.Generator) -> Responses:
         """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
 
         Each keeps what was presented before it. Bursts are left out, and a condition without other responses stays

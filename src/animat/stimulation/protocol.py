@@ -186,4 +186,4 @@ PAPER = Protocol()
 
 CLOSED_LOOP = Protocol(order="mixed", presentations=500)
 """What a closed loop needs: frequencies mixed at random, one pulse a presentation, and so many of each that a simulator
-with memory finds responses with a like past."""
+with memory finds responses with a similar history."""

@@ -116,7 +116,7 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
     return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
 
 
-def write_paths(folder: Path, robot: str, quantities: Sequence[str], paths: Mapping[str, Paths]) -> Path:
+def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[str, Paths]) -> Path:
     """One episode of each policy of every arm: what is observed, and the command that led there."""
     rows = (
         (arm, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
@@ -124,7 +124,7 @@ def write_paths(folder: Path, robot: str, quantities: Sequence[str], paths: Mapp
         for actor, (observations, commands) in enumerate(of.whole())
         for i, observed in enumerate(observations)
     )
-    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *quantities, "command"), rows)
+    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, "command"), rows)
 
 
 def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:

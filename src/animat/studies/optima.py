@@ -22,7 +22,7 @@ from animat.studies.task import StudyTask
 ROUGH = 0.5
 """Steps of the grid along each axis where every recording has its optimum, as a part of those elsewhere."""
 COARSER = 0.8
-"""Steps of the grid of redrawn responses along each axis, at most, as a part of the optimum's."""
+"""Steps of the grid of bootstrapped responses along each axis, at most, as a part of the optimum's."""
 
 
 def kinds_of(study: Study) -> list[Arm]:

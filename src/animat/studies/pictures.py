@@ -128,7 +128,7 @@ class RobotPictures(StudyTask):
             _controls(study, [row for row in results.controls if row.robot == name]), f"{name}: controls"
         )
         recorded = {each.name: Paths.load(paths_file(folder, self.spec, each)) for each in study.arms}
-        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.quantities], recorded))
+        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
         paths = {arm: of.whole() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:

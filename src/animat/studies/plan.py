@@ -72,7 +72,7 @@ def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job
         name = f"controls/{spec.name}/{kind.thresholds}"
         jobs.append(Job(name, Control(study, spec, plain), (*groups, *neurons), 6))
     resolution = spec.optimum_resolution or study.optimum_resolution
-    cost_s = 40 * resolution ** len(spec.robot().quantities) + 10
+    cost_s = 40 * resolution ** len(spec.robot().observation_spec) + 10
     jobs.append(Job(f"optimum/{spec.name}", FindOptima(study, spec), neurons, cost_s))
     if neurons:
         jobs.append(Job(f"optimum/{spec.name}/over-time", FindOptima(study, spec, over_time=True), neurons, 12))

@@ -30,6 +30,8 @@ from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.writing import atomic_write
 
+_FORMER = {"reach": "neighbour_exponent"}
+"""What files of before call arrays of simulators."""
 _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator, MemorySimulator)}
 
 
@@ -138,7 +140,9 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         return SimulatorTimeline(
-            simulators=_KINDS[told["kind"]](**{name: jnp.asarray(array) for name, array in load(data).items()}),
+            simulators=_KINDS[told["kind"]](
+                **{_FORMER.get(name, name): jnp.asarray(array) for name, array in load(data).items()}
+            ),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),

@@ -107,7 +107,7 @@ class Policy:
                 f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
             )
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
-        widths = [len(self.robot.quantities) + self.neural_observation, *(bias.size for bias in self.biases)]
+        widths = [len(self.robot.observation_spec) + self.neural_observation, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
             raise InvalidArgument(

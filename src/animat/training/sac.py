@@ -212,7 +212,7 @@ def continuous_losses(
 def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
     """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
-    n, n_actions, hidden = len(environment.quantities), environment.n_actions, settings.hidden
+    n, n_actions, hidden = len(environment.observation_spec), environment.n_actions, settings.hidden
     n_drawn = environment.n_drawn
     inputs, values, outputs = (n + 1 + n_drawn, 1, 2 * n_drawn) if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics = initial_networks(
@@ -344,7 +344,7 @@ def _learn(
 ) -> Learner:
     """`settings.gradient_steps` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
-    n, n_drawn = len(environment.quantities) + 1, environment.n_drawn
+    n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
     is_continuous = environment.n_actions is None
 
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
