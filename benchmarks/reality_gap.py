@@ -52,14 +52,14 @@ class Way:
 
     order: str = "mixed"
     pulses: int = 1
-    presentations: int = 100
+    trials: int = 100
     simulator: str = "histogram"
     mapping: str = "1-threshold"
 
     @property
     def recorded(self) -> str:
         """In words."""
-        return f"{self.order}, {self.pulses}, {self.presentations} times"
+        return f"{self.order}, {self.pulses}, {self.trials} times"
 
 
 WAYS = {
@@ -67,8 +67,8 @@ WAYS = {
     "paper": Way(order="blocked"),
     "mixed": Way(),
     "five": Way(pulses=5),
-    "memory": Way(presentations=500, simulator="memory"),
-    "memory9": Way(presentations=500, simulator="memory", mapping="9-thresholds"),
+    "memory": Way(trials=500, simulator="memory"),
+    "memory9": Way(trials=500, simulator="memory", mapping="9-thresholds"),
 }
 
 
@@ -76,7 +76,7 @@ def recording_options(way: Way | None) -> list[str]:
     """Of `animat record`."""
     if way is None:
         return []
-    presented = ["--order", way.order, "--pulses", str(way.pulses), "--presentations", str(way.presentations)]
+    presented = ["--order", way.order, "--pulses", str(way.pulses), "--trials", str(way.trials)]
     return ["--sessions", "2", "--interval-min", "10", *presented]
 
 

@@ -72,7 +72,7 @@ tell(done=len(done))
 
 def test_the_five_frequencies_come_as_asked_and_as_the_sdks_own_file_says(tmp_path: Path) -> None:
     script = """
-protocol = Protocol(pulse=CL1_PULSE, patterns=10, presentations=10, setup_s=0.1, pause_s=0.2)
+protocol = Protocol(pulse=CL1_PULSE, patterns=10, trials=10, setup_s=0.1, pause_s=0.2)
 with CL1Culture(record_to="rec") as culture:
     recording = culture.record(protocol, seed=1)
     asked = np.concatenate([b.stimuli.time_s for b in culture.schedule(protocol, 1).blocks])
@@ -182,7 +182,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.stimulation.protocol import Protocol
 with CL1Culture() as culture:
     pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
-    protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), presentations=20, patterns=20)
+    protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), trials=20, patterns=20)
     recording = culture.record(protocol, seed=1)
     write_nwb(recording, "cl1.nwb")
     window = [np.count_nonzero((recording.spike_times_s >= t + 0.002) & (recording.spike_times_s < t + 0.010))

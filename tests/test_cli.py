@@ -326,7 +326,7 @@ BAD = {
         for command, more, option in (
             ("record", [], "--sessions"),
             ("record", ["--culture", "synthetic"], "--sessions"),
-            ("record", [], "--presentations"),
+            ("record", [], "--trials"),
             ("record", [], "--pulses"),
             ("train", ["cartpole", "--recordings", "{recordings}"], "--policies"),
             ("run", ["{policies}", "--culture", "replay", "--recordings", "{recordings}"], "--episodes"),

@@ -605,7 +605,7 @@ def test_adaptive_thresholds_keep_half_of_the_responses_above_the_median_of_a_cu
     tmp_path: Path,
 ) -> None:
     above: dict[str, float] = {}
-    protocol = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
+    protocol = Protocol(order="mixed", patterns=8, trials=40, setup_s=0.1)
     for how in ("fixed", "adaptive"):
         with Tiring() as culture:
             responses = extract_responses(culture.record(protocol), burst_threshold=0.95)

@@ -28,7 +28,7 @@ from animat.stimulation.selection import Selection, SelectionRule
 from animat.stimulation.stimulus import Stimulus
 from cultures import FEW, small_culture
 
-SHORT = Protocol((10.0, 40.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
+SHORT = Protocol((10.0, 40.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +325,7 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 
 def test_a_replay_answers_with_what_was_measured() -> None:
-    protocol = Protocol((10.0, 40.0), order="mixed", pulses=2, patterns=5, presentations=8, setup_s=0.0, pause_s=0.2)
+    protocol = Protocol((10.0, 40.0), order="mixed", pulses=2, patterns=5, trials=8, setup_s=0.0, pause_s=0.2)
     with small_culture() as culture:
         source = culture.record(protocol)
 

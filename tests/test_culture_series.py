@@ -24,7 +24,7 @@ from animat.stimulation.selection import Selection
 from animat.writing import exclusive_lock
 from cultures import small_culture
 
-SHORT = Protocol((20.0, 80.0), patterns=5, presentations=10, setup_s=0.5, pause_s=0.2)
+SHORT = Protocol((20.0, 80.0), patterns=5, trials=10, setup_s=0.5, pause_s=0.2)
 PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -211,7 +211,7 @@ def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path]
     with pytest.raises(Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"):
         record(folder, seed=2)
     with pytest.raises(Mismatch, match="protocol"):
-        record(folder, protocol=Protocol((20.0, 80.0), patterns=5, presentations=9, setup_s=0.5, pause_s=0.2))
+        record(folder, protocol=Protocol((20.0, 80.0), patterns=5, trials=9, setup_s=0.5, pause_s=0.2))
     other = copied(undisturbed, tmp_path / "other")
     shutil.copy(other / "recording_0001_min.nwb", other / "recording_0002_min.nwb")
     with pytest.raises(Mismatch, match=r"recording_0002_min.nwb: expected"):

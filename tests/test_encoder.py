@@ -235,7 +235,7 @@ def test_the_protocol_of_an_encoder_presents_every_condition_as_often() -> None:
     each = Counter(zip(stimuli.frequency_hz[last].tolist(), stimuli.pattern[last].tolist(), strict=True))
     assert each == {(hz, place): 500 for hz in (5.0, 20.0) for place in (0, 2)}
     protocol = protocol_of(Encoder((Condition("8 Hz", 8.0, "Hz"),)), "blocked", 4, PUBLISHED_PULSE)
-    assert (protocol.frequencies_hz, protocol.patterns, protocol.presentations) == ((8.0,), 4, 100)
+    assert (protocol.frequencies_hz, protocol.patterns, protocol.trials) == ((8.0,), 4, 100)
     assert protocol.places == ()
 
 

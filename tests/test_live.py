@@ -51,7 +51,7 @@ SMALL = SAC(environments=8, gradient_steps=1, batch=16, replay=1024, hidden=8)
 TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iterations=6000, seed=3, algorithm=SMALL)
 ONE = replace(TRAINING, policies=1)
 """In one process: for what has nothing to do with how many train."""
-PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
 PULSES = 5 * 40 * 2
 QUICK = Timetable(interval_min=10, duration_min=30, speed=1e6)
 
@@ -172,7 +172,7 @@ def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Pa
 
 def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path) -> None:
     account = Account(Budget())
-    blocked = Protocol(pulses=2, patterns=8, presentations=40, setup_s=0.1)
+    blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
 
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")
@@ -192,7 +192,7 @@ def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path)
 def test_what_others_deliver_meanwhile_is_not_spent(fails: bool) -> None:
     """The culture counts all deliveries of a session, an account only those of its own recordings."""
     account = Account(Budget())
-    blocked = Protocol(pulses=2, patterns=8, presentations=40, setup_s=0.1)
+    blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
 
     class Other:
         """Stimulates after each block, as another thread would."""
@@ -426,7 +426,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--speed", "0"], "speed: expected a number above 0, got 0"),
         (["--duration-min", "-1"], "duration_min"),
         (["--interval-min", "0.1"], "interval_min: expected at least"),
-        (["--presentations", "0"], "presentations: expected at least 1"),
+        (["--trials", "0"], "trials: expected at least 1"),
         (["--pulses", "0"], "pulses: expected at least 1"),
         (["--episodes", "0"], "episodes: expected at least 1"),
         (["--policies", "0"], "policies: expected a whole number from 1"),
@@ -489,7 +489,7 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
         raise DeviceFailed("gone")
 
     monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
-    given = ["live", "navigation", "--policies", "2", "--pulses", "1", "--presentations", "40", "--speed", "1e6"]
+    given = ["live", "navigation", "--policies", "2", "--pulses", "1", "--trials", "40", "--speed", "1e6"]
     given += ["--interval-min", "5", "--duration-min", "10", "--episodes", "1", "--json"]
     assert main([*given, "--out", str(tmp_path / "done")]) == 0
     printed = capsys.readouterr().out.splitlines()

@@ -38,7 +38,7 @@ from animat.stimulation.selection import Selection
 from animat.writing import exclusive_lock
 from fake_culture import FakeCulture
 
-SHORT = Protocol((20.0, 80.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
+SHORT = Protocol((20.0, 80.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 
 
 def replay() -> ReplayCulture:
@@ -226,7 +226,7 @@ def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixt
         "replay",
         "--sessions",
         "2",
-        "--presentations",
+        "--trials",
         "2",
         "--out",
         str(tmp_path / "out"),
@@ -255,7 +255,7 @@ def test_a_kill_while_it_is_recorded_closes_the_culture(
     culture = FakeCulture(fault=kill, at=1)
     monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
     before = signal.getsignal(number)
-    given = ["--culture", "maxone", "--selection", "x.json", "--presentations", "2", "--out", str(tmp_path)]
+    given = ["--culture", "maxone", "--selection", "x.json", "--trials", "2", "--out", str(tmp_path)]
     assert main(["record", *given]) == 130
     assert not culture.is_open
     assert culture.deliveries == 2

@@ -17,6 +17,7 @@ from animat.differences import fingerprint_of
 from animat.errors import InvalidFile, Mismatch
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
+from animat.stimulation.protocol import Protocol
 from animat.studies.plan import plan_study
 from animat.studies.run import run_study
 from animat.studies.toml import read_study
@@ -55,7 +56,7 @@ def test_recordings_are_what_they_were(
         assert recording.spike_times_s.sum() == pytest.approx(was["spike_times_s"], rel=1e-12)
         assert recording.stimuli.time_s.sum() == pytest.approx(was["stimulus_times_s"], rel=1e-12)
         assert sorted(set(recording.stimuli.frequency_hz.tolist())) == was["frequencies_hz"]
-        assert str(recording.presentation) == was["presentation"]
+        assert str(recording.presentation) == was["presentation"].replace("a presentation", "a trial")
     assert [each.rate_hz.tolist() for each in extract_series(recordings)] == told["rate_hz"]
     assert main(["inspect", str(old / "recordings")]) == 0
     assert capsys.readouterr().out.count("usable") == 2
@@ -110,6 +111,7 @@ def test_a_studys_former_keys_are_read_by_their_names_of_today(tmp_path: Path) -
 optimum_episodes = 7
 [culture]
 kind = "synthetic"
+trials = 40
 [simulators]
 allow = ["dead-window"]
 [[robots]]
@@ -130,6 +132,7 @@ mapping = "linear"
         ("gradient_steps", "updates"),
         ("tau", "follow"),
         ("synthetic", "made-up"),
+        ("trials", "presentations"),
     ):
         text = text.replace(now, before)
     former.write_text(text)
@@ -153,3 +156,9 @@ def test_a_trainings_folder_goes_on_by_the_former_names_of_its_settings(tmp_path
     assert is_ours(tmp_path, describe(training, None))
     with pytest.raises(Mismatch, match=r"training\.algorithm\.tau: 0\.005 there, 0\.1 now"):
         expect_folder_for(replace(training, algorithm=SAC(tau=0.1)), tmp_path)
+
+
+def test_a_protocol_of_presentations_is_one_of_trials() -> None:
+    protocol = Protocol(order="mixed", trials=40)
+    former = protocol.to_json().replace("trials", "presentations")
+    assert "presentations" in former and Protocol.from_json(former) == protocol

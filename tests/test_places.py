@@ -79,7 +79,7 @@ def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, t
 
 @pytest.mark.parametrize("order", ["mixed", "blocked"])
 def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
-    protocol = Protocol((5.0, 20.0), order, 2, presentations=7, places=LISTED)  # type: ignore[arg-type]
+    protocol = Protocol((5.0, 20.0), order, 2, trials=7, places=LISTED)  # type: ignore[arg-type]
     assert Protocol.from_json(protocol.to_json()) == protocol
     # The second place is the third of the culture's patterns.
     patterns = np.array([[0, 2, -1], [3, 9, 0], [7, 5, -1]])
@@ -105,7 +105,7 @@ def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
 
 def test_in_a_mixed_recording_a_place_may_follow_itself() -> None:
     """As in a closed loop: a round of all places before any comes again would never show it."""
-    protocol = Protocol((10.0,), "mixed", presentations=500, places=LISTED)
+    protocol = Protocol((10.0,), "mixed", trials=500, places=LISTED)
     (block,) = make_schedule(protocol, np.zeros((100, 1), np.int64), 0, places=LISTED).blocks
     first = block.stimuli.electrodes[:, 0]
     share = float(np.mean(first[1:] == first[:-1]))
@@ -118,7 +118,7 @@ def test_a_protocol_without_places_is_written_as_before() -> None:
 
 
 def test_halves_of_a_virtual_culture_are_recorded_and_sorted(tmp_path: Path) -> None:
-    protocol = Protocol((20.0,), "mixed", presentations=3, places="halves", setup_s=0.0, pause_s=0.1)
+    protocol = Protocol((20.0,), "mixed", trials=3, places="halves", setup_s=0.0, pause_s=0.1)
     with small_culture() as culture:
         recording = culture.record(protocol)
         x_of = dict(zip(culture.channels.electrode.tolist(), culture.channels.x_um.tolist(), strict=True))

@@ -54,7 +54,7 @@ from animat.training.policy import Policy
 from animat.wrappers import ShuffledDelivery
 from fake_culture import FakeCulture
 
-PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,7 @@ def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "presentation": (
         {"calibration": {"presentation": Presentation("blocked", 1)}},
-        "the recording was presented blocked, 1 pulse a presentation, the loop mixed, 1 pulse a presentation",
+        "the recording was presented blocked, 1 pulse a trial, the loop mixed, 1 pulse a trial",
     ),
     "few-samples": (
         {"calibration": {"responses_hz": (np.ones(7), np.full(200, 14.0))}},
@@ -103,7 +103,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "lateness": (
         {"late_s": lambda condition, _: np.where(condition == 1, 0.0026, 0.0)},
-        "pulses came late: 80 Hz in 100 % of its presentations, by 2.6 ms of its 12.5 on average",
+        "pulses came late: 80 Hz in 100 % of its trials, by 2.6 ms of its 12.5 on average",
     ),
     "bursts": (
         {"is_burst": lambda *_: EVERY % 10 == 0},

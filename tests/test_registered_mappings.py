@@ -119,7 +119,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 @pytest.mark.oracle
 def test_a_study_has_conditions_with_it(package: Path) -> None:
     study = Study(
-        culture=Source("synthetic", sessions=1, presentations=40, channels=16),
+        culture=Source("synthetic", sessions=1, trials=40, channels=16),
         robots=(RobotSpec("cartpole", iterations=240),),
         arms=(Arm("steep", mapping=STEEP), Arm("one threshold")),
         policies=1,

@@ -141,7 +141,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
-        culture=Source("synthetic", sessions=1, presentations=40, channels=16),
+        culture=Source("synthetic", sessions=1, trials=40, channels=16),
         robots=(RobotSpec("rover", iterations=240),),
         policies=1,
         episodes=2,

@@ -34,7 +34,7 @@ from cultures import small_culture
 pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
 RULE = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=8)
-PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=20, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=20, setup_s=0.1)
 FIVE_HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 
 

@@ -314,7 +314,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
 ) -> None:
     rule = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=100)
     monkeypatch.setattr("animat.cultures.virtual.VirtualCulture", partial(small_culture, rule=rule))
-    study = Study(culture=Source(sessions=2, interval_min=2.0, presentations=2))
+    study = Study(culture=Source(sessions=2, interval_min=2.0, trials=2))
 
     def record(name: str) -> Receipt:
         done = carry_out(Record(study, tmp_path), tmp_path / name, tmp_path / "told")
@@ -769,7 +769,7 @@ COMPARED = (
                 ("", "episodes_over_time"),
                 ("", "optimum_episodes"),
                 ("[culture]\n", "sessions"),
-                ("[culture]\n", "presentations"),
+                ("[culture]\n", "trials"),
                 ("[culture]\nkind = 'synthetic'\n", "channels"),
                 ("[[robots]]\nname = 'cartpole'\n", "iterations"),
                 ("[algorithm]\n", "hidden"),

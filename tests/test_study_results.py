@@ -156,7 +156,7 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
 def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(tmp_path: Path, delivery: Any) -> None:
     arm = Arm("control", delivery=delivery, trained=False)
     study = Study(
-        culture=Source("synthetic", sessions=2, interval_min=140.0, presentations=20, channels=32),
+        culture=Source("synthetic", sessions=2, interval_min=140.0, trials=20, channels=32),
         robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
         arms=(arm, Arm("other")),
         comparisons=(Compared("with another", "control", "other", at_min=0.0, episodes=7),),
@@ -199,7 +199,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
 # --- the optimal returns --------------------------------------------------------------------------------------
 
 FEW = Study(
-    culture=Source(kind="synthetic", sessions=2, interval_min=140, presentations=40, channels=32),
+    culture=Source(kind="synthetic", sessions=2, interval_min=140, trials=40, channels=32),
     robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
     arms=(Arm("1 threshold", trained=False), Arm("without neurons", mapping="none")),
     comparisons=(Compared("c", "without neurons", "1 threshold", at_min=0.0, episodes=2),),

@@ -66,7 +66,7 @@ def test_simulated_cultures_are_in_seconds_and_named_in_other_units(order: Order
     source = synthetic_recording(1)
     if order is not None:
         with VirtualCulture(seed=3) as culture:
-            source = culture.record(Protocol(order=order, presentations=20))
+            source = culture.record(Protocol(order=order, trials=20))
     assert said(source) is None and said(without_frequencies(source)) is None
     for factor, words in {
         1e3: "factor of 1,000: times are in milliseconds; divide them by 1,000",

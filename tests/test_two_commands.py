@@ -49,7 +49,7 @@ from fake_culture import CHANNELS, FakeCulture
 from test_training import SMALL
 from two_wheels import FILE, Wheels
 
-PROTOCOL = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", patterns=8, trials=40, setup_s=0.1)
 
 
 @pytest.fixture(autouse=True)

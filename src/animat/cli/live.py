@@ -35,7 +35,7 @@ class Live(Stimulating):
     """How recordings are presented; mixed is how a closed loop presents"""
     pulses: int = 1
     """Pulses per trial, the last one read"""
-    presentations: int = 500
+    trials: int = 500
     """Of each frequency in a recording"""
     interval_min: float = 10.0
     """Minutes of the culture's clock from one recording to the next"""
@@ -96,9 +96,7 @@ class Live(Stimulating):
             percentiles=self.percentiles,
         )
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
-        protocol = Protocol(
-            order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
-        )
+        protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
         settings = {**self._of_the_loop(), "adaptive": self.thresholds == "adaptive"}
         check_plan(training, protocol, self.out, timetable, self.episodes, settings)
         keep_compilations()

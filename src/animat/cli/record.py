@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol
 
 
-_PRESENTED = ("order", "pulses", "presentations", "places")
+_PRESENTED = ("order", "pulses", "trials", "places")
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Record:
     seed: int = 1
     """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
     paper: bool = False
-    """The paper's protocol: blocks of one frequency, 100 presentations of each, 15 recordings; default: what a closed
-    loop needs, frequencies mixed, 500 presentations of each, 2 recordings"""
+    """The paper's protocol: blocks of one frequency, 100 trials of each, 15 recordings; default: what a closed
+    loop needs, frequencies mixed, 500 trials of each, 2 recordings"""
     sessions: int | None = None
     """How many recordings; default: 2, with --paper 15"""
     interval_min: float | None = None
@@ -42,7 +42,7 @@ class Record:
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
     """Pulses per trial, the last one read; default: 1"""
-    presentations: int | None = None
+    trials: int | None = None
     """Presentations at each frequency; default: 500, with --paper 100"""
     places: str | None = None
     """halves, quadrants, or a file of JSON with groups of electrodes, [[1, 2], [3, 4]]: each at each frequency is a
@@ -94,11 +94,11 @@ class Record:
     def _synthetic(self, progress: Progress) -> list[Path]:
         from animat.recordings.synthetic import write_synthetic_series
 
-        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.presentations in (None, 100)
+        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.trials in (None, 100)
         if not usual or self.places is not None or self.protocol is not None:
             raise InvalidArgument(
-                "--order, --pulses, --presentations, --places, --protocol: synthetic recordings are blocked, with one "
-                "pulse, 100 presentations and no places; --culture virtual takes others"
+                "--order, --pulses, --trials, --places, --protocol: synthetic recordings are blocked, with one "
+                "pulse, 100 trials and no places; --culture virtual takes others"
             )
         with exclusive_lock(self.out):
             return write_synthetic_series(
@@ -169,7 +169,7 @@ class Record:
         usual = replace(PAPER if paper else CLOSED_LOOP, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
-        asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}
+        asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
         asked["places"] = None if self.places is None else read_places(self.places)
         return replace(usual, **{name: value for name, value in asked.items() if value is not None})
 

@@ -273,7 +273,7 @@ class Driver:
         }
 
     def _times(self, due_s: float, frequency_hz: float) -> tuple[float, Float64[np.ndarray, " pulses"]]:
-        """The culture's clock, and when the pulses of a presentation come after that; the first one is due at `due_s`.
+        """The culture's clock, and when the pulses of a trial come after that; the first one is due at `due_s`.
 
         All that it takes to ask for them from here on is counted: they come when they are due, not later by that.
         """

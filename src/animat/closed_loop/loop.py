@@ -67,7 +67,7 @@ class Trained(Protocol):
 class Loop:
     """The settings of a closed loop.
 
-    An action is a presentation of a condition: `pulses` pulses, the first one 1/f after the last pulse of the action
+    An action is a trial of a condition: `pulses` pulses, the first one 1/f after the last pulse of the action
     before it and the others 1/f apart, on the condition's electrodes or, where it names none, each one of the patterns
     in random order; the response to the last one is read.
 
@@ -79,7 +79,7 @@ class Loop:
             (readouts, 11).
         adaptive_from: non-burst responses of each condition in that recording, Hz, in the order of time, which adaptive
             thresholds start from (see `animat.closed_loop.adaptive`). None: thresholds are fixed.
-        pulses: of a presentation.
+        pulses: of a trial.
         window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
         pulse: what each electrode delivers.
@@ -181,7 +181,7 @@ class Loop:
             policy: its robot, mapping, readouts, conditions, window and presentation are taken, but for those in
                 `settings`.
             percentiles: of the simulator that it was trained on, in Hz, shape (11,), or (readouts, 11).
-            pulses: of a presentation; None: as many as in its recordings (1 where that is not known).
+            pulses: of a trial; None: as many as in its recordings (1 where that is not known).
             settings: the other attributes.
 
         Raises:

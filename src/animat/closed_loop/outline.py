@@ -14,15 +14,15 @@ class Acted:
     """What was presented in an episode while its robot moved, without the warm-up.
 
     Attributes:
-        presentations: repeated ones among them.
+        trials: repeated ones among them.
         actions: that the robot was moved by.
         pulses: that the culture was given.
         pulses_s: of each presentation, its pulses over its frequency.
         bursts: responses that were bursts.
-        late: presentations that came late.
+        late: trials that came late.
     """
 
-    presentations: int = 0
+    trials: int = 0
     actions: int = 0
     pulses: int = 0
     pulses_s: float = 0.0
@@ -65,7 +65,7 @@ class Outline:
     """Counts as records are added, in their order.
 
     Args:
-        pulses: of a presentation.
+        pulses: of a trial.
 
     Attributes:
         ending: what was written about it, None where nothing was.
@@ -141,7 +141,7 @@ class Outline:
         episode.late += is_late
         if tick["handled"] != "warm-up":
             acted = episode.acted
-            acted.presentations += 1
+            acted.trials += 1
             acted.actions += tick["command"] is not None
             acted.pulses += n_pulses
             acted.pulses_s += self._presented / tick["frequency_hz"]

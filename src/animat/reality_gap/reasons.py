@@ -22,7 +22,7 @@ FEWEST_EPISODES = 8
 """Of the policies, that a trend or a share is told from; of a condition in a trend's episode, `_FEWEST`."""
 _FEWEST = 3
 LEAST_LATE = 0.05
-"""Of the interval between pulses, on average over a condition's presentations."""
+"""Of the interval between pulses, on average over a condition's trials."""
 LEAST_BURSTS, _FEWEST_BURSTS = 0.05, 5
 LEAST_TREND = 0.1
 """Change over the session, of a condition's mean response."""
@@ -79,7 +79,7 @@ def lateness(evidence: Evidence) -> Finding | None:
         most = max(most, part)
         share, late_ms = float(np.mean(late_s > 0)), 1000 * float(late_s[late_s > 0].mean())
         told.append(
-            f"{condition.label} in {100 * share:.0f} % of its presentations, by {late_ms:.2g} ms of its "
+            f"{condition.label} in {100 * share:.0f} % of its trials, by {late_ms:.2g} ms of its "
             f"{1000 * condition.interval_s:.3g} on average"
         )
     return _reason("lateness", f"pulses came late: {', '.join(told)}", most) if told else None

@@ -83,7 +83,7 @@ def run_policies(
         adaptive: whether the mapping's thresholds adapt to the culture (`animat.closed_loop.adaptive`) from where the
             calibration left them, or are fixed.
         seed: decides every random draw, but what the culture does.
-        pulses: of a presentation; None: as in the policies' recordings.
+        pulses: of a trial; None: as in the policies' recordings.
         account: of a stimulation budget.
         progress: told after each episode.
         tell: is given lines before the session: the warnings, and how long it will and can be.
@@ -292,7 +292,7 @@ def _rows(
         episodes = [episode for episode in session.episodes if episode.agent in of]
         acted = [episode.acted for episode in episodes]
         actions = max(1, sum(each.actions for each in acted))
-        presentations = max(1, sum(each.presentations for each in acted))
+        trials = max(1, sum(each.trials for each in acted))
         of_them = together([predicted[each] for each in of])
         return Row(
             name=name,
@@ -302,8 +302,8 @@ def _rows(
             measured=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
             pulses_per_action=sum(each.pulses for each in acted) / actions,
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,
-            bursts=sum(each.bursts for each in acted) / presentations,
-            late=sum(each.late for each in acted) / presentations,
+            bursts=sum(each.bursts for each in acted) / trials,
+            late=sum(each.late for each in acted) / trials,
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)

@@ -37,7 +37,7 @@ class Row:
         pulses_per_action: that the culture was given, without the warm-up; so are the next three.
         seconds_per_action: of the culture's time.
         bursts: share of responses that were.
-        late: share of presentations that came late.
+        late: share of trials that came late.
         beside: the policies' measured returns beside these; None for the policies, and where either has none.
     """
 

@@ -99,7 +99,7 @@ class SyntheticCulture:
         _expect(0 <= self.background_hz <= 1000, "background_hz", "0 to 1,000 Hz", self.background_hz)
 
     def record(self, start_min: float = 0.0) -> Recording:
-        """One recording by the paper's protocol: blocked, one pulse a presentation (method of the paper, section 2).
+        """One recording by the paper's protocol: blocked, one pulse a trial (method of the paper, section 2).
 
         Args:
             start_min: its start on the culture's clock in minutes, 0 or more.

@@ -199,7 +199,7 @@ def _done(study: Study, results: Results) -> Section:
         recorded = (
             f"{culture.sessions} recordings, one every {culture.interval_min:g} min, of the {culture.kind} culture of "
             f"seed {culture.seed}; stimuli {Presentation(culture.order, culture.pulses)}, "
-            f"{culture.presentations} presentations of each."
+            f"{culture.trials} trials of each."
         )
     points = [
         ("Recordings", recorded),

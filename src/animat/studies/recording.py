@@ -28,7 +28,7 @@ class Record(StudyTask):
         base: what a specification's file names are relative to.
     """
 
-    sizes = ("culture.presentations", "culture.pulses", "culture.channels")
+    sizes = ("culture.trials", "culture.pulses", "culture.channels")
 
     base: Path
 
@@ -72,7 +72,7 @@ def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     culture = study.culture
     return record_virtual_series(
         lambda: VirtualCulture(culture.seed),
-        Protocol(order=culture.order, pulses=culture.pulses, presentations=culture.presentations),
+        Protocol(order=culture.order, pulses=culture.pulses, trials=culture.trials),
         out,
         sessions=culture.sessions,
         interval_min=culture.interval_min,
@@ -92,6 +92,6 @@ def _synthetic(study: Study, out: Path, progress: Progress) -> list[Path]:
         sessions=culture.sessions,
         interval_min=culture.interval_min,
         progress=progress,
-        patterns=culture.presentations,
+        patterns=culture.trials,
         channels=culture.channels,
     )

@@ -40,7 +40,7 @@ _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulato
 class Fit(StudyTask):
     """Read the responses of all recordings and fit a simulator to each."""
 
-    sizes = ("culture.sessions", "culture.presentations", "simulators.bins")
+    sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, settings = self.study, self.study.simulators

@@ -13,8 +13,8 @@ from animat.recordings.synthetic import SyntheticCulture
 from animat.records import Positive, Seed, Whole, record
 from animat.stimulation.protocol import Protocol
 
-MOST_SESSIONS, MOST_PRESENTATIONS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
-"""Recordings, presentations in each, and entries of a list; `docs/studies.md` states them."""
+MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
+"""Recordings, trials in each, and entries of a list; `docs/studies.md` states them."""
 
 LISTED = Field(max_length=MOST_ENTRIES)
 
@@ -24,11 +24,11 @@ class Source:
     """Where the recordings come from: files, or a culture that is recorded for the study.
 
     Attributes:
-        kind: `"virtual"`, simulated neurons; `"synthetic"`, responses of known distributions, for trials; `"files"`.
+        kind: `"virtual"`, simulated neurons; `"synthetic"`, responses of known distributions, to try things; `"files"`.
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
         seed: which virtual or synthetic culture.
         sessions, interval_min: how many recordings, and the minutes from one to the next.
-        order, pulses, presentations: how stimuli are presented (`animat.stimulation.protocol`).
+        order, pulses, trials: how stimuli are presented (`animat.stimulation.protocol`).
         channels: of a synthetic culture.
     """
 
@@ -38,8 +38,8 @@ class Source:
     sessions: Annotated[Whole, Field(ge=1, le=MOST_SESSIONS)] = 15
     interval_min: Positive = 10.0
     order: Literal["blocked", "mixed"] = "blocked"
-    pulses: Annotated[Whole, Field(ge=1, le=MOST_PRESENTATIONS)] = 1
-    presentations: Annotated[Whole, Field(ge=2, le=MOST_PRESENTATIONS)] = 100
+    pulses: Annotated[Whole, Field(ge=1, le=MOST_TRIALS)] = 1
+    trials: Annotated[Whole, Field(ge=2, le=MOST_TRIALS)] = 100
     channels: Annotated[Whole, Field(ge=1, le=1024)] = 256
 
     def __post_init__(self) -> None:
@@ -63,6 +63,6 @@ class Source:
             raise InvalidArgument("order: a synthetic culture is recorded blocked with one pulse, got otherwise")
         # What the recordings themselves refuse is refused before there is a folder.
         if self.kind == "virtual":
-            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations)
+            Protocol(order=self.order, pulses=self.pulses, trials=self.trials)
         elif self.kind == "synthetic":
-            SyntheticCulture(self.seed, patterns=self.presentations, channels=self.channels)
+            SyntheticCulture(self.seed, patterns=self.trials, channels=self.channels)

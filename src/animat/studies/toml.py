@@ -19,6 +19,7 @@ MOST_BYTES = 2**20
 FORMER = {
     "": {"conditions": "arms", "limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
     "robots": {"limit_resolution": "optimum_resolution"},
+    "culture": {"presentations": "trials"},
     "simulators": {"despite": "allow"},
     "algorithm": FORMER_SETTINGS,
 }

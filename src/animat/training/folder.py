@@ -122,7 +122,7 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
 def _description_in(folder: Path) -> dict[str, Any] | None:
     """What a folder says it holds; None if it is free."""
     if (found := description_in(folder / MANIFEST, "training")) is not None:
-        return _renamed(found, FORMER)
+        return _renamed(found, FORMER, ("a presentation", "a trial"))
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
@@ -132,16 +132,18 @@ def _description_in(folder: Path) -> dict[str, Any] | None:
 
 def _by_former_names(manifest: dict[str, Any]) -> dict[str, Any]:
     """A description as fingerprints are made of it: those of before are of the same bytes, and their folders go on."""
-    return _renamed(manifest, {today: former for former, today in FORMER.items()})
+    return _renamed(manifest, {today: former for former, today in FORMER.items()}, ("a trial", "a presentation"))
 
 
-def _renamed(manifest: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
-    """A description with other names for the settings of the algorithm."""
-    training = manifest.get("training")
-    if not isinstance(training, dict) or not isinstance(training.get("algorithm"), dict):
-        return manifest
-    algorithm = {names.get(name, name): value for name, value in training["algorithm"].items()}
-    return {**manifest, "training": {**training, "algorithm": algorithm}}
+def _renamed(manifest: dict[str, Any], names: dict[str, str], pulses: tuple[str, str]) -> dict[str, Any]:
+    """A description with other names for the settings of the algorithm, and for what the pulses are counted by."""
+    training, simulators = manifest.get("training"), manifest.get("simulators")
+    if isinstance(training, dict) and isinstance(training.get("algorithm"), dict):
+        algorithm = {names.get(name, name): value for name, value in training["algorithm"].items()}
+        manifest = {**manifest, "training": {**training, "algorithm": algorithm}}
+    if isinstance(simulators, dict) and isinstance(presented := simulators.get("presentation"), str):
+        manifest = {**manifest, "simulators": {**simulators, "presentation": presented.replace(*pulses)}}
+    return manifest
 
 
 def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
