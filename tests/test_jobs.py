@@ -20,7 +20,7 @@ from animat.errors import AnimatError, InvalidFile
 from animat.execution.jobs import Job, Jobs, in_order
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, digest_of, receipt_path
-from animat.execution.task import Task, carry_out, told
+from animat.execution.task import Task, carry_out, reported
 from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.synthetic import synthetic_recording
@@ -124,9 +124,9 @@ def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
 
 
 def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
-    assert told(tmp_path / "notice.json") is None
+    assert reported(tmp_path / "notice.json") is None
     done = carry_out(Join("a"), tmp_path, tmp_path / "notice.json")
-    assert told(tmp_path / "notice.json") == [0.5, "half"]
+    assert reported(tmp_path / "notice.json") == [0.5, "half"]
     assert list(done.files) == ["a"]
 
 

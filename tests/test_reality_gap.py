@@ -106,7 +106,7 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
     told: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
-        return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, tell=told.append), told
+        return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=told.append), told
 
 
 def test_the_table_holds_what_the_simulator_and_the_session_say(

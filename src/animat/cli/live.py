@@ -122,14 +122,14 @@ class Live(Stimulating):
                 kind=self.simulator,
                 account=account,
                 progress=progress,
-                tell=partial(print, file=sys.stderr),
+                report=partial(print, file=sys.stderr),
                 **settings,
             )
             # It is told even where the culture cannot be closed then.
-            told.callback(self._tell, ran)
+            told.callback(self._report, ran)
         return ran.to_dict()
 
-    def _tell(self, ran: LiveRun) -> None:
+    def _report(self, ran: LiveRun) -> None:
         print(
             f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
             f"({ran.wall_s:.0f} s of ours); {ran.iterations:,} iterations of each policy, never stopped; "

@@ -134,17 +134,17 @@ class Run(Stimulating):
                 seed=self.seed,
                 account=account,
                 progress=progress,
-                tell=partial(print, file=sys.stderr),
+                report=partial(print, file=sys.stderr),
                 noticed=noticed,
                 pulse=pulse,
                 patterns=patterns,
                 **settings,
             )
             # It is told even where the culture cannot be closed then.
-            told.callback(self._tell, gap)
+            told.callback(self._report, gap)
         return gap.to_dict()
 
-    def _tell(self, gap: RealityGap) -> None:
+    def _report(self, gap: RealityGap) -> None:
         print(gap.to_text())
         if gap.session.recording_file.is_file():
             print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")

@@ -32,10 +32,10 @@ class StudyFile:
         """Run it."""
         from animat.studies.toml import read_study
 
-        return run_and_tell(read_study(self.specification), self.specification.parent, self.out, self.workers)
+        return run_and_report(read_study(self.specification), self.specification.parent, self.out, self.workers)
 
 
-def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
+def run_and_report(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
     """Run a study, whose files are named as seen from `base`, and print its comparisons."""
     from animat.lined_up import lined_up
     from animat.progress import Bar

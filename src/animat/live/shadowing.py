@@ -88,7 +88,7 @@ def live(
     kind: Kind | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> LiveRun:
     """Record a culture again and again while policies train on its newest simulators, then run them on it.
@@ -113,7 +113,7 @@ def live(
         kind: of simulator; None: what suits the protocol (`fit_timeline`).
         account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
         progress: told as the culture's time goes by, and in the closed loop.
-        tell: as for `run_policies`.
+        report: as for `run_policies`.
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
@@ -142,7 +142,7 @@ def live(
                 seed=training.seed,
                 account=run.account,
                 progress=progress,
-                tell=tell,
+                report=report,
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
                 **settings,

@@ -61,7 +61,7 @@ def run_policies(
     pulses: int | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
     noticed: Sequence[Finding] = (),
     **settings: Any,
 ) -> RealityGap:
@@ -86,8 +86,8 @@ def run_policies(
         pulses: of a trial; None: as in the policies' recordings.
         account: of a stimulation budget.
         progress: told after each episode.
-        tell: is given lines before the session: the warnings, and how long it will and can be.
-        noticed: findings to be told beside those made here.
+        report: is given lines before the session: the warnings, and how long it will and can be.
+        noticed: findings to be reported beside those made here.
         settings: other attributes of `Loop`.
 
     Raises:
@@ -174,11 +174,11 @@ def run_policies(
     ]
     ahead = outlook(loop, calibration, plan, account, culture.now_s / 60)
     findings = (*noticed, *findings, *calibration.findings)
-    if tell is not None:
+    if report is not None:
         # Before the first pulse: whoever stands at the rig may think better of it.
         for message in warnings_once(findings):
-            tell(f"warning: {message}")
-        tell(str(ahead))
+            report(f"warning: {message}")
+        report(str(ahead))
     session = run_session(
         culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=progress
     )
