@@ -206,13 +206,13 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
     assert np.any(
         wanted != evaluate({"a": moving}, timeline, at_min=14.0, episodes=50, seed=3).rows[0].episodes.returns
     )
-    assert "recording at 10 min, percentiles held from 0 min: 1 policy," in found.to_text()
-    assert found.to_dict()["percentiles_held_from_min"] == 0.0
+    assert "recording at 10 min, percentiles fixed from 0 min: 1 policy," in found.to_text()
+    assert found.to_dict()["percentiles_fixed_from_min"] == 0.0
     assert "other-percentiles" not in {finding.name for finding in found.findings}
     elsewhere = replace(held, provenance={**held.provenance, "simulators": {"recorded_at_min": [-10.0, 0.0]}})
     noticed = evaluate({"a": elsewhere}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-percentiles")
-    assert "held from the recording at -10 min, which is not the first of these" in finding.message
+    assert "fixed from the recording at -10 min, which is not the first of these" in finding.message
     with pytest.raises(Mismatch, match="b: expected the same percentiles as a"):
         evaluate({"a": moving, "b": held}, timeline)
 

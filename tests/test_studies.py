@@ -459,7 +459,7 @@ def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path)
     arm_of = {
         "none": "without neurons",
         "1-threshold": "1-threshold",
-        "9-thresholds": "9-thresholds, percentiles held",
+        "9-thresholds": "9-thresholds, percentiles fixed",
     }
     optima = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/optima.csv")}
 
@@ -895,7 +895,7 @@ def test_no_two_arms_or_controls_share_a_file(tmp_path: Path) -> None:
     spec = RobotSpec("navigation")
     arms = [Arm(name, percentiles=held) for name in names for held in ("moving", "first")]
     places = {of(tmp_path, spec, arm) for arm in arms for of in (episodes_file, controls_file, paths_file)}
-    # An arm's name is its own, however its percentiles are held; controls are of a way to hold them.
+    # An arm's name is its own, whether its percentiles are fixed or not; controls are told apart by that.
     assert len(places) == 2 * len(names) + 2
 
 

@@ -48,27 +48,27 @@ class Counted:
     fit: Callable[[Responses], NeuronSimulator]
 
     @classmethod
-    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_held: bool) -> Self:
+    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_fixed: bool) -> Self:
         """Of a recording of a timeline.
 
         Args:
             environment: with all of its conditions.
             timeline: with its responses.
             minute: of the recording.
-            are_held: whether the mapping's percentiles are those of the first recording.
+            are_fixed: whether the mapping's percentiles are those of the first recording.
 
         Raises:
             UnusableData: where no condition has enough.
         """
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
-        simulator = (timeline.with_first_percentiles() if are_held else timeline).at(minute)
+        simulator = (timeline.with_first_percentiles() if are_fixed else timeline).at(minute)
         # The mapping's thresholds are those of all responses, also where some of them are left out.
         percentiles, kind = simulator.percentiles, timeline.fitted["kind"]
         fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
 
         def fit(these: Responses, kind: str) -> NeuronSimulator:
             made = fit_simulator(these, kind=kind, **(fitted if kind == "histogram" else {}))
-            return replace(made, percentiles=percentiles) if are_held or left_out else made  # type: ignore[type-var]
+            return replace(made, percentiles=percentiles) if are_fixed or left_out else made  # type: ignore[type-var]
 
         if left_out:
             environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)

@@ -83,7 +83,7 @@ class Evaluation:
         findings: where the policies' training and this simulator differ, and where the optimum is not well known.
         optimum: the optimal return of any controller; None where it was not asked for, or is not known.
         no_optimum: why it is not known, though it was asked for.
-        held_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move along.
+        fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
     """
 
     __repr__ = briefly
@@ -96,7 +96,7 @@ class Evaluation:
     findings: tuple[Finding, ...]
     optimum: Optimum | None = None
     no_optimum: str | None = None
-    held_from_min: float | None = None
+    fixed_from_min: float | None = None
 
     @property
     def verdict(self) -> Verdict | None:
@@ -132,7 +132,7 @@ class Evaluation:
             "robot": self.robot,
             "mapping": self.mapping,
             "recorded_at_min": self.recorded_at_min,
-            "percentiles_held_from_min": self.held_from_min,
+            "percentiles_fixed_from_min": self.fixed_from_min,
             "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
             "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
             "optimum": None if self.optimum is None else self.optimum.to_dict(),
@@ -147,8 +147,8 @@ class Evaluation:
         """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
         first = self.rows[0].episodes.returns
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
-        if self.held_from_min is not None:
-            on += f", percentiles held from {self.held_from_min:g} min"
+        if self.fixed_from_min is not None:
+            on += f", percentiles fixed from {self.fixed_from_min:g} min"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         head = ["", "mean return", "s.e.", "iterations", "ended early", "score", ""]
         cells = []
@@ -234,7 +234,7 @@ def evaluate(
     findings: tuple[Finding, ...] = ()
     simulator: NeuronSimulator | None = None
     environment: Environment[Any]
-    minute, held_from_min = None, None
+    minute, fixed_from_min = None, None
     if first.mapping is None:
         environment = WithoutNeurons(body, first.commands)
     else:
@@ -243,8 +243,8 @@ def evaluate(
         row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
         findings = (*_check(first, timeline), *_not_of_a_loop(first, timeline, minute))
-        held_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
-        simulator = (timeline if held_from_min is None else timeline.with_first_percentiles()).at(minute)
+        fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
+        simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))
         if first.neural_observation:
             environment = NeuralObservation(environment)
@@ -277,7 +277,7 @@ def evaluate(
             progress.update(len(rows), steps, "optimal return")
         try:
             optimum = _optimum(
-                environment, simulator, timeline, minute, held_from_min is not None, optimum_resolution, seed
+                environment, simulator, timeline, minute, fixed_from_min is not None, optimum_resolution, seed
             )
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
@@ -290,7 +290,7 @@ def evaluate(
         (*findings, *(() if optimum is None else optimum.findings())),
         optimum,
         no_optimum,
-        held_from_min,
+        fixed_from_min,
     )
 
 
@@ -299,7 +299,7 @@ def _optimum(
     simulator: NeuronSimulator | None,
     timeline: SimulatorTimeline | None,
     minute: float | None,
-    are_held: bool,
+    are_fixed: bool,
     resolution: float,
     seed: int,
 ) -> Optimum:
@@ -309,7 +309,7 @@ def _optimum(
         return best_return(environment, simulator, resolution=resolution, seed=seed)
     if not timeline.responses:
         return best_return(environment, simulator, resolution=resolution, seed=seed)
-    case = Counted.of(environment, timeline, minute, are_held=are_held)
+    case = Counted.of(environment, timeline, minute, are_fixed=are_fixed)
     best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed)
     return case.known(best, resolution=resolution, seed=seed)
 
@@ -343,8 +343,8 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
             Finding(
                 "other-percentiles",
                 "warning",
-                f"the policies' percentiles were held from the recording at {first_min:g} min, which is not the first "
-                f"of these: here they are held from {timeline.start_min[0]:g} min",
+                f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
+                f"of these: here they are fixed from {timeline.start_min[0]:g} min",
             )
         )
     return tuple(found)

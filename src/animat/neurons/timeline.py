@@ -102,7 +102,7 @@ class SimulatorTimeline:
         return jax.tree.map(lambda stacked: stacked[row], self.simulators)  # type: ignore[no-any-return]
 
     def with_first_percentiles(self) -> SimulatorTimeline:
-        """The same simulators with the first recording's percentiles held, for mappings that do not move along."""
+        """The same simulators with the first recording's percentiles fixed, for mappings that do not move along."""
         percentiles = self.simulators.percentiles
         held = jnp.broadcast_to(percentiles[:1], percentiles.shape)
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]

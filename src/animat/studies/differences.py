@@ -74,12 +74,12 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
             "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into "
             "the last bin, and is reported.",
         )
-    held = any(arm.percentiles == "first" for arm in study.arms)
+    fixed = any(arm.percentiles == "first" for arm in study.arms)
     yield (
         "Percentiles",
         "The paper does not say which recording the thresholds are taken from. Here they come from the recording whose "
         "simulator is in use, so "
-        + ("they move, except in the arms that hold the first recording's." if held else "they move with it."),
+        + ("they move, except in the arms with those of the first recording." if fixed else "they move with it."),
     )
 
 

@@ -32,6 +32,8 @@ POLICY = "policy"
 RANDOM = "random"
 FORMER_AGENTS = {"made by hand": "heuristic"}
 """What files of before call agents."""
+FORMER_MAPPING = ", percentiles held", ", percentiles fixed"
+"""How files of before name mappings, and how they are named now."""
 
 
 def tabulated(
@@ -72,7 +74,9 @@ def read_episodes(paths: Iterable[Path]) -> DataFrame:
     import pandas as pd
 
     parts = [pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths]
-    return pd.concat(parts, ignore_index=True).replace({"agent": FORMER_AGENTS})
+    table = pd.concat(parts, ignore_index=True).replace({"agent": FORMER_AGENTS})
+    table["arm"] = table["arm"].str.replace(*FORMER_MAPPING, regex=False)
+    return table
 
 
 def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.ndarray, " actors"]:

@@ -103,7 +103,7 @@ class FindOptima(StudyTask):
             responses = timeline.responses[timeline.row_at(at)]
             left_out[i] = few_of(responses)
             if len(left_out[i]) < len(responses.conditions):
-                of = Counted.of(environment, timeline, at, are_held=kind.percentiles == "first")
+                of = Counted.of(environment, timeline, at, are_fixed=kind.percentiles == "first")
                 counted[i], cases[i] = of, (of.environment, of.simulator)
         # Cases side by side all have as many actions as the one with the most, and as many commands as all together: a
         # continuous one has many, and over time there are many cases.

@@ -229,7 +229,7 @@ def _done(study: Study, results: Results) -> Section:
         if arm.delivery == "shuffled":
             said.append("the delivered stimulus is drawn at random, in training and in evaluation")
         if arm.percentiles == "first":
-            said.append("percentiles of the first recording held")
+            said.append("fixed percentiles, those of the first recording")
         if not arm.trained:
             said.append("not trained")
         points.append((f"Arm: {arm.name}", "; ".join(said) + "."))

@@ -134,7 +134,7 @@ class Arm:
             mappings that are not ours); `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
-        percentiles: of the mapping: `"moving"` with the simulator, or held from the `"first"` recording.
+        percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording.
         trained: false for policies as they are before training.
     """
 
@@ -162,7 +162,7 @@ class Arm:
 
     @property
     def thresholds(self) -> str:
-        """Its mapping and how the percentiles are held, as a folder's name."""
+        """Its mapping and whether the percentiles are fixed, as a folder's name."""
         return self.mapping.replace(":", ".") + ("-held" if self.percentiles == "first" else "")
 
     @property
@@ -177,9 +177,9 @@ class Arm:
 
 
 def named_mapping(mapping: str, percentiles: str) -> str:
-    """A mapping in words, with whether its percentiles are held."""
-    held = ", percentiles held" if percentiles == "first" else ""
-    return "without neurons" if mapping == "none" else f"{mapping}{held}"
+    """A mapping in words, with whether its percentiles are fixed."""
+    fixed = ", percentiles fixed" if percentiles == "first" else ""
+    return "without neurons" if mapping == "none" else f"{mapping}{fixed}"
 
 
 @record

@@ -142,7 +142,7 @@ class Policy:
 
     @property
     def percentiles(self) -> str:
-        """In training, the mapping's percentiles were `"moving"` with the simulator, or those of the `"first"` held."""
+        """In training, the mapping's percentiles were `"moving"` with the simulator, or fixed by the `"first"` one."""
         return str(self._trained.get("percentiles", "moving"))
 
     @property
