@@ -52,7 +52,7 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
 
         def __init__(self, rig: stand_in_maxlab.Rig) -> None:
             super().__init__(rig)
-            self.lived = rig.now
+            self.stepped = rig.now
             self.spikes = np.empty((0, 2), np.int64)
 
         def wait(self, frame: int) -> None:
@@ -60,12 +60,12 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
             due = sorted((p for p in self.rig.delivered if p.frame < frame), key=lambda pulse: pulse.frame)
             self.rig.delivered = [p for p in self.rig.delivered if p.frame >= frame]
             rate_hz = virtual.sampling_rate_hz
-            stimuli = [_stimulus(list(pulses), (at - self.lived) / rate_hz) for at, pulses in groupby(due, _frame)]
-            if frame > self.lived:
-                seen = virtual.deliver(stimuli, (frame - self.lived) / rate_hz)
-                frames = self.lived + np.rint(seen.spikes.time_s * rate_hz).astype(np.int64)
+            stimuli = [_stimulus(list(pulses), (at - self.stepped) / rate_hz) for at, pulses in groupby(due, _frame)]
+            if frame > self.stepped:
+                seen = virtual.deliver(stimuli, (frame - self.stepped) / rate_hz)
+                frames = self.stepped + np.rint(seen.spikes.time_s * rate_hz).astype(np.int64)
                 new = np.column_stack([frames, amplifier[seen.spikes.channel]])
-                self.spikes, self.lived = np.concatenate([self.spikes, new]), frame
+                self.spikes, self.stepped = np.concatenate([self.spikes, new]), frame
 
         def forget(self, before: int) -> None:
             self.spikes = self.spikes[self.spikes[:, 0] >= before]

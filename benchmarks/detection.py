@@ -2,7 +2,7 @@
 
     python benchmarks/detection.py [--channels 1024] [--seconds 20] [--stimuli-hz 0] [--json results.json]
 
-The traces are made up: noise of 5 uV with spikes of 60 uV at known times, 16-bit whole numbers at 20 kHz, in an HDF5
+The traces are synthetic: noise of 5 uV with spikes of 60 uV at known times, 16-bit whole numbers at 20 kHz, in an HDF5
 file as a rig writes it, so that reading counts. Each row is a process of its own on all cores; its memory is the
 largest resident memory of the process, and of those that it started. With stimuli, ours removes artefacts around so
 many a second, and the spikes in what is blanked are lost; SpikeInterface knows of none. Reading and finding

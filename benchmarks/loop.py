@@ -34,7 +34,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from animat.closed_loop.contenders import Contender, Greedy
+from animat.closed_loop.agents import Agent, Greedy
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import mapping_named
@@ -151,15 +151,15 @@ def loop_of(iterations: int, **settings: Any) -> Loop:
     """A loop whose robot never falls: an episode lasts as long as is measured."""
     robot = Cartpole(track_length_m=1e8, angle_limit_rad=1e8, force_n=0.0, episode_limit=iterations)
     percentiles = np.linspace(0, 40, 11)
-    settings = {"pause_s": PAUSE_S, "lead_in": 0, **settings}
+    settings = {"pause_s": PAUSE_S, "warm_up": 0, **settings}
     return Loop(robot, mapping_named("9-thresholds"), CONDITIONS, percentiles, **settings)
 
 
 def decisions_us(ticks: int) -> tuple[np.ndarray, dict[str, float]]:
     """How long each decision took; and how long the session took to close after its last tick, with how much memory."""
     with tempfile.TemporaryDirectory() as folder, Instant(ticks + 1) as culture:
-        contender = Contender("policy", "random weights", Greedy(policy()))
-        session = run_session(culture, loop_of(ticks), [contender], folder, episodes=1)
+        agent = Agent("policy", "random weights", Greedy(policy()))
+        session = run_session(culture, loop_of(ticks), [agent], folder, episodes=1)
         closing = {
             "seconds": (time.perf_counter_ns() - int(culture.answered_ns[-1])) / 1e9,
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
@@ -241,8 +241,8 @@ def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     idle.start()
     here.recv()
     with tempfile.TemporaryDirectory() as folder, OnOneCore(window_ends_s) as culture:
-        contender = Contender("policy", "random weights", Greedy(policy()))
-        session = run_session(culture, loop_of(ticks, real_time=True), [contender], folder, episodes=1)
+        agent = Agent("policy", "random weights", Greedy(policy()))
+        session = run_session(culture, loop_of(ticks, real_time=True), [agent], folder, episodes=1)
         assert session.ending.by == "plan", session.ending
         assert len(session.ticks) == ticks
     here.send("over")

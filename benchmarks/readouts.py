@@ -1,6 +1,6 @@
 """How far two commands can be set apart: the readouts' responses to each condition of place and frequency.
 
-    python benchmarks/readouts.py [--cultures 1 2 3] [--places halves] [--frequencies 5 80] [--presentations 500]
+    python benchmarks/readouts.py [--cultures 1 2 3] [--places halves] [--frequencies 5 80] [--trials 500]
     python benchmarks/readouts.py --places corners --frequencies 20
 
 Of each virtual culture one recording is made, with its conditions mixed, one pulse each. With `corners` the stimulated
@@ -28,12 +28,12 @@ from animat.stimulation.places import NAMED, Places, electrodes_of
 from animat.stimulation.protocol import Protocol
 
 
-def recorded(seed: int, places: str, frequencies_hz: tuple[float, ...], presentations: int) -> Responses:
+def recorded(seed: int, places: str, frequencies_hz: tuple[float, ...], trials: int) -> Responses:
     """The responses of a virtual culture, read by halves or quadrants."""
     with VirtualCulture(seed) as culture:
         electrodes = np.array(culture.stimulation_electrodes)
         groups: Places = places if places in NAMED else corners_of(electrodes)
-        protocol = Protocol(order="mixed", places=groups, frequencies_hz=frequencies_hz, presentations=presentations)
+        protocol = Protocol(order="mixed", places=groups, frequencies_hz=frequencies_hz, trials=trials)
         recording = culture.record(protocol, seed=1)
     by = conditions_named("frequency x electrode")
     readouts = readouts_on(places if places in NAMED else "halves", recording.channels)
@@ -73,10 +73,10 @@ def main() -> None:
     parser.add_argument("--cultures", type=int, nargs="+", default=[1, 2, 3], help="seeds")
     parser.add_argument("--places", default="halves", choices=[*NAMED, "corners"])
     parser.add_argument("--frequencies", type=float, nargs="+", default=[5.0, 80.0], help="Hz")
-    parser.add_argument("--presentations", type=int, default=500, help="of each condition")
+    parser.add_argument("--trials", type=int, default=500, help="of each condition")
     given = parser.parse_args()
     for seed in given.cultures:
-        responses = recorded(seed, given.places, tuple(given.frequencies), given.presentations)
+        responses = recorded(seed, given.places, tuple(given.frequencies), given.trials)
         print(f"\nculture {seed}; corners are of {', '.join(responses.readouts.names)}\n")
         print("\n".join(table(responses)), flush=True)
 

@@ -1,7 +1,7 @@
-"""The headline table: predicted against lived return by how recordings and loop present, over cultures and both robots.
+"""The headline table: predicted against measured return by recordings and presentation, over cultures and both robots.
 
     python benchmarks/reality_gap.py [--seeds 1 2 3 4 5] [--robots cartpole navigation]
-        [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds follow held]
+        [--ways default paper mixed five memory memory9] [--policies 2] [--episodes 20] [--thresholds adaptive fixed]
         [--controls] [--out gap/]
     python benchmarks/reality_gap.py --backends virtual cl1 maxone --channels 1024 256 128 60 16
 
@@ -35,11 +35,11 @@ COLUMNS = (
     "recorded",
     "simulator",
     "mapping",
-    "percentiles",
-    "random: predicted, lived",
-    "limit",
+    "thresholds",
+    "random: predicted, measured",
+    "optimum",
     "predicted, 95 %",
-    "lived",
+    "measured",
     "gap, 95 %",
     "of the range",
     "pulses/action",
@@ -52,14 +52,14 @@ class Way:
 
     order: str = "mixed"
     pulses: int = 1
-    presentations: int = 100
+    trials: int = 100
     simulator: str = "histogram"
     mapping: str = "1-threshold"
 
     @property
     def recorded(self) -> str:
         """In words."""
-        return f"{self.order}, {self.pulses}, {self.presentations} times"
+        return f"{self.order}, {self.pulses}, {self.trials} times"
 
 
 WAYS = {
@@ -67,8 +67,8 @@ WAYS = {
     "paper": Way(order="blocked"),
     "mixed": Way(),
     "five": Way(pulses=5),
-    "memory": Way(presentations=500, simulator="memory"),
-    "memory9": Way(presentations=500, simulator="memory", mapping="9-thresholds"),
+    "memory": Way(trials=500, simulator="memory"),
+    "memory9": Way(trials=500, simulator="memory", mapping="9-thresholds"),
 }
 
 
@@ -76,7 +76,7 @@ def recording_options(way: Way | None) -> list[str]:
     """Of `animat record`."""
     if way is None:
         return []
-    presented = ["--order", way.order, "--pulses", str(way.pulses), "--presentations", str(way.presentations)]
+    presented = ["--order", way.order, "--pulses", str(way.pulses), "--trials", str(way.trials)]
     return ["--sessions", "2", "--interval-min", "10", *presented]
 
 
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--robots", nargs="+", default=["cartpole", "navigation"])
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--thresholds", nargs="+", default=["follow", "held"])
+    parser.add_argument("--thresholds", nargs="+", default=["adaptive", "fixed"])
     parser.add_argument("--policies", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--iterations", type=int, help="default: the paper's")
@@ -133,13 +133,13 @@ def main() -> None:
             policies = str(folder / "policies")
             given = training_options(way, robot, options.policies, options.iterations)
             expect(["train", robot, "--recordings", recordings, *given, "--out", policies])
-            for thresholds in options.thresholds if way else ["follow"]:
-                table = folder / f"{thresholds}.json"
+            for thresholds in options.thresholds if way else ["adaptive"]:
+                table = table_of(folder, thresholds)
                 if not table.exists():
                     run = ["run", policies, "--recordings", recordings, "--out", str(free(folder / thresholds))]
                     run += running_options(way, thresholds, options.episodes, controls=options.controls)
                     table.write_text(json.dumps(ran(run)) + "\n")
-                lines.append(told(seed, way, thresholds, json.loads(table.read_text())))
+                lines.append(told(seed, way, thresholds, read_table(table)))
                 print(lines[-1], flush=True)
     print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
     print("\n".join(lines))
@@ -183,16 +183,38 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
                 pulse=pulse,
                 patterns=protocol.patterns,
             )
-        lived = gap.to_dict()
-        if lived["session"]["ended_by"] != "plan":
-            print(f"{folder}: no row: {lived['session']['ended']}", file=sys.stderr)
+        outcome = gap.to_dict()
+        if outcome["session"]["ended_by"] != "plan":
+            print(f"{folder}: no row: {outcome['session']['ended']}", file=sys.stderr)
             return None
-        table.write_text(json.dumps(lived) + "\n")
-    return told(seed, way, "follow", json.loads(table.read_text()))
+        table.write_text(json.dumps(outcome) + "\n")
+    return told(seed, way, "adaptive", read_table(table))
+
+
+FORMER = {"lived": "measured", "limit": "optimum"}
+"""Keys as tables of before have them."""
+FORMER_FILES = {"adaptive": "follow", "fixed": "held"}
+"""What tables of before are called."""
+
+
+def table_of(folder: Path, thresholds: str) -> Path:
+    """Where the table is: the former one, or the new one."""
+    former = folder / f"{FORMER_FILES[thresholds]}.json"
+    return former if former.exists() else folder / f"{thresholds}.json"
+
+
+def read_table(file: Path) -> dict[str, Any]:
+    """What a run came to."""
+    found: dict[str, Any] = json.loads(file.read_text(), object_hook=_renamed)
+    return found
+
+
+def _renamed(words: dict[str, Any]) -> dict[str, Any]:
+    return {FORMER.get(key, key): value for key, value in words.items()}
 
 
 def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:
-    """A line of the table; the range is from random to the limit, both on the simulator."""
+    """A line of the table; the range is from random to the optimum, both on the simulator."""
     policies, random = ran["rows"][0], next(row for row in ran["rows"] if row["name"] == "random")
     prediction, gap = policies["prediction"], policies["gap"]
     cells = (
@@ -200,10 +222,10 @@ def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> st
         ran["robot"],
         *((way.recorded, way.simulator, way.mapping) if way else ("default", "default", ran["mapping"])),
         thresholds,
-        f"{random['predicted']:.1f}, {random['lived']:.1f}",
-        "-" if ran["limit"] is None else f"{ran['limit']:.1f}",
+        f"{random['predicted']:.1f}, {random['measured']:.1f}",
+        "-" if ran["optimum"] is None else f"{ran['optimum']:.1f}",
         f"{prediction['value']:.1f} ({prediction['low']:.1f} to {prediction['high']:.1f})",
-        f"{policies['lived']:.1f}",
+        f"{policies['measured']:.1f}",
         f"{gap['value']:+.1f} ({gap['low']:+.1f} to {gap['high']:+.1f})",
         "-" if ran["gap_share"] is None else f"{100 * ran['gap_share']:+.0f} %",
         f"{policies['pulses_per_action']:.0f}",

@@ -149,7 +149,7 @@ def algorithm() -> Any:
     from animat.training.settings import SAC
 
     default = SAC()
-    return replace(default, updates=max(1, default.environments // 8))
+    return replace(default, gradient_steps=max(1, default.environments // 8))
 
 
 def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
@@ -157,12 +157,12 @@ def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
     from animat.coding.mapping import mapping_named
     from animat.compilation import keep_compilations
     from animat.environment import Animat
-    from animat.neurons.made_up import made_up_simulator
+    from animat.neurons.synthetic import synthetic_simulator
     from animat.robots.cartpole import Cartpole
     from animat.training.group import programs
 
     keep_compilations()
-    simulator, settings = made_up_simulator(), algorithm()
+    simulator, settings = synthetic_simulator(), algorithm()
     environment = Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions)
     beginning, chunk = programs(environment, settings)
     return environment, settings, simulator, chunk, beginning
@@ -205,26 +205,26 @@ def rate(policies: int, repeats: int) -> dict[str, Any]:
     iterations = rounds * settings.environments * policies
     return {
         "environments": settings.environments,
-        "updates": settings.updates,
+        "gradient_steps": settings.gradient_steps,
         "batch": settings.batch,
         "hidden": settings.hidden,
         "best_per_s": iterations / min(seconds),
         "median_per_s": iterations / statistics.median(seconds),
-        "update_us": 1e6 * min(seconds) / (rounds * settings.updates * policies),
+        "update_us": 1e6 * min(seconds) / (rounds * settings.gradient_steps * policies),
     }
 
 
 def timeline() -> Any:
-    """The made-up culture as a timeline of one recording."""
+    """The synthetic culture as a timeline of one recording."""
     import jax
     import numpy as np
 
-    from animat.neurons.made_up import LABELS, made_up_simulator
+    from animat.neurons.synthetic import LABELS, synthetic_simulator
     from animat.neurons.timeline import SimulatorTimeline
     from animat.responses.condition import Condition
 
     return SimulatorTimeline(
-        simulators=jax.tree.map(lambda leaf: leaf[None], made_up_simulator()),
+        simulators=jax.tree.map(lambda leaf: leaf[None], synthetic_simulator()),
         start_min=np.zeros(1),
         conditions=tuple(Condition(label, float(label.split()[0]), "Hz") for label in LABELS),
         window_ms=(2.0, 10.0),

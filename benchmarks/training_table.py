@@ -16,7 +16,7 @@ def print_table(measured: dict[str, Any]) -> None:
     wanted = measured["wanted_return"]
     reached = f"mean {ours_['mean_return']:.0f}, lowest {ours_['lowest_return']:.0f}"
     of_tracing = f"{cached['trace_s']:.2f} s of it tracing"
-    settings = f"{one['environments']} environments, {one['updates']} updates, batch {one['batch']}"
+    settings = f"{one['environments']} environments, {one['gradient_steps']} gradient steps, batch {one['batch']}"
     rows = [
         ("training, one core, replay ratio 1/8", "", settings),
         ("  one policy", f"{one['best_per_s']:,.0f} iterations/s", f"{one['update_us']:.0f} us an update; aim 60,000"),

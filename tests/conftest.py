@@ -100,6 +100,6 @@ def in_this_process() -> Iterator[None]:
 
 
 @pytest.fixture
-def few_redrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Predictions with intervals from few simulators, for tests of what else a closed loop says and does."""
-    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 4)
+    monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)

@@ -22,8 +22,8 @@ import numpy as np
 from animat.errors import AnimatError
 from animat.recordings.apart import _reader
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.inspection import inspect_recording
 from rig_files import (
     BITS,
@@ -51,7 +51,7 @@ def sound(kind: str, path: Path) -> None:
     table = mapping_table([3, 9, 40], [1000, 2000, 26_399])
     stimuli = np.arange(1, 9)
     if kind == "nwb":
-        write_nwb(make_up_recording(3, patterns=3, channels=16), path)
+        write_nwb(synthetic_recording(3, patterns=3, channels=16), path)
     elif kind == "other-nwb":
         from test_rig_readers import other_nwb
 

@@ -38,7 +38,7 @@ class Payer(Robot[Counted]):
     paper_iterations: ClassVar[int] = 1
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("iteration", "1", 2.0),)
 
     def reset(self, key: Array) -> Counted:
@@ -65,7 +65,7 @@ class Follower(Robot[Counted]):
     paper_iterations: ClassVar[int] = 1
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("wanted", "1", 1.0),)
 
     def reset(self, key: Array) -> Counted:
@@ -98,7 +98,7 @@ class FollowerOfTwo(Robot[TwoCounted]):
     paper_iterations: ClassVar[int] = 1
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("wanted", "1", 1.0), Quantity("wanted too", "1", 1.0))
 
     def reset(self, key: Array) -> TwoCounted:

@@ -13,7 +13,7 @@ from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
 
 ONE_CHANNEL = Channels(label=np.array(["0"]), electrode=np.array([0]), x_um=np.zeros(1), y_um=np.zeros(1))
-PROTOCOL = Protocol((20.0, 40.0, 80.0), patterns=1, presentations=2, setup_s=0.0, pause_s=0.1)
+PROTOCOL = Protocol((20.0, 40.0, 80.0), patterns=1, trials=2, setup_s=0.0, pause_s=0.1)
 
 
 @given(

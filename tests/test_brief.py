@@ -8,14 +8,14 @@ import pytest
 
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import fit_timeline
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 
 
 @pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])
 def test_recordings_responses_and_simulators_are_printed_by_type_and_shape(kind: str) -> None:
-    recording = make_up_recording(1, patterns=40, channels=64)
+    recording = synthetic_recording(1, patterns=40, channels=64)
     responses = extract_responses(recording)
     timeline = fit_timeline([responses], kind=kind)
     for record in (
@@ -35,6 +35,6 @@ def test_recordings_responses_and_simulators_are_printed_by_type_and_shape(kind:
 
 def test_a_traced_simulator_is_printed_too() -> None:
     seen = []
-    simulator = fit_empirical(extract_responses(make_up_recording(1, patterns=40, channels=64)))
+    simulator = fit_empirical(extract_responses(synthetic_recording(1, patterns=40, channels=64)))
     jax.jit(lambda traced: seen.append(repr(traced)) or np.float32(0))(simulator)
     assert "values_hz=float32[5, " in seen[0]

@@ -176,12 +176,12 @@ def test_the_printed_variants_are_selectable_and_say_what_they_mean() -> None:
     assert not run(printed, tilted, jnp.zeros(1), jnp.asarray(NO_NOISE))[2][0]
     assert run(Cartpole(), tilted, jnp.zeros(1), jnp.asarray(NO_NOISE))[2][0]
     assert Cartpole().caveats() == ()
-    (sentence,) = printed.caveats()
-    assert "angle_limit_rad = 12" in sentence and "not to balance" in sentence
+    (message,) = printed.caveats()
+    assert "angle_limit_rad = 12" in message and "not to balance" in message
 
 
 def test_a_pole_left_alone_falls_and_a_simple_rule_keeps_it_up() -> None:
-    """A hand-made rule holds for all 120 iterations, so the task's best return of 120 can be had."""
+    """A heuristic policy holds for all 120 iterations, so the task's best return of 120 can be had."""
     robot = Cartpole()
 
     def episode(key, rule):

@@ -61,7 +61,7 @@ def test_a_channel_that_cannot_stimulate_is_refused_by_name(channel: int, what: 
 def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with CL1Culture() as culture:
         culture.rest(60.0)
-        recording = culture.record(Protocol(pulse=CL1_PULSE, presentations=2, patterns=2, setup_s=0.1), seed=1)
+        recording = culture.record(Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1), seed=1)
         assert other_culture(recording, recording.start_min, culture) is None
     install(monkeypatch)
     with CL1Culture() as culture:
@@ -69,7 +69,7 @@ def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         found = other_culture(recording, recording.start_min, culture)
     assert recording.duration_s > 5
     assert found is not None and found.name == "other-culture"
-    assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.sentence
+    assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.message
 
 
 def pulse(*numbers: float) -> Pulse:
@@ -113,8 +113,8 @@ def test_pulses_faster_than_200_hz_are_refused_on_one_channel_and_not_on_two() -
 
 def test_the_five_frequencies_are_delivered_to_a_frame(neurons: Neurons) -> None:
     with CL1Culture() as culture:
-        recording = culture.record(Protocol(pulse=CL1_PULSE, presentations=20, setup_s=0.1, pause_s=0.5), seed=2)
-        schedule = culture.schedule(Protocol(pulse=CL1_PULSE, presentations=20, setup_s=0.1, pause_s=0.5), seed=2)
+        recording = culture.record(Protocol(pulse=CL1_PULSE, trials=20, setup_s=0.1, pause_s=0.5), seed=2)
+        schedule = culture.schedule(Protocol(pulse=CL1_PULSE, trials=20, setup_s=0.1, pause_s=0.5), seed=2)
     delivered = sorted({frame for frame, _, _ in neurons.pulses})
     asked = np.concatenate([block.stimuli.time_s for block in schedule.blocks])
     assert len(delivered) == len(asked) == 100
@@ -315,7 +315,7 @@ def test_spikes_on_ground_are_counted_and_not_recorded(neurons: Neurons) -> None
         assert culture.spikes_not_on_electrodes == 2
         # A recording says what it does not have; what was before it is not its own.
         neurons.queue = [(neurons.now + 14 - neurons.now % 7, 4, None)]  # type: ignore[list-item]
-        protocol = Protocol(pulse=CL1_PULSE, presentations=1, patterns=5, setup_s=0.0)
+        protocol = Protocol(pulse=CL1_PULSE, trials=1, patterns=5, setup_s=0.0)
         assert culture.record(protocol).provenance["left_out"] == "1 spikes on ground or reference"
         assert "left_out" not in culture.record(protocol).provenance
 

@@ -72,7 +72,7 @@ tell(done=len(done))
 
 def test_the_five_frequencies_come_as_asked_and_as_the_sdks_own_file_says(tmp_path: Path) -> None:
     script = """
-protocol = Protocol(pulse=CL1_PULSE, patterns=10, presentations=10, setup_s=0.1, pause_s=0.2)
+protocol = Protocol(pulse=CL1_PULSE, patterns=10, trials=10, setup_s=0.1, pause_s=0.2)
 with CL1Culture(record_to="rec") as culture:
     recording = culture.record(protocol, seed=1)
     asked = np.concatenate([b.stimuli.time_s for b in culture.schedule(protocol, 1).blocks])
@@ -182,7 +182,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.stimulation.protocol import Protocol
 with CL1Culture() as culture:
     pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
-    protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), presentations=20, patterns=20)
+    protocol = Protocol(pulse=pulse, frequencies_hz=(10.0, 40.0), trials=20, patterns=20)
     recording = culture.record(protocol, seed=1)
     write_nwb(recording, "cl1.nwb")
     window = [np.count_nonzero((recording.spike_times_s >= t + 0.002) & (recording.spike_times_s < t + 0.010))
@@ -197,7 +197,7 @@ tell(window=float(np.mean(window)), rest=rest, stimuli=len(window))
 
 def test_a_closed_loop_runs_on_it_and_the_sdks_own_file_has_the_same_pulses(tmp_path: Path) -> None:
     script = """
-from animat.closed_loop.contenders import controls
+from animat.closed_loop.agents import controls
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import mapping_named
@@ -208,11 +208,11 @@ pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
 frequencies = tuple(Condition(f"{f} Hz", float(f), "Hz") for f in (20, 40, 80))
 percentiles = np.linspace(0, 100, 11)
 loop = Loop(robot_named("cartpole"), mapping_named("1-threshold"), frequencies, percentiles, pulses=5, pulse=pulse)
-contenders = controls(loop.robot, [c.label for c in frequencies], means=None)[:1]
+agents = controls(loop.robot, [c.label for c in frequencies], means=None)[:1]
 with CL1Culture(record_to="rig") as culture:
-    session = run_session(culture, loop, contenders, "session", episodes=2)
+    session = run_session(culture, loop, agents, "session", episodes=2)
 if session.ending.by != "plan":
-    sys.exit(session.ending.sentence)
+    sys.exit(session.ending.message)
 recording = session.recording()
 tell(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
      hz=recording.stimuli.frequency_hz.tolist(), pattern=recording.stimuli.pattern.tolist())

@@ -27,8 +27,8 @@ from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import with_intervals
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
-from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recordings
+from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
@@ -41,7 +41,7 @@ QUICK = ["--policies", "2", "--iterations", "2000"]
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("series") / "recordings"
-    write_made_up_series(1, folder, sessions=2, patterns=40, channels=64)
+    write_synthetic_series(1, folder, sessions=2, patterns=40, channels=64)
     return folder
 
 
@@ -101,7 +101,7 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
 
 def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
-    record = ["record", "--culture", "made-up", "--sessions", "2", "--out", str(series)]
+    record = ["record", "--culture", "synthetic", "--sessions", "2", "--out", str(series)]
     assert main([*record, "--json"]) == 0
     assert len(last_json(capsys.readouterr().out)["recordings"]) == 2  # type: ignore[arg-type]
 
@@ -122,7 +122,7 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.oracle
-def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
+def test_evaluate_tells_the_optimum_of_the_recording_it_evaluates_on(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
@@ -137,15 +137,15 @@ def test_evaluate_tells_the_limit_of_the_recording_it_evaluates_on(
     monkeypatch.setattr("animat.evaluation.table.best_return", rough)
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0"]
-    assert main([*command, "--limit", "--json"]) == 0
+    assert main([*command, "--optimum", "--json"]) == 0
     said = capsys.readouterr().out
     told: dict[str, Any] = last_json(said)
     assert asked == [1.0]
     simulator = fit_timeline(extract_series(read_recordings([recordings]))).at(0.0)
     direct = best_return(Animat(Cartpole(), Thresholds(9), 5), simulator, resolution=0.25, episodes=0)
-    interval = told["limit"].pop("interval")
+    interval = told["optimum"].pop("interval")
     assert interval["low"] <= interval["value"] == direct.value <= interval["high"]
-    assert told["limit"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
+    assert told["optimum"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
     assert f"optimal return {direct.value:.1f}, 95 % interval {interval['low']:.1f} to" in said
     means = {row["name"]: row["mean_return"] for row in told["rows"]}
     score = (means["policies"] - means["random"]) / (direct.value - means["random"])
@@ -325,8 +325,8 @@ BAD = {
         )
         for command, more, option in (
             ("record", [], "--sessions"),
-            ("record", ["--culture", "made-up"], "--sessions"),
-            ("record", [], "--presentations"),
+            ("record", ["--culture", "synthetic"], "--sessions"),
+            ("record", [], "--trials"),
             ("record", [], "--pulses"),
             ("train", ["cartpole", "--recordings", "{recordings}"], "--policies"),
             ("run", ["{policies}", "--culture", "replay", "--recordings", "{recordings}"], "--episodes"),
@@ -358,7 +358,7 @@ BAD = {
     "a name that is too long": (nothing, ["inspect", "a" * 5000], ["File name too long"]),
     "zero sessions": (
         nothing,
-        ["record", "--culture", "made-up", "--sessions", "0", "--out", "{folder}/r"],
+        ["record", "--culture", "synthetic", "--sessions", "0", "--out", "{folder}/r"],
         ["sessions"],
     ),
 }

@@ -14,18 +14,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import (
+from animat.closed_loop.adaptive import AdaptiveThresholds
+from animat.closed_loop.agents import (
+    Agent,
     AnyCondition,
-    Contender,
-    HandMadeRule,
+    HeuristicController,
     InTurn,
     OneCondition,
     controls,
     interleaved,
 )
-from animat.closed_loop.following import Following
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.closed_loop.tick import Tick
@@ -50,12 +50,12 @@ HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 CONDITIONS = tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ)
 PERCENTILES = np.linspace(0.0, 125.0, 11)
 SHORT = Navigation(episode_limit=6)
-RANDOM = Contender("random", "any", AnyCondition(5))
+RANDOM = Agent("random", "any", AnyCondition(5))
 
 
 def loop_of(**changed: Any) -> Loop:
     given = {"robot": SHORT, "mapping": Thresholds(9), "conditions": CONDITIONS, "percentiles": PERCENTILES}
-    return Loop(**(given | {"pause_s": 0.1, "lead_in": 0} | changed))
+    return Loop(**(given | {"pause_s": 0.1, "warm_up": 0} | changed))
 
 
 class TestFake(CultureContract):
@@ -74,7 +74,7 @@ class TestFake(CultureContract):
     jitter=st.booleans(),
     on_burst=st.sampled_from(["use", "repeat", "skip"]),
     window_ms=st.sampled_from([(2.0, 10.0), (0.0, 5.0), (3.15, 11.05)]),
-    lead_in=st.integers(0, 2),
+    warm_up=st.integers(0, 2),
 )
 def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     tmp_path_factory: pytest.TempPathFactory,
@@ -83,17 +83,17 @@ def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     jitter: bool,
     on_burst: str,
     window_ms: tuple[float, float],
-    lead_in: int,
+    warm_up: int,
 ) -> None:
     folder = tmp_path_factory.mktemp("session")
-    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms, lead_in=lead_in)
-    contenders = [
+    loop = loop_of(pulses=pulses, burst_threshold=0.9, on_burst=on_burst, window_ms=window_ms, warm_up=warm_up)
+    agents = [
         RANDOM,
-        Contender("shuffled", "", OneCondition(1), "shuffled"),
-        Contender("no", "", OneCondition(0), "silent"),
+        Agent("shuffled", "", OneCondition(1), "shuffled"),
+        Agent("no", "", OneCondition(0), "silent"),
     ]
     with FakeCulture(seed, jitter=jitter) as culture:
-        session = run_session(culture, loop, contenders, folder, episodes=2, seed=seed)
+        session = run_session(culture, loop, agents, folder, episodes=2, seed=seed)
     assert session.ending.by == "plan", session.ending
     assert_read_alike(folder, loop)
     ticks = session.ticks
@@ -139,7 +139,7 @@ def assert_table_is_the_session(folder: Path, names: list[str]) -> None:
     again = [
         Tick(
             number=int(row["tick"]),
-            contender=row["contender"],
+            agent=row["agent"],
             episode=int(row["episode"]),
             iteration=int(row["iteration"]),
             chosen=[c.label for c in CONDITIONS].index(row["chosen"]),
@@ -180,9 +180,9 @@ def assert_table_is_the_session(folder: Path, names: list[str]) -> None:
 )
 def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Robot[Any], names: list[str]) -> None:
     loop = loop_of(robot=robot, pulses=2, burst_threshold=0.9, on_burst="repeat")
-    contenders = [RANDOM, Contender("no", "", OneCondition(0), "silent")]
+    agents = [RANDOM, Agent("no", "", OneCondition(0), "silent")]
     with FakeCulture(1) as culture:
-        session = run_session(culture, loop, contenders, tmp_path, episodes=3)
+        session = run_session(culture, loop, agents, tmp_path, episodes=3)
     assert {tick.handled for tick in session.ticks} == {"used", "repeated"}
     assert_table_is_the_session(tmp_path, names)
     said = read_recording(session.recording_file).provenance["session_description"]
@@ -196,8 +196,8 @@ def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Ro
 def test_on_the_virtual_culture_too(tmp_path: Path) -> None:
     loop = loop_of(pulses=5, percentiles=np.linspace(0, 40, 11), burst_threshold=0.9)
     with small_culture() as culture:
-        contenders = [RANDOM, Contender("no", "", OneCondition(4), "silent")]
-        session = run_session(culture, loop, contenders, tmp_path, episodes=2)
+        agents = [RANDOM, Agent("no", "", OneCondition(4), "silent")]
+        session = run_session(culture, loop, agents, tmp_path, episodes=2)
         assert session.ending.by == "plan"
         assert not culture.is_stopped
         assert culture.delivered == sum(episode.pulses for episode in session.episodes) == 60
@@ -244,7 +244,7 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
     assert 0 < max(tick.decided_s for tick in session.ticks) < 0.002
 
 
-def test_contenders_take_turns_in_random_order() -> None:
+def test_agents_take_turns_in_random_order() -> None:
     rng = np.random.default_rng(1)
     turns = interleaved([50] * 4, rng)
     rounds = np.array(turns).reshape(50, 4)
@@ -253,7 +253,7 @@ def test_contenders_take_turns_in_random_order() -> None:
     assert all(4 <= np.sum(rounds[:, place] == who) <= 24 for place in range(4) for who in range(4))
 
 
-def test_contenders_with_fewer_episodes_are_spread_over_the_session() -> None:
+def test_agents_with_fewer_episodes_are_spread_over_the_session() -> None:
     turns = np.array(interleaved([40, 5], np.random.default_rng(2)))
     assert np.bincount(turns).tolist() == [40, 5]
     before = np.cumsum(turns == 0)[turns == 1]
@@ -262,15 +262,15 @@ def test_contenders_with_fewer_episodes_are_spread_over_the_session() -> None:
 
 
 def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_condition(tmp_path: Path) -> None:
-    contenders = [Contender("no", "", OneCondition(0), "silent"), Contender("any", "", OneCondition(4), "shuffled")]
+    agents = [Agent("no", "", OneCondition(0), "silent"), Agent("any", "", OneCondition(4), "shuffled")]
     with FakeCulture() as culture:
-        session = run_session(culture, loop_of(), contenders, tmp_path, episodes=10)
+        session = run_session(culture, loop_of(), agents, tmp_path, episodes=10)
         assert culture.delivered == culture.pulses == 60
-    silent = [tick for tick in session.ticks if tick.contender == "no"]
+    silent = [tick for tick in session.ticks if tick.agent == "no"]
     assert not any(tick.patterns or tick.pulse_time_s for tick in silent)
     assert all(tick.reward is not None for tick in silent)
-    shuffled = [tick.delivered for tick in session.ticks if tick.contender == "any"]
-    assert {tick.chosen for tick in session.ticks if tick.contender == "any"} == {4}
+    shuffled = [tick.delivered for tick in session.ticks if tick.agent == "any"]
+    assert {tick.chosen for tick in session.ticks if tick.agent == "any"} == {4}
     assert set(shuffled) == set(range(5))
 
 
@@ -297,63 +297,63 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
     class Done(Exception):
         pass
 
-    rest = Contender("rest", "no pulse", AnyCondition(5), "silent")
-    loop = loop_of(lead_in=3, pulses=2, burst_threshold=0.5, on_burst="repeat")
+    rest = Agent("rest", "no pulse", AnyCondition(5), "silent")
+    loop = loop_of(warm_up=3, pulses=2, burst_threshold=0.5, on_burst="repeat")
     with FakeCulture() as culture:
         session = run_session(culture, loop, [RANDOM, rest], tmp_path / "two", episodes=2)
     for episode in session.episodes:
         ticks = [tick for tick in session.ticks if tick.episode == episode.number]
-        leading = [tick for tick in ticks if tick.handled == "lead-in"]
+        warming = [tick for tick in ticks if tick.handled == "warm-up"]
         # Silence has nothing before it either.
-        assert len(leading) == (0 if episode.contender == "rest" else 15)
-        assert ticks[: len(leading)] == leading
-        for n in range(0, len(leading), 5):
-            assert sorted(tick.delivered for tick in leading[n : n + 5]) == [0, 1, 2, 3, 4]
-        assert len({tuple(tick.delivered for tick in leading[n : n + 5]) for n in (0, 5, 10)}) == (3 if leading else 1)
-        for tick in leading:
+        assert len(warming) == (0 if episode.agent == "rest" else 15)
+        assert ticks[: len(warming)] == warming
+        for n in range(0, len(warming), 5):
+            assert sorted(tick.delivered for tick in warming[n : n + 5]) == [0, 1, 2, 3, 4]
+        assert len({tuple(tick.delivered for tick in warming[n : n + 5]) for n in (0, 5, 10)}) == (3 if warming else 1)
+        for tick in warming:
             assert (tick.iteration, tick.command, tick.reward, tick.observation) == (-1, None, None, ())
             assert len(tick.pulse_time_s) == 2
-        assert ticks[len(leading)].iteration == 0
+        assert ticks[len(warming)].iteration == 0
         assert episode.iterations == 6
         assert episode.pulses == sum(len(tick.pulse_time_s) for tick in ticks)
     assert_read_alike(tmp_path / "two", loop)
     # The robot stands until the policy's first choice.
     with FakeCulture() as culture:
-        session = run_session(culture, loop, [Contender("fixed", "", Fixed())], tmp_path / "one", episodes=1)
+        session = run_session(culture, loop, [Agent("fixed", "", Fixed())], tmp_path / "one", episodes=1)
     assert session.ending.by == "controller"
-    assert "Done" in session.ending.sentence
+    assert "Done" in session.ending.message
     assert len(session.ticks) == 15
 
 
-def test_what_leads_in_counts_for_percentiles_that_follow(tmp_path: Path) -> None:
-    following = tuple(np.zeros(3) for _ in HZ)
-    loop = loop_of(lead_in=3, following=following)
-    one = Contender("constant", "", OneCondition(0), calibrates=False)
+def test_the_warm_up_counts_for_adaptive_thresholds(tmp_path: Path) -> None:
+    reference = tuple(np.zeros(3) for _ in HZ)
+    loop = loop_of(warm_up=3, adaptive_from=reference)
+    one = Agent("constant", "", OneCondition(0), calibrates=False)
     with FakeCulture() as culture:
         session = run_session(culture, loop, [one], tmp_path, episodes=1)
-    leading = [tick.rate_hz for tick in session.ticks if tick.handled == "lead-in"]
+    warming = [tick.rate_hz for tick in session.ticks if tick.handled == "warm-up"]
     told = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
-    assert len(leading) == 15
-    assert max(leading) > 0
+    assert len(warming) == 15
+    assert max(warming) > 0
     # Three of each condition: all that was recorded has given way.
-    np.testing.assert_array_equal(told, [np.percentile(leading, np.linspace(0, 100, 11)).astype(np.float32)])
-    acted = [tick for tick in session.ticks if tick.handled != "lead-in"]
+    np.testing.assert_array_equal(told, [np.percentile(warming, np.linspace(0, 100, 11)).astype(np.float32)])
+    acted = [tick for tick in session.ticks if tick.handled != "warm-up"]
     assert all(
         tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), np.float32(told[0]))) for tick in acted
     )
 
 
-def test_several_pulses_lead_in_by_themselves() -> None:
-    assert [loop_of(pulses=n, lead_in=None).lead_in for n in (1, 2, 5)] == [2, 0, 0]
-    assert loop_of(pulses=5, lead_in=1).lead_in == 1
+def test_several_pulses_need_no_warm_up() -> None:
+    assert [loop_of(pulses=n, warm_up=None).warm_up for n in (1, 2, 5)] == [2, 0, 0]
+    assert loop_of(pulses=5, warm_up=1).warm_up == 1
 
 
-def test_a_budget_that_runs_out_while_leading_in_ends_the_session(tmp_path: Path) -> None:
+def test_a_budget_that_runs_out_in_the_warm_up_ends_the_session(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         account = Account(Budget(7))
-        session = run_session(culture, loop_of(lead_in=2), [RANDOM], tmp_path, episodes=1, account=account)
+        session = run_session(culture, loop_of(warm_up=2), [RANDOM], tmp_path, episodes=1, account=account)
     assert session.ending.by == "budget"
-    assert [tick.handled for tick in session.ticks] == ["lead-in"] * 7
+    assert [tick.handled for tick in session.ticks] == ["warm-up"] * 7
     (episode,) = session.episodes
     assert (episode.iterations, episode.is_whole, episode.pulses) == (0, False, 7)
     assert_read_alike(tmp_path, loop_of())
@@ -408,12 +408,12 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     loop, findings = Loop.of_policy(RecordedAs(Presentation("blocked", 1)), PERCENTILES)
     assert loop.pulses == 1
     assert [f.severity for f in findings] == ["warning"]
-    assert "blocked" in findings[0].sentence
+    assert "blocked" in findings[0].message
     _, findings = Loop.of_policy(RecordedAs(Presentation("mixed", 5)), PERCENTILES, pulses=2)
-    assert "5 pulse(s) per trial, the loop has 2" in findings[0].sentence
+    assert "5 pulse(s) per trial, the loop has 2" in findings[0].message
     loop, findings = Loop.of_policy(RecordedAs(None), PERCENTILES)
     assert loop.pulses == 1
-    assert "not known" in findings[0].sentence
+    assert "not known" in findings[0].message
     _, findings = Loop.of_policy(RecordedAs(Presentation("mixed")), PERCENTILES, window_ms=(3.0, 9.0))
     assert [f.name for f in findings] == ["other-window"]
     without = RecordedAs(Presentation("mixed"))
@@ -434,8 +434,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"on_burst": "panic"}, "use, repeat, skip"),
         ({"on_late": "panic"}, "continue, stop"),
         ({"pause_s": -1.0}, "pause_s"),
-        ({"lead_in": -1}, "lead_in"),
-        ({"lead_in": 1.5}, "lead_in: expected a whole number"),
+        ({"warm_up": -1}, "warm_up"),
+        ({"warm_up": 1.5}, "warm_up: expected a whole number"),
         ({"patience_s": float("nan")}, "patience_s"),
         ({"patience_s": 0.0}, "patience_s"),
         ({"patterns": 0}, "patterns"),
@@ -446,14 +446,14 @@ def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) 
         loop_of(**wrong)
 
 
-def test_a_session_needs_an_open_culture_contenders_and_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path: Path) -> None:
     culture = FakeCulture()
     with pytest.raises(InvalidArgument, match="closed"):
         run_session(culture, loop_of(), [RANDOM], tmp_path)
     with culture:
-        for contenders in ([], [RANDOM, RANDOM]):
-            with pytest.raises(InvalidArgument, match="contenders"):
-                run_session(culture, loop_of(), contenders, tmp_path)
+        for agents in ([], [RANDOM, RANDOM]):
+            with pytest.raises(InvalidArgument, match="agents"):
+                run_session(culture, loop_of(), agents, tmp_path)
         with pytest.raises(InvalidArgument, match="patterns"):
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
         with pytest.raises(InvalidArgument, match="episodes"):
@@ -468,8 +468,8 @@ def test_a_session_needs_an_open_culture_contenders_and_a_folder_of_its_own(tmp_
             run_session(culture, loop_of(), [RANDOM], tmp_path / "other")
 
 
-def test_the_hand_made_rule_steers_the_right_way() -> None:
-    rule = HandMadeRule(Cartpole(), (-0.4, -0.1, 0.0, 0.1, 0.4))
+def test_the_heuristic_policy_steers_the_right_way() -> None:
+    rule = HeuristicController(Cartpole(), (-0.4, -0.1, 0.0, 0.1, 0.4))
     rng = np.random.default_rng(1)
     assert rule.act(np.array([0.0, 0.0, 0.1, 0.0]), rng) == 4
     assert rule.act(np.array([0.0, 0.0, 0.05, -1.0]), rng) == 0
@@ -481,7 +481,7 @@ def test_the_hand_made_rule_steers_the_right_way() -> None:
     turn_rad = (to_goal + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_array_equal([navigation.heuristic(place) for place in places], np.sign(turn_rad))
     names = [c.name for c in controls(Cartpole(), ["a", "b"], means=(-0.2, 0.2), policies={"p0": rule})]
-    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "made by hand"]
+    assert names == ["random", "constant a", "constant b", "silent", "shuffled", "heuristic"]
 
 
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
@@ -489,10 +489,10 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
     """Commands of full power by the rule, and by the rule turned round."""
     lasted = {}
     for sign in (1, -1):
-        body = Body(robot, np.random.default_rng(1))
-        observation, total = body.reset(0), 0.0
+        runner = RobotRunner(robot, np.random.default_rng(1))
+        observation, total = runner.reset(0), 0.0
         for _ in range(robot.episode_limit):
-            moved = body.step(sign * robot.heuristic(observation))
+            moved = runner.step(sign * robot.heuristic(observation))
             observation, total = moved.observation, total + moved.reward
             if moved.terminated:
                 break
@@ -514,14 +514,14 @@ def test_what_the_device_left_out_is_told(tmp_path: Path) -> None:
 
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
     who = InTurn({f"p{i}": OneCondition(i) for i in range(3)})
-    contenders = [RANDOM, Contender("silent", "", who, "silent"), Contender("shuffled", "", who, "shuffled")]
+    agents = [RANDOM, Agent("silent", "", who, "silent"), Agent("shuffled", "", who, "shuffled")]
     with FakeCulture() as culture:
-        session = run_session(culture, loop_of(), contenders, tmp_path, episodes=5)
+        session = run_session(culture, loop_of(), agents, tmp_path, episodes=5)
     for name in ("silent", "shuffled"):
-        episodes = [episode.number for episode in session.episodes if episode.contender == name]
+        episodes = [episode.number for episode in session.episodes if episode.agent == name]
         chosen = [{tick.chosen for tick in session.ticks if tick.episode == number} for number in episodes]
         assert chosen == [{0}, {1}, {2}, {0}, {1}]
-    assert [told.get("in_turn") for told in session.log.header["contenders"]] == [None, *[["p0", "p1", "p2"]] * 2]
+    assert [told.get("in_turn") for told in session.log.header["agents"]] == [None, *[["p0", "p1", "p2"]] * 2]
 
 
 def test_a_budget_is_kept_to_the_pulse() -> None:
@@ -547,32 +547,32 @@ def test_a_budget_is_kept_to_the_pulse() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_percentiles_follow_the_newest_of_each_condition_and_of_nothing_else(data: st.DataObject) -> None:
+def test_thresholds_adapt_to_the_newest_of_each_condition_and_of_nothing_else(data: st.DataObject) -> None:
     # Where a condition has more than a hundred, the newest count, of every condition the same part.
     sizes = data.draw(st.lists(st.integers(1, 6) | st.integers(98, 130), min_size=1, max_size=4))
     rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
     history = [rng.gamma(5.0, 2.0, n).tolist() for n in sizes]
-    following = Following([np.array(each) for each in history])
+    adaptive = AdaptiveThresholds([np.array(each) for each in history])
     for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
         x = float(rng.gamma(5.0, 1.0))
         history[condition].append(x)
-        following.add(condition, x)
+        adaptive.add(condition, x)
     part = min(1, 100 / max(sizes))
     pooled = np.concatenate([each[-max(1, round(part * n)) :] for each, n in zip(history, sizes, strict=True)])
     expected = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
-    np.testing.assert_array_equal(following.percentiles(), expected)
+    np.testing.assert_array_equal(adaptive.percentiles(), expected)
 
 
 def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> None:
     reference = tuple(np.full(4, 100.0) for _ in HZ)
-    loop = loop_of(following=reference, mapping=Linear(), burst_threshold=0.95)
-    contenders = [
+    loop = loop_of(adaptive_from=reference, mapping=Linear(), burst_threshold=0.95)
+    agents = [
         RANDOM,
-        Contender("always", "", OneCondition(4), calibrates=False),
-        Contender("no", "", OneCondition(4), "silent"),
+        Agent("always", "", OneCondition(4), calibrates=False),
+        Agent("no", "", OneCondition(4), "silent"),
     ]
     with FakeCulture() as culture:
-        session = run_session(culture, loop, contenders, tmp_path, episodes=6)
+        session = run_session(culture, loop, agents, tmp_path, episodes=6)
     in_force = {record.words["episode"]: record.words["percentiles_hz"] for record in session.log.records
                 if record.words["kind"] == "percentiles"}  # fmt: skip
     history = [list(each) for each in reference]
@@ -583,13 +583,13 @@ def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> 
             percentiles = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
             np.testing.assert_array_equal(np.float32(in_force[tick.episode]), percentiles)
         assert tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), percentiles))
-        if tick.contender == "random" and not tick.is_burst:
+        if tick.agent == "random" and not tick.is_burst:
             history[tick.delivered].append(tick.rate_hz)
     assert sum(len(each) for each in history) > 20 + 20
     assert_read_alike(tmp_path, loop)
     for wrong in (reference[:3], (*reference[:4], np.empty(0))):
-        with pytest.raises(InvalidArgument, match="following"):
-            loop_of(following=wrong)
+        with pytest.raises(InvalidArgument, match="adaptive_from"):
+            loop_of(adaptive_from=wrong)
 
 
 class Tiring(FakeCulture):
@@ -601,25 +601,27 @@ class Tiring(FakeCulture):
         return replace(observed, spikes=Spikes(observed.spikes.time_s[kept], observed.spikes.channel[kept]))
 
 
-def test_following_keeps_half_of_the_responses_above_the_median_of_a_culture_that_tires(tmp_path: Path) -> None:
+def test_adaptive_thresholds_keep_half_of_the_responses_above_the_median_of_a_culture_that_tires(
+    tmp_path: Path,
+) -> None:
     above: dict[str, float] = {}
-    protocol = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
-    for how in ("held", "follow"):
+    protocol = Protocol(order="mixed", patterns=8, trials=40, setup_s=0.1)
+    for how in ("fixed", "adaptive"):
         with Tiring() as culture:
             responses = extract_responses(culture.record(protocol), burst_threshold=0.95)
             percentiles = np.percentile(responses.non_burst_rate_hz, range(0, 101, 10))
-            reference = tuple(responses.rates_of(i) for i in range(5)) if how == "follow" else None
+            reference = tuple(responses.rates_of(i) for i in range(5)) if how == "adaptive" else None
             culture.rest(600.0)
             loop = loop_of(
                 robot=Navigation(episode_limit=25),
                 mapping=Thresholds(1),
                 percentiles=percentiles,
-                following=reference,
+                adaptive_from=reference,
                 burst_threshold=0.95,
             )
             session = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=16)
         # The last quarter of the session.
         above[how] = float(np.mean([tick.command == 1.0 for tick in session.ticks[-100:]]))
     # Half of a binomial of 100: standard deviation 0.05. Ties at the median count as above it.
-    assert above["held"] < 0.25
-    assert 0.38 < above["follow"] < 0.72
+    assert above["fixed"] < 0.25
+    assert 0.38 < above["adaptive"] < 0.72

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.closed_loop.contenders import Contender
+from animat.closed_loop.agents import Agent
 from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
@@ -92,7 +92,7 @@ def test_a_backend_that_raises_or_loses_its_connection(tmp_path: Path, error: Ex
     with FakeCulture(fault=raising(error), at=8) as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "culture"
-        assert words in session.ending.sentence
+        assert words in session.ending.message
         assert_safe(session, culture, 7)
         assert len(session.ticks) == 7
     # What was asked is in the log and in the account, as nobody knows whether it came.
@@ -141,7 +141,7 @@ def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str
     with FakeCulture(fault=fault, at=8) as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "culture"
-        assert words in session.ending.sentence
+        assert words in session.ending.message
         assert_safe(session, culture, 7)
     assert session.to_dict()["unanswered_pulses"] == 1
 
@@ -170,7 +170,7 @@ def test_a_connection_that_is_lost_between_two_stimuli(tmp_path: Path) -> None:
         with Gone(lose, left) as culture:
             session = run(tmp_path / str(left), culture)
             assert session.ending.by == "culture"
-            assert "the connection to the culture is lost" in session.ending.sentence
+            assert "the connection to the culture is lost" in session.ending.message
             assert_safe(session, culture, 3)
 
 
@@ -187,7 +187,7 @@ def test_a_clock_that_hangs(tmp_path: Path, left: int, little_grace: None) -> No
         try:
             session = run(tmp_path, culture, patience_s=0.3)
             assert session.ending.by == "hang"
-            assert "the culture did not answer 0.3 s after" in session.ending.sentence
+            assert "the culture did not answer 0.3 s after" in session.ending.message
             assert_safe(session, culture, 3)
         finally:
             released.set()
@@ -209,10 +209,10 @@ def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace:
 
     with FakeCulture() as culture:
         try:
-            contender = Contender("it", "", Pondering())
-            session = run_session(culture, loop_of(robot=LONG, patience_s=0.3), [contender], tmp_path, episodes=1)
+            agent = Agent("it", "", Pondering())
+            session = run_session(culture, loop_of(robot=LONG, patience_s=0.3), [agent], tmp_path, episodes=1)
             assert session.ending.by == "hang"
-            assert "it did not answer 0.3 s after it should have" in session.ending.sentence
+            assert "it did not answer 0.3 s after it should have" in session.ending.message
             assert_safe(session, culture, 7)
             pulses = culture.pulses
         finally:
@@ -239,8 +239,8 @@ def test_a_culture_that_cannot_be_stopped_is_told(tmp_path: Path, how: str, monk
             session = run(tmp_path, culture)
         finally:
             released.set()
-        assert "got RuntimeError: smoke; BUT the culture" in session.ending.sentence
-        assert "see to it that the device gives no more pulses" in session.ending.sentence
+        assert "got RuntimeError: smoke; BUT the culture" in session.ending.message
+        assert "see to it that the device gives no more pulses" in session.ending.message
         # Whatever the device does: nothing passes the guard.
         with pytest.raises(UnsafeStimulus, match="stop"):
             culture.stimulate(culture.stimulation_electrodes[:1], session_pulse())
@@ -272,7 +272,7 @@ def test_a_backend_that_hangs(tmp_path: Path, little_grace: None) -> None:
         try:
             session = run(tmp_path, culture, patience_s=0.3)
             assert session.ending.by == "hang"
-            assert "the culture did not answer 0.3 s after it should have" in session.ending.sentence
+            assert "the culture did not answer 0.3 s after it should have" in session.ending.message
             assert session.to_dict()["unanswered_pulses"] == 1
             assert_safe(session, culture, 7)
             pulses = culture.pulses
@@ -318,7 +318,7 @@ def test_a_backend_that_answers_late(tmp_path: Path, on_late: str) -> None:
         assert tick.late_s == pytest.approx(0.25 - (1 / tick.frequency_hz - window_s), abs=1e-4)
         if on_late == "stop":
             assert session.ending.by == "lateness"
-            assert f"{1000 * tick.late_s:.3g} ms late" in session.ending.sentence
+            assert f"{1000 * tick.late_s:.3g} ms late" in session.ending.message
             assert_safe(session, culture, 9)
             assert session.ticks[-1].handled == "unfinished"
         else:
@@ -353,16 +353,16 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
 
     broken = Broken(how)
 
-    class BrokenBody(driver.Body):
+    class BrokenRunner(driver.RobotRunner):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             self.step = broken(self.step)  # type: ignore[method-assign]
 
-    monkeypatch.setattr(driver, "Body", BrokenBody)
+    monkeypatch.setattr(driver, "RobotRunner", BrokenRunner)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "robot"
-        assert words in session.ending.sentence
+        assert words in session.ending.message
         assert_safe(session, culture, 7)
     assert [tick.handled for tick in session.ticks] == ["used"] * 6 + ["unfinished"]
     assert not session.episodes[0].is_whole
@@ -375,7 +375,7 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
 
     released, steps = threading.Event(), [0]
 
-    class StuckBody(driver.Body):
+    class StuckRunner(driver.RobotRunner):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             step = self.step
@@ -388,13 +388,13 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
 
             self.step = stuck  # type: ignore[method-assign]
 
-    monkeypatch.setattr(driver, "Body", StuckBody)
+    monkeypatch.setattr(driver, "RobotRunner", StuckRunner)
     monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
     with FakeCulture() as culture:
         try:
             session = run(tmp_path, culture, patience_s=0.3)
             assert session.ending.by == "hang"
-            assert "the robot did not answer 0.3 s after it should have" in session.ending.sentence
+            assert "the robot did not answer 0.3 s after it should have" in session.ending.message
             assert_safe(session, culture, 7)
         finally:
             released.set()
@@ -410,9 +410,9 @@ def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> Non
             return action if rng.random() < 0.2 else 0
 
     with FakeCulture() as culture:
-        session = run_session(culture, loop_of(robot=LONG), [Contender("it", "", Confused())], tmp_path, episodes=1)
+        session = run_session(culture, loop_of(robot=LONG), [Agent("it", "", Confused())], tmp_path, episodes=1)
         assert session.ending.by == "controller"
-        assert f"it {words}" in session.ending.sentence
+        assert f"it {words}" in session.ending.message
         assert_safe(session, culture, 0)
 
 
@@ -469,7 +469,7 @@ def test_a_progress_that_fails_leaves_no_loop_behind(tmp_path: Path, error: Base
         assert not any(thread.name == "closed loop" for thread in threading.enumerate())
         session = recover_session(tmp_path)
         assert session.ending.by == by
-        assert str(error) in session.ending.sentence
+        assert str(error) in session.ending.message
         assert_safe(session, culture, 8)
 
 
@@ -542,11 +542,11 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     with FakeCulture(fault=slowly, at=0) as culture:
         session = run(tmp_path, culture, robot=LONG)
         assert session.ending.by == "disk"
-        assert "No space left on device" in session.ending.sentence
+        assert "No space left on device" in session.ending.message
         assert disk.room == 0
         assert_safe(session, culture, 20)
     assert session.log.lost_bytes == 0
-    assert "could not be written" in session.ending.sentence
+    assert "could not be written" in session.ending.message
     with pytest.raises(InvalidFile, match="No space left"):
         LogWriter(tmp_path / "other.log", {})
 
@@ -558,8 +558,8 @@ def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> Non
     with FakeCulture() as culture:
         session = run(tmp_path, culture, robot=Navigation(episode_limit=3))
     assert session.ending.by == "plan"
-    assert "session.nwb: cannot be written" in session.ending.sentence
-    assert "animat recover" in session.ending.sentence
+    assert "session.nwb: cannot be written" in session.ending.message
+    assert "animat recover" in session.ending.message
     (tmp_path / "session.nwb" / "in the way").unlink()
     (tmp_path / "session.nwb").rmdir()
     assert recover_session(tmp_path).ticks == session.ticks
@@ -577,15 +577,15 @@ def test_a_session_comes_back_whatever_its_files_are_like(
         patched.setattr("animat.closed_loop.gathering.write_nwb", failing)
         session = run(tmp_path, culture, robot=Navigation(episode_limit=3))
     assert session.ending.by == "plan"
-    assert str(error) in session.ending.sentence
-    assert f"(animat recover {tmp_path}" in session.ending.sentence
+    assert str(error) in session.ending.message
+    assert f"(animat recover {tmp_path}" in session.ending.message
     assert len(session.episodes) == 5
     assert recover_session(tmp_path).episodes == session.episodes
     assert_read_alike(tmp_path, loop_of())
 
 
 def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again(
-    few_redrawn: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    few_bootstraps: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cultures = []
 

@@ -59,10 +59,10 @@ from animat.compilation import keep_compilations
 keep_compilations()
 import jax
 print(jax.jit(lambda x: x + 1)(1), jax.config.jax_compilation_cache_dir)
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-recording = make_up_recording(1)
+recording = synthetic_recording(1)
 write_nwb(recording, sys.argv[1])
 print(read_recording(sys.argv[1]).equals(recording))
 """

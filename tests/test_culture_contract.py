@@ -11,7 +11,7 @@ from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
 from animat.cultures.replay import ReplayCulture
 from animat.errors import DeviceFailed
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from cultures import small_culture
 from fake_culture import FakeCulture
 
@@ -23,12 +23,12 @@ class TestVirtualCulture(CultureContract):
 
 class TestReplay(CultureContract):
     def make_culture(self) -> Culture:
-        return ReplayCulture([make_up_recording(1, channels=32), make_up_recording(1, channels=32, start_min=10.0)])
+        return ReplayCulture([synthetic_recording(1, channels=32), synthetic_recording(1, channels=32, start_min=10.0)])
 
 
 class TestReplayInOrder(CultureContract):
     def make_culture(self) -> Culture:
-        return ReplayCulture([make_up_recording(2, channels=32)], how="in order")
+        return ReplayCulture([synthetic_recording(2, channels=32)], how="in order")
 
 
 class Leaky(ReplayCulture):
@@ -42,7 +42,7 @@ class Leaky(ReplayCulture):
 def test_the_contract_finds_a_backend_that_breaks_it() -> None:
     class OfLeaky(CultureContract):
         def make_culture(self) -> Culture:
-            return Leaky([make_up_recording(1, channels=32)])
+            return Leaky([synthetic_recording(1, channels=32)])
 
     with pytest.raises(AssertionError):
         OfLeaky().test_its_clock_runs_forward_by_at_least_what_was_asked()

@@ -28,7 +28,7 @@ from animat.stimulation.selection import Selection, SelectionRule
 from animat.stimulation.stimulus import Stimulus
 from cultures import FEW, small_culture
 
-SHORT = Protocol((10.0, 40.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
+SHORT = Protocol((10.0, 40.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -298,12 +298,12 @@ def test_a_culture_that_another_s_state_was_given_to_is_what_it_was(tmp_path: Pa
         culture.restore_state(tmp_path / "first.state")
     with culture:
         assert culture.record(SHORT).equals(begun)
-    lived = small_culture()
-    lived.restore_state(tmp_path / "first.state")
+    restored = small_culture()
+    restored.restore_state(tmp_path / "first.state")
     with pytest.raises(Mismatch, match="differs in seed"):
-        lived.restore_state(tmp_path / "other.state")
-    with lived:
-        assert lived.record(SHORT).equals(recording)
+        restored.restore_state(tmp_path / "other.state")
+    with restored:
+        assert restored.record(SHORT).equals(recording)
 
 
 def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:
@@ -325,7 +325,7 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 
 def test_a_replay_answers_with_what_was_measured() -> None:
-    protocol = Protocol((10.0, 40.0), order="mixed", pulses=2, patterns=5, presentations=8, setup_s=0.0, pause_s=0.2)
+    protocol = Protocol((10.0, 40.0), order="mixed", pulses=2, patterns=5, trials=8, setup_s=0.0, pause_s=0.2)
     with small_culture() as culture:
         source = culture.record(protocol)
 

@@ -21,10 +21,10 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.reading import read_recording, read_recordings
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.selection import Selection
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 from cultures import small_culture
 
-SHORT = Protocol((20.0, 80.0), patterns=5, presentations=10, setup_s=0.5, pause_s=0.2)
+SHORT = Protocol((20.0, 80.0), patterns=5, trials=10, setup_s=0.5, pause_s=0.2)
 PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -167,7 +167,7 @@ def test_a_state_after_something_else_is_not_gone_on_from(undisturbed: list[Path
 
 def test_a_second_run_in_a_folder_at_work_is_refused(undisturbed: list[Path]) -> None:
     folder = undisturbed[0].parent
-    with alone_in(folder), pytest.raises(Mismatch, match="another run is at work in this folder"):
+    with exclusive_lock(folder), pytest.raises(Mismatch, match="another run is at work in this folder"):
         record(folder)
     record(folder)
 
@@ -180,10 +180,10 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
     @contextmanager
     def ended_in_between(path: Path) -> Iterator[None]:
         copied(undisturbed, path)
-        with alone_in(path):
+        with exclusive_lock(path):
             yield
 
-    monkeypatch.setattr("animat.cultures.series.alone_in", ended_in_between)
+    monkeypatch.setattr("animat.cultures.series.exclusive_lock", ended_in_between)
     with pytest.raises(Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"):
         record(folder, seed=2)
 
@@ -211,7 +211,7 @@ def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path]
     with pytest.raises(Mismatch, match=r"_0000_min.nwb: expected .* same culture .*\(seed: 1 there, 2 now\)"):
         record(folder, seed=2)
     with pytest.raises(Mismatch, match="protocol"):
-        record(folder, protocol=Protocol((20.0, 80.0), patterns=5, presentations=9, setup_s=0.5, pause_s=0.2))
+        record(folder, protocol=Protocol((20.0, 80.0), patterns=5, trials=9, setup_s=0.5, pause_s=0.2))
     other = copied(undisturbed, tmp_path / "other")
     shutil.copy(other / "recording_0001_min.nwb", other / "recording_0002_min.nwb")
     with pytest.raises(Mismatch, match=r"recording_0002_min.nwb: expected"):
@@ -245,7 +245,7 @@ def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
     with small_culture() as culture:
         found = other_culture(read_recording(file), 0.0, culture)
     assert found is not None
-    assert "of virtual culture 1 with another tissue_revision, and this is virtual culture 1" in found.sentence
+    assert "of virtual culture 1 with another tissue_revision, and this is virtual culture 1" in found.message
     file.unlink()
     with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
         record(tmp_path, sessions=2)

@@ -17,9 +17,9 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
+from animat.recordings.detection.negative_peaks import find_negative_peaks
 from animat.recordings.detection.noise import median_noise_uv
 from animat.recordings.detection.settings import Detection
-from animat.recordings.detection.troughs import find_troughs
 from animat.recordings.raw import ArrayTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.recordings.spikes_of_traces import read_traces
@@ -88,7 +88,7 @@ def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
 ) -> None:
     whole = find_spikes(known[0], workers=1)
     pieces = find_spikes(known[0], None, Detection(chunk_s=chunk_s), workers=workers)
-    # A trough at the threshold itself can fall on either side by the rounding of single precision.
+    # A negative peak at the threshold itself can fall on either side by the rounding of single precision.
     assert abs(len(pieces.time_s) - len(whole.time_s)) <= 2
     both = set(zip(whole.time_s.tolist(), whole.channel.tolist(), strict=True)) & set(
         zip(pieces.time_s.tolist(), pieces.channel.tolist(), strict=True)
@@ -107,7 +107,7 @@ def test_the_filter_is_the_two_pass_butterworth() -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(steps=st.lists(st.integers(-9, 3), min_size=1, max_size=60), apart=st.integers(1, 8), depth=st.integers(0, 8))
-def test_troughs_are_those_of_the_definition(steps: list[int], apart: int, depth: int) -> None:
+def test_negative_peaks_are_those_of_the_definition(steps: list[int], apart: int, depth: int) -> None:
     trace = np.array(steps, dtype=np.float32)
     expected = [
         t
@@ -116,7 +116,7 @@ def test_troughs_are_those_of_the_definition(steps: list[int], apart: int, depth
         and all(v < s for s in steps[max(t - apart, 0) : t])
         and all(v <= s for s in steps[t + 1 : t + apart + 1])
     ]
-    row, sample = find_troughs(trace[None, :], np.array([depth], np.float32), apart, 0, len(trace))
+    row, sample = find_negative_peaks(trace[None, :], np.array([depth], np.float32), apart, 0, len(trace))
     assert sample.tolist() == expected
     assert set(row.tolist()) <= {0}
 
@@ -210,7 +210,7 @@ def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tu
     assert not np.any(in_window(found.time_s, traces.stimulus_time_s, (0, 1.4)))
     names = {finding.name: finding for finding in found.findings}
     assert names["blanked"].severity == "note"
-    assert "are saturated on average" in names["saturated-channels"].sentence
+    assert "are saturated on average" in names["saturated-channels"].message
 
 
 def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, ArrayTraces]) -> None:
@@ -244,7 +244,7 @@ def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
 
 @pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("step_uv", [0.195, 6.3, 12.6])
-def test_the_trough_of_a_spike_in_coarse_steps_is_no_saturation(amplitude: float, step_uv: float) -> None:
+def test_the_negative_peak_of_a_spike_in_coarse_steps_is_no_saturation(amplitude: float, step_uv: float) -> None:
     rng = np.random.default_rng(5)
     pulses = np.arange(1000, 39_000, 1000)
     voltage = rng.normal(0, 3, (40_000, 8))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stand_in_maxlab
-from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import Thresholds
@@ -109,7 +109,7 @@ def test_at_80_hz_the_first_pulse_of_an_action_is_late_on_a_maxone(
         pause_s=0.1,
     )
     with MaxOneCulture(selection, stream=stand_in_maxlab.Stream(rig), settle=False) as culture:
-        session = run_session(culture, loop, [Contender("f", "", OneCondition(0))], tmp_path, episodes=1)
+        session = run_session(culture, loop, [Agent("f", "", OneCondition(0))], tmp_path, episodes=1)
     first, *others = session.ticks
     assert first.late_s == 0.0
     assert [1000 * tick.late_s for tick in others] == pytest.approx([late_ms] * 9)

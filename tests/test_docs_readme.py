@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from animat.cli import _parse
-from animat.recordings.made_up import write_made_up_series
+from animat.recordings.synthetic import write_synthetic_series
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -62,7 +62,7 @@ def test_the_examples_in_python_run(
 ) -> None:
     """The README's and, on the policies that it trains, that of docs/training.md; two short ones for ten long ones."""
     monkeypatch.chdir(tmp_path)
-    write_made_up_series(1, tmp_path / "recordings", sessions=2, interval_min=50, patterns=30, channels=32)
+    write_synthetic_series(1, tmp_path / "recordings", sessions=2, interval_min=50, patterns=30, channels=32)
     example = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
     shorter = example.replace("policies=4, iterations=400_000", "policies=2, iterations=6_400")
     assert shorter != example

@@ -11,8 +11,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from animat.neurons.made_up import made_up_simulator
-from animat.recordings.made_up import write_made_up_series
+from animat.neurons.synthetic import synthetic_simulator
+from animat.recordings.synthetic import write_synthetic_series
 from animat.robots.registry import REGISTRY
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -32,8 +32,8 @@ def as_in_a_new_process() -> Iterator[None]:
 @pytest.mark.parametrize("page", ["robots.md", "gymnasium.md"])
 def test_the_examples_run(page: str, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    write_made_up_series(0, "recordings", sessions=2, interval_min=140)
-    names = {"gymnasium": gymnasium, "simulator": made_up_simulator()}
+    write_synthetic_series(0, "recordings", sessions=2, interval_min=140)
+    names = {"gymnasium": gymnasium, "simulator": synthetic_simulator()}
     examples = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
     assert examples
     for example in examples:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from animat.closed_loop.contenders import AnyCondition, Contender, OneCondition
+from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.encoder import Dealer, Encoder
@@ -203,7 +203,7 @@ def test_a_loop_over_patterns_is_read_as_any_recording_of_patterns(
     loop = loop_over(of_the_fake(2, 6, 3, only_last=only_last), pulses)
     with FakeCulture() as culture:
         session = run_session(
-            culture, loop, [Contender("any", "", AnyCondition(3)), Contender("s", "", OneCondition(0), "shuffled")],
+            culture, loop, [Agent("any", "", AnyCondition(3)), Agent("s", "", OneCondition(0), "shuffled")],
             tmp_path, episodes=2,
         )  # fmt: skip
     assert session.ending.by == "plan", session.ending
@@ -221,7 +221,7 @@ def test_electrodes_that_a_culture_does_not_have_are_refused_before_a_pulse(tmp_
     loop = loop_over((*of_the_fake(1), a_condition(((100, 555),))), 1)
     with FakeCulture() as culture:
         with pytest.raises(Mismatch, match=r"electrodes that the fake culture can stimulate .*, got 555: run on"):
-            run_session(culture, loop, [Contender("any", "", AnyCondition(2))], tmp_path)
+            run_session(culture, loop, [Agent("any", "", AnyCondition(2))], tmp_path)
         assert culture.pulses == 0
     assert not list(tmp_path.iterdir())
 
@@ -235,7 +235,7 @@ def test_the_protocol_of_an_encoder_presents_every_condition_as_often() -> None:
     each = Counter(zip(stimuli.frequency_hz[last].tolist(), stimuli.pattern[last].tolist(), strict=True))
     assert each == {(hz, place): 500 for hz in (5.0, 20.0) for place in (0, 2)}
     protocol = protocol_of(Encoder((Condition("8 Hz", 8.0, "Hz"),)), "blocked", 4, PUBLISHED_PULSE)
-    assert (protocol.frequencies_hz, protocol.patterns, protocol.presentations) == ((8.0,), 4, 100)
+    assert (protocol.frequencies_hz, protocol.patterns, protocol.trials) == ((8.0,), 4, 100)
     assert protocol.places == ()
 
 

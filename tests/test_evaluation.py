@@ -15,17 +15,17 @@ import pytest
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import fit_histogram, silenced
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
 from animat.training.policy import Policy
-from test_prospects import answers
+from test_optimal_returns import answers
 from test_simulator import responses_of
 from test_training import timeline_of
 
@@ -44,11 +44,11 @@ WITHOUT_NEURONS = Policy(
 def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int = 0) -> Policy:  # type: ignore[type-arg]  # noqa: B008
     """A policy with random weights."""
     rng = np.random.default_rng(seed)
-    sizes = (len(robot.quantities), 16, 16, len(timeline.conditions))
+    sizes = (len(robot.observation_spec), 16, 16, len(timeline.conditions))
     return Policy(
         weights=tuple(rng.normal(0, 1, size).astype(np.float32) for size in itertools.pairwise(sizes)),
         biases=tuple(rng.normal(0, 1, size).astype(np.float32) for size in sizes[1:]),
-        scales=np.array([quantity.scale for quantity in robot.quantities], np.float32),
+        scales=np.array([quantity.scale for quantity in robot.observation_spec], np.float32),
         robot=robot,
         mapping=Thresholds(1),
         conditions=timeline.conditions,
@@ -58,7 +58,7 @@ def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int 
 
 
 def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
-    simulator = silenced(made_up_simulator())
+    simulator = silenced(synthetic_simulator())
     episodes = roll_out(
         Animat(Cartpole(force_noise=0.0), Thresholds(1), 5), simulator, Uniform(), 1, episodes=5, seed=0
     )
@@ -78,7 +78,7 @@ def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
 
 def test_truncated_episodes_count_to_the_limit_and_are_not_terminated() -> None:
     episodes = roll_out(
-        Animat(Navigation(episode_limit=20), Linear(), 5), made_up_simulator(), Uniform(), 3, episodes=7, seed=0
+        Animat(Navigation(episode_limit=20), Linear(), 5), synthetic_simulator(), Uniform(), 3, episodes=7, seed=0
     )
     assert np.all(episodes.lengths == 20)
     assert not episodes.terminated.any()
@@ -182,7 +182,7 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
         "constant 5 Hz",
         "constant 10 Hz",
         "constant 20 Hz",
-        "made by hand",
+        "heuristic",
         "silent",
         "shuffled",
     ]
@@ -206,31 +206,31 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
     assert np.any(
         wanted != evaluate({"a": moving}, timeline, at_min=14.0, episodes=50, seed=3).rows[0].episodes.returns
     )
-    assert "recording at 10 min, percentiles held from 0 min: 1 policy," in found.to_text()
-    assert found.to_dict()["percentiles_held_from_min"] == 0.0
+    assert "recording at 10 min, percentiles fixed from 0 min: 1 policy," in found.to_text()
+    assert found.to_dict()["percentiles_fixed_from_min"] == 0.0
     assert "other-percentiles" not in {finding.name for finding in found.findings}
     elsewhere = replace(held, provenance={**held.provenance, "simulators": {"recorded_at_min": [-10.0, 0.0]}})
     noticed = evaluate({"a": elsewhere}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-percentiles")
-    assert "held from the recording at -10 min, which is not the first of these" in finding.sentence
+    assert "fixed from the recording at -10 min, which is not the first of these" in finding.message
     with pytest.raises(Mismatch, match="b: expected the same percentiles as a"):
         evaluate({"a": moving, "b": held}, timeline)
 
 
 @pytest.mark.oracle
 def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
-    """Whatever it chooses, what is delivered is drawn: as good as random actions, and no limit is its own."""
+    """Whatever it chooses, what is delivered is drawn: as good as random actions, and no optimum is its own."""
     timeline = timeline_of()
     chosen = policy_of(timeline, SHORT, seed=1)
     control = replace(chosen, provenance={"training": {"delivery": "shuffled"}})
-    found = evaluate({"a": control}, timeline, episodes=500, seed=3, limit_resolution=0.25)
+    found = evaluate({"a": control}, timeline, episodes=500, seed=3, optimum_resolution=0.25)
     rows = {row.name: row for row in found.rows}
     np.testing.assert_array_equal(rows["policies"].episodes.returns, rows["shuffled"].episodes.returns)
     assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=500, seed=3).rows[0]
                   .episodes.returns)  # fmt: skip
     assert "as trained: what is delivered is drawn anew" in found.to_text()
     assert found.score(rows["policies"]) is None and found.score(rows["random"]) == 0.0
-    assert "none for policies and silent and shuffled, whose limit is another" in found.to_text()
+    assert "none for policies and silent and shuffled, whose optimum is another" in found.to_text()
 
 
 def test_simulators_made_otherwise_than_in_training_are_told() -> None:
@@ -239,26 +239,26 @@ def test_simulators_made_otherwise_than_in_training_are_told() -> None:
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
     noticed = evaluate({"a": policy}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
-    assert finding.sentence.endswith("made otherwise: bins 40, here 20")
+    assert finding.message.endswith("made otherwise: bins 40, here 20")
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
     noticed = evaluate({"a": alike}, timeline, episodes=50).findings
     assert "other-simulator" not in {each.name for each in noticed}
 
 
-def test_the_rule_made_by_hand_goes_through_the_same_mapping_and_neurons() -> None:
+def test_the_heuristic_policy_goes_through_the_same_mapping_and_neurons() -> None:
     timeline = timeline_of()
     evaluation = evaluate({"a": policy_of(timeline)}, timeline, at_min=14.0, episodes=50, seed=3)
-    (row,) = [row for row in evaluation.rows if row.name == "made by hand"]
+    (row,) = [row for row in evaluation.rows if row.name == "heuristic"]
     environment, simulator = Animat(Cartpole(), Thresholds(1), 3), timeline.at(14.0)
-    rule = hand_made(environment, simulator)
+    rule = heuristic_policy(environment, simulator)
     np.testing.assert_array_equal(
         row.episodes.returns, roll_out(environment, simulator, rule, 1, episodes=50, seed=3).returns
     )
 
 
 @pytest.mark.oracle
-def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
-    """The limit is `best_return` of the very simulator; scores are worked out again from the means."""
+def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
+    """The optimum is `best_return` of the very simulator; scores are worked out again from the means."""
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, SHORT, seed=1), "b": policy_of(timeline, SHORT, seed=2)}
     told: list[str] = []
@@ -269,17 +269,17 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
             told.append(note)
 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
-    found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, limit_resolution=0.25, progress=Noting())
+    found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, optimum_resolution=0.25, progress=Noting())
     environment = Animat(SHORT, Thresholds(1), 3)
-    assert found.limit is not None
-    assert replace(found.limit, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
+    assert found.optimum is not None
+    assert replace(found.optimum, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
     assert told[-2:] == ["shuffled", "optimal return"]
-    assert set(found.limit.findings()) <= set(found.findings)
+    assert set(found.optimum.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))
-    assert data["limit"] == json.loads(json.dumps(found.limit.to_dict())) and data["no_limit"] is None
+    assert data["optimum"] == json.loads(json.dumps(found.optimum.to_dict())) and data["no_optimum"] is None
     rows = {row["name"]: row for row in data["rows"]}
-    random, best = rows["random"]["mean_return"], data["limit"]["value"]
+    random, best = rows["random"]["mean_return"], data["optimum"]["value"]
     for name, row in rows.items():
         if name in ("silent", "shuffled"):
             assert row["normalised_score"] is None
@@ -287,57 +287,59 @@ def test_the_limit_stands_beside_and_scores_what_acts_in_the_same_environment() 
             assert row["normalised_score"] == pytest.approx((row["mean_return"] - random) / (best - random))
     assert rows["random"]["normalised_score"] == 0
     text = found.to_text()
-    assert found.limit.to_text() in text and "none for silent and shuffled, whose limit is another" in text
+    assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is another" in text
     assert f"{rows['policies']['normalised_score']:.2f}  as trained" in text
 
     # Nothing else changes by it, and nothing is told of it where it was not asked for.
-    assert plainly.limit is None and plainly.no_limit is None
+    assert plainly.optimum is None and plainly.no_optimum is None
     assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in data["rows"]]
     assert "score" not in plainly.to_text() and "optimal return" not in plainly.to_text()
     assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
 
 
 @pytest.mark.oracle
-def test_a_limit_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The rows act on these conditions too; the limit is at the thresholds of all responses, as the rows are."""
+def test_an_optimum_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows act on these conditions too; the optimum is at the thresholds of all responses, as the rows are."""
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", lambda optima, *_, **__: tuple(optima))
     monkeypatch.setattr("animat.evaluation.table.best_return", partial(best_return, episodes=0))
     responses = answers([60, 60, 60, 60, 3], 2)
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
     timeline = fit_timeline([lucky], kind="histogram")
-    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=50, limit_resolution=0.25)
-    assert found.limit is not None and found.limit.left_out == ("80 Hz (3)",)
+    found = evaluate({"a": policy_of(timeline, SHORT)}, timeline, episodes=50, optimum_resolution=0.25)
+    assert found.optimum is not None and found.optimum.left_out == ("80 Hz (3)",)
     held = replace(fit_histogram(lucky.only([0, 1, 2, 3])), percentiles=timeline.at(0.0).percentiles)
-    assert found.limit.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
+    assert found.optimum.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
     assert {row["normalised_score"] for row in found.to_dict()["rows"]} == {None}
     assert "no score, as the optimal return is without conditions" in found.to_text()
 
 
 @pytest.mark.oracle
-def test_without_neurons_the_limit_is_a_pole_kept_up_to_the_end() -> None:
+def test_without_neurons_the_optimum_is_a_pole_kept_up_to_the_end() -> None:
     """In closed form: a reward of 1 an iteration, and no fall, as two forces are enough to hold the pole."""
-    evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, limit_resolution=0.6)
-    assert evaluation.limit is not None
-    assert evaluation.limit.value == pytest.approx(120, abs=0.01)
+    evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, optimum_resolution=0.6)
+    assert evaluation.optimum is not None
+    assert evaluation.optimum.value == pytest.approx(120, abs=0.01)
     rows = {row.name: row for row in evaluation.rows}
-    by_hand, random = (float(rows[name].mean_returns.mean()) for name in ("made by hand", "random"))
-    assert evaluation.score(rows["made by hand"]) == pytest.approx((by_hand - random) / (120 - random), abs=0.001)
+    heuristic, random = (float(rows[name].mean_returns.mean()) for name in ("heuristic", "random"))
+    assert evaluation.score(rows["heuristic"]) == pytest.approx((heuristic - random) / (120 - random), abs=0.001)
     assert evaluation.score(rows["constant -1"]) == pytest.approx(
         (float(rows["constant -1"].mean_returns.mean()) - random) / (120 - random), abs=0.001
     )
     assert "none for" not in evaluation.to_text()
 
 
-def test_where_there_is_no_limit_or_no_score_a_line_says_so() -> None:
+def test_where_there_is_no_optimum_or_no_score_a_line_says_so() -> None:
     wide = replace(WITHOUT_NEURONS, robot=Cartpole(angle_limit_rad=1.0, episode_limit=10))
-    unknown = evaluate({"a": wide}, None, episodes=3, limit_resolution=0.25)
+    unknown = evaluate({"a": wide}, None, episodes=3, optimum_resolution=0.25)
     (line,) = [line for line in unknown.to_text().splitlines() if "no optimal return: " in line]
     assert "angle_limit_rad" in line
     data = unknown.to_dict()
-    assert data["limit"] is None and data["no_limit"] in line
+    assert data["optimum"] is None and data["no_optimum"] in line
     assert {row["normalised_score"] for row in data["rows"]} == {None}
 
-    nothing_to_learn = replace(unknown, limit=Optimum(-200.0, 0.0, -200.0, 1.0, -200.0, 1.0, 100, 1000), no_limit=None)
+    nothing_to_learn = replace(
+        unknown, optimum=Optimum(-200.0, 0.0, -200.0, 1.0, -200.0, 1.0, 100, 1000), no_optimum=None
+    )
     assert {row["normalised_score"] for row in nothing_to_learn.to_dict()["rows"]} == {None}
     assert "no score, as the optimal return is not above" in nothing_to_learn.to_text()
 
@@ -353,7 +355,7 @@ def test_shuffling_makes_every_policy_a_random_one() -> None:
 
 def test_without_neurons_there_is_nothing_to_silence() -> None:
     evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=4)
-    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "made by hand"]
+    assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "heuristic"]
     assert isinstance(WithoutNeurons(Cartpole(), (-1.0, 1.0)).n_actions, int)
 
 
@@ -374,8 +376,8 @@ def test_what_does_not_belong_together_is_refused() -> None:
         with pytest.raises(InvalidArgument, match="seed: expected a whole number"):
             evaluate({"a": policy}, timeline, seed=seed)
     for resolution in (0.0, float("nan")):
-        with pytest.raises(InvalidArgument, match="limit_resolution: expected a positive number"):
-            evaluate({"a": policy}, timeline, limit_resolution=resolution)
+        with pytest.raises(InvalidArgument, match="optimum_resolution: expected a positive number"):
+            evaluate({"a": policy}, timeline, optimum_resolution=resolution)
     with pytest.raises(Mismatch, match="robot: expected cartpole"):
         evaluate({"a": policy}, timeline, robot=Navigation())
     with pytest.raises(Mismatch, match="b: expected the same robot as a"):

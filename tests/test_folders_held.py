@@ -13,13 +13,13 @@ from animat.errors import DeviceFailed, Mismatch
 from animat.live.plan import Timetable
 from animat.live.shadowing import live
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording, write_made_up_series
-from animat.writing import LOCK, alone_in
+from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
+from animat.writing import LOCK, exclusive_lock
 from fake_culture import FakeCulture
 from test_live import ONE, PROTOCOL
 from test_run_on_recordings import policy_of
 
-pytestmark = pytest.mark.usefixtures("few_redrawn")
+pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
 OPENING = ["record cl1", "record replay", "run", "run on recordings", "live"]
 
@@ -27,25 +27,25 @@ OPENING = ["record cl1", "record replay", "run", "run on recordings", "live"]
 def command(name: str, folder: Path) -> list[str]:
     """A command that opens a culture for the folder `out`."""
     policy_of(0).save(folder / "p0.safetensors")
-    made_up = folder / "made-up.nwb"
+    synthetic = folder / "synthetic.nwb"
     if name in ("record replay", "run on recordings"):
-        write_nwb(make_up_recording(1, patterns=40, channels=32), made_up)
+        write_nwb(synthetic_recording(1, patterns=40, channels=32), synthetic)
     return {
-        "record made-up": ["record", "--culture", "made-up", "--sessions", "1"],
+        "record synthetic": ["record", "--culture", "synthetic", "--sessions", "1"],
         "record cl1": ["record", "--culture", "cl1"],
-        "record replay": ["record", "--culture", "replay", "--recordings", str(made_up)],
+        "record replay": ["record", "--culture", "replay", "--recordings", str(synthetic)],
         "run": ["run", str(folder / "p0.safetensors")],
-        "run on recordings": ["run", str(folder / "p0.safetensors"), "--recordings", str(made_up)],
+        "run on recordings": ["run", str(folder / "p0.safetensors"), "--recordings", str(synthetic)],
         "live": ["live", "navigation"],
     }[name] + ["--out", str(folder / "in" / "out")]
 
 
-@pytest.mark.parametrize("name", [*OPENING, "record made-up"])
+@pytest.mark.parametrize("name", [*OPENING, "record synthetic"])
 def test_a_second_run_is_refused_before_a_culture_is_opened(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: pytest.fail("a culture was made"))
-    with alone_in(tmp_path / "in" / "out"):
+    with exclusive_lock(tmp_path / "in" / "out"):
         assert main(command(name, tmp_path)) == 1
         assert "out: another run is at work in this folder; wait for it, or stop it" in capsys.readouterr().err
         assert not list((tmp_path / "in" / "out").iterdir())
@@ -56,7 +56,7 @@ def test_the_folder_is_held_while_a_culture_is_opened_and_taken_away_if_that_fai
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def failing(*_: Any, **__: Any) -> Any:
-        with pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path / "in" / "out"):
+        with pytest.raises(Mismatch, match="another run is at work"), exclusive_lock(tmp_path / "in" / "out"):
             pass
         raise DeviceFailed("the device: it is off")
 
@@ -70,7 +70,7 @@ def test_a_session_that_still_runs_is_not_recovered(tmp_path: Path, capsys: pyte
     assert main([*command("run on recordings", tmp_path), "--culture", "replay", "--episodes", "1"]) == 0
     session = tmp_path / "in" / "out"
     before = (session / "session.nwb").stat().st_mtime_ns
-    with alone_in(session):
+    with exclusive_lock(session):
         assert main(["recover", str(session)]) == 1
     assert "another run is at work" in capsys.readouterr().err
     assert (session / "session.nwb").stat().st_mtime_ns == before
@@ -78,15 +78,15 @@ def test_a_session_that_still_runs_is_not_recovered(tmp_path: Path, capsys: pyte
     assert "session.nwb and ticks.csv: " in capsys.readouterr().out
 
 
-def test_a_made_up_series_is_written_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_synthetic_series_is_written_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def noted(*given: Any, **more: Any) -> list[Path]:
-        with pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path / "in" / "out"):
+        with pytest.raises(Mismatch, match="another run is at work"), exclusive_lock(tmp_path / "in" / "out"):
             pass
-        return write_made_up_series(*given, **more)
+        return write_synthetic_series(*given, **more)
 
-    monkeypatch.setattr("animat.recordings.made_up.write_made_up_series", noted)
+    monkeypatch.setattr("animat.recordings.synthetic.write_synthetic_series", noted)
     for _ in range(2):
-        assert main(command("record made-up", tmp_path)) == 0
+        assert main(command("record synthetic", tmp_path)) == 0
     assert [file.name for file in (tmp_path / "in" / "out").iterdir()] == ["recording_0000_min.nwb"]
 
 
@@ -102,7 +102,7 @@ def test_a_live_run_takes_a_folder_in_which_only_a_file_to_be_locked_is(
         flock(descriptor, how)
 
     monkeypatch.setattr(fcntl, "flock", files_only)
-    with alone_in(tmp_path / "live"), FakeCulture() as culture:
+    with exclusive_lock(tmp_path / "live"), FakeCulture() as culture:
         assert (tmp_path / "live" / LOCK).exists()
         found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=Timetable(10, 10, 1e6), episodes=1)
     assert len(found.recordings) == 1

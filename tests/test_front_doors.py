@@ -24,7 +24,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import UnsafeStimulus
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.array import MAXONE
 from animat.stimulation.pulse import Phase, Pulse
 from animat.stimulation.selection import Selection
@@ -67,7 +67,7 @@ class Door:
             self.culture = (
                 small_culture(limits=limits)
                 if kind == "virtual"
-                else ReplayCulture([make_up_recording(1, channels=16)], limits=limits)
+                else ReplayCulture([synthetic_recording(1, channels=16)], limits=limits)
             )
             patch.setattr(self.culture, "_deliver", self._take)
 

@@ -21,10 +21,10 @@ from animat.coding.mapping import Linear, mapping_named
 from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.gym import IDS, register_environments
-from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.simulator import silenced
+from animat.neurons.synthetic import LABELS, synthetic_simulator
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording, write_made_up_series
+from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.robots import Cartpole, robot_named
 from animat.wrappers import EpisodeLimit
 
@@ -82,7 +82,7 @@ def test_an_episode_is_a_rollout_of_the_animat(id_: str, mapping: str) -> None:
     rng = np.random.Generator(type(env.unwrapped.np_random.bit_generator)())
     rng.bit_generator.state = env.unwrapped.np_random.bit_generator.state
 
-    body, simulator = robot_named(IDS[id_]), made_up_simulator()
+    body, simulator = robot_named(IDS[id_]), synthetic_simulator()
     direct = EpisodeLimit(Animat(body, mapping_named(mapping), 5))
     state, advance = direct.reset(jax.random.key(0)), jax.jit(direct.advance)
     for action in actions:
@@ -145,7 +145,7 @@ def test_truncation_is_not_termination() -> None:
 
 def test_an_episode_that_ends_by_itself_at_the_limit_is_terminated_only() -> None:
     """A silent culture always pushes left, and without noise the pole falls in the same iteration every time."""
-    options = {"simulator": silenced(made_up_simulator()), "force_noise": 0.0}
+    options = {"simulator": silenced(synthetic_simulator()), "force_noise": 0.0}
     falls = int(np.argmax(rollout(gymnasium.make("Animat/Cartpole-v0", **options), [0] * 60)[2])) + 1
     _, rewards, terminated, truncated, _ = rollout(
         gymnasium.make("Animat/Cartpole-v0", episode_limit=falls, **options), [0] * falls
@@ -166,7 +166,7 @@ def test_robot_parameters_and_mappings_are_options() -> None:
 
 
 def test_a_simulator_decides_how_the_neurons_answer() -> None:
-    env = gymnasium.make("Animat/Cartpole-v0", simulator=silenced(made_up_simulator()), mapping="linear")
+    env = gymnasium.make("Animat/Cartpole-v0", simulator=silenced(synthetic_simulator()), mapping="linear")
     infos = rollout(env, [0, 1, 2, 3, 4])[4]
     assert all(info["rate_hz"] == 0 and info["command"] == -1 for info in infos)
 
@@ -179,7 +179,7 @@ def test_shuffled_delivery_says_what_was_delivered() -> None:
 
 
 def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
-    write_made_up_series(0, tmp_path, sessions=2, interval_min=60.0, fatigue_per_h=1.0)
+    write_synthetic_series(0, tmp_path, sessions=2, interval_min=60.0, fatigue_per_h=1.0)
     first, second = (gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path, at_min=m).unwrapped for m in (0, 60))
     assert first.setup.condition_labels == LABELS
     assert first.action_space.n == 5
@@ -199,9 +199,9 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
     [
         ({"mapping": "3-thresholds"}, "mapping: expected one of 1-threshold"),
         ({"pole_mass": 1.0}, "cartpole: expected parameters among .*, got 'pole_mass'"),
-        ({"recordings": "r", "simulator": made_up_simulator()}, "recordings, simulator: expected one of them"),
+        ({"recordings": "r", "simulator": synthetic_simulator()}, "recordings, simulator: expected one of them"),
         ({"conditions": "frequency:5,80"}, "conditions: expected only with recordings"),
-        ({"at_min": 140, "simulator": made_up_simulator()}, "at_min: expected only with recordings"),
+        ({"at_min": 140, "simulator": synthetic_simulator()}, "at_min: expected only with recordings"),
         ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
         ({"kind": "empirical"}, "kind: expected only with recordings"),
         ({"name": 3.0}, "cartpole: expected parameters among .*, got 'name'"),
@@ -349,8 +349,8 @@ def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
 
 def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -> None:
     for number in range(3):
-        made_up = make_up_recording(number, start_min=30.0 * number, patterns=4, channels=16)
-        write_nwb(made_up, tmp_path / f"{number}.nwb")
+        synthetic = synthetic_recording(number, start_min=30.0 * number, patterns=4, channels=16)
+        write_nwb(synthetic, tmp_path / f"{number}.nwb")
     with pytest.warns(UserWarning) as told:
         gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path)
     few = [str(each.message) for each in told if "a distribution takes 30 or more" in str(each.message)]

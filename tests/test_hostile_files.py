@@ -33,8 +33,8 @@ SELECTION: dict[str, Any] = {
     "text",
     [
         "[" * 100_000,
-        '{"presentations": ' + "9" * 4000 + "}",
-        '{"presentations": ' + "9" * 5000 + "}",
+        '{"trials": ' + "9" * 4000 + "}",
+        '{"trials": ' + "9" * 5000 + "}",
         '{"frequencies_hz": [1e-300]}',
         '{"order": []}',
         '{"pulses": 1e400}',

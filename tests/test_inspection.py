@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import SyntheticCulture
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.inspection import draw_inspection, inspection_text
 from animat.report.psth import draw_psth
@@ -48,13 +48,13 @@ def answering(
     return recording(spikes, stimulus_s, n_channels, duration_s, frequency_hz=frequencies)
 
 
-def sentence(source: Recording, name: str, **options: object) -> str:
-    found = {f.name: f.sentence for f in extract_responses(source, **options).findings}  # type: ignore[arg-type]
+def message(source: Recording, name: str, **options: object) -> str:
+    found = {f.name: f.message for f in extract_responses(source, **options).findings}  # type: ignore[arg-type]
     return found[name]
 
 
 def test_nothing_is_wrong_with_a_good_recording() -> None:
-    source = MadeUpCulture(seed=1).record(0.0)
+    source = SyntheticCulture(seed=1).record(0.0)
     inspection = inspect_recording(source)
     assert inspection.verdict == "usable"
     assert {f.severity for f in inspection.findings} == {"note"}
@@ -95,7 +95,7 @@ def test_a_window_without_the_response_says_where_it_is() -> None:
     heard = (source.spike_times_s % 0.25 > 0.012) | (source.spike_times_s < 1)
     spikes = np.column_stack([source.spike_times_s, source.spike_channels])[heard]
     blanked = recording(spikes, source.stimuli.time_s, 40, source.duration_s, frequency_hz=source.stimuli.frequency_hz)
-    assert "the response is at 30 to 70 ms: use --window-ms 30 70" in sentence(blanked, "dead-window")
+    assert "the response is at 30 to 70 ms: use --window-ms 30 70" in message(blanked, "dead-window")
     assert not {"dead-window", "response-elsewhere"} & set(names(extract_responses(blanked, window_ms=(30, 70))))
 
 
@@ -104,7 +104,7 @@ def test_a_window_on_a_later_wave_is_told_of_the_first() -> None:
     wave = np.column_stack([np.repeat(source.stimuli.time_s, 10) + 0.085, np.zeros(10 * len(source.stimuli))])
     spikes = np.vstack([np.column_stack([source.spike_times_s, source.spike_channels]), wave])
     waves = recording(spikes, source.stimuli.time_s, 40, source.duration_s, frequency_hz=source.stimuli.frequency_hz)
-    assert "the response is at 10 to 30 ms" in sentence(waves, "response-elsewhere", window_ms=(80, 90))
+    assert "the response is at 10 to 30 ms" in message(waves, "response-elsewhere", window_ms=(80, 90))
 
 
 def test_an_artefact_in_the_window_is_no_response() -> None:
@@ -122,7 +122,7 @@ def test_stimuli_closer_than_the_window_are_counted() -> None:
     source = recording([], [1, 1.005, 2, 2.010, 3])
     found = {f.name: f for f in extract_responses(source).findings}["stimuli-too-close"]
     assert found.value == 1  # 10 ms apart is not closer than a window that ends at 10 ms
-    assert "1 of 5 stimuli" in found.sentence
+    assert "1 of 5 stimuli" in found.message
     assert "stimuli-too-close" not in names(extract_responses(source, window_ms=(2, 5)))
 
 
@@ -143,7 +143,7 @@ def test_empty_and_thin_conditions() -> None:
     source = answering({5: 10.0, 10: 14.0})
     responses = extract_responses(source, ByFrequency((5, 10, 20)), burst_threshold=1)
     assert names(responses)["empty-condition"] == "refuse"
-    assert "condition 20 Hz: no stimulus" in sentence(source, "empty-condition", by=ByFrequency((5, 20)))
+    assert "condition 20 Hz: no stimulus" in message(source, "empty-condition", by=ByFrequency((5, 20)))
     assert np.isnan(responses.shares_above_median()[2])
     thin = extract_responses(answering({5: 10.0, 10: 14.0}, n=29), burst_threshold=1)
     assert names(thin)["few-samples"] == "warning"
@@ -153,9 +153,9 @@ def test_empty_and_thin_conditions() -> None:
 def test_conditions_that_do_not_differ_are_said_to_give_no_control() -> None:
     same = answering({5: 20.0, 10: 20.0}, n=400, n_channels=60)
     assert names(extract_responses(same, burst_threshold=1))["no-difference"] == "warning"
-    assert "no policy can steer" in sentence(same, "no-difference", burst_threshold=1)
+    assert "no policy can steer" in message(same, "no-difference", burst_threshold=1)
     other = answering({5: 10.0, 10: 30.0}, n=400, n_channels=60)
-    assert "P(x >= P50) is 0.0" in sentence(other, "difference", burst_threshold=1)
+    assert "P(x >= P50) is 0.0" in message(other, "difference", burst_threshold=1)
     assert "one-condition" in names(extract_responses(same, All()))
 
 
@@ -176,16 +176,16 @@ def test_how_far_conditions_can_steer_is_said(above: int, name: str) -> None:
     )
     (found,) = _difference(responses)
     assert (found.name, found.severity) == (name, "note" if name == "difference" else "warning")
-    assert f"0.{above} for 5 Hz, 0.{100 - above} for 10 Hz" in found.sentence
-    assert f"from {above / 50 - 1:+.2f} to {1 - above / 50:+.2f}" in found.sentence
-    assert ("a robot can hardly be steered" in found.sentence) == (name == "little-difference")
+    assert f"0.{above} for 5 Hz, 0.{100 - above} for 10 Hz" in found.message
+    assert f"from {above / 50 - 1:+.2f} to {1 - above / 50:+.2f}" in found.message
+    assert ("a robot can hardly be steered" in found.message) == (name == "little-difference")
 
 
 def test_burst_separation_that_separates_nothing_is_said_so() -> None:
     found = {f.name: f for f in extract_responses(answering({5: 20.0, 10: 20.0}, n=300)).findings}
     assert "bursts" not in found
     assert found["bursts-not-separable"].severity == "note"
-    assert "no response is set apart as a burst" in found["bursts-not-separable"].sentence
+    assert "no response is set apart as a burst" in found["bursts-not-separable"].message
     responses = extract_responses(answering({5: 20.0, 10: 20.0}, n=300))
     assert not responses.is_burst.any()
     assert responses.threshold == 1
@@ -219,7 +219,7 @@ def test_organoid(real_data: Path) -> None:
     # One hump of ratios: Otsu would drop more than half of the responses.
     assert inspection.n_bursts == 0
     assert found["bursts-not-separable"].value == pytest.approx(0.62, abs=0.01)
-    assert "a robot can hardly be steered" in found["little-difference"].sentence
+    assert "a robot can hardly be steered" in found["little-difference"].message
     assert inspection.response is not None
     assert (inspection.response.start_ms, inspection.response.end_ms) == pytest.approx((3, 18), abs=1)
 
@@ -229,22 +229,22 @@ def test_brainoware_is_refused_and_shown_the_way(real_data: Path) -> None:
     inspection = inspect_recording(source)
     assert inspection.verdict == "not usable"
     assert inspection.findings[0].name == "dead-window"
-    assert "the window from 2 to 10 ms is dead" in inspection.findings[0].sentence
+    assert "the window from 2 to 10 ms is dead" in inspection.findings[0].message
     response = inspection.response
     assert response is not None
     assert 10 <= response.start_ms <= 20 and 400 <= response.end_ms <= 500
-    assert f"--window-ms {response.start_ms:g} {response.end_ms:g}" in inspection.findings[0].sentence
+    assert f"--window-ms {response.start_ms:g} {response.end_ms:g}" in inspection.findings[0].message
     there = inspect_recording(source, window_ms=(response.start_ms, response.end_ms))
     assert there.verdict != "not usable"
 
 
 def test_to_dict_is_json_and_says_what_the_text_says() -> None:
-    inspection = inspect_recording(MadeUpCulture(seed=2).record(0.0), name="culture.nwb")
+    inspection = inspect_recording(SyntheticCulture(seed=2).record(0.0), name="culture.nwb")
     data = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
     text = inspection_text(inspection)
     assert text.startswith(f"culture.nwb: {data['verdict']}")
     assert f"{data['mean_spikes_per_stimulus']:.2f} spikes in 2-10 ms per stimulus" in text
-    assert all(finding["sentence"] in text and "\n" not in finding["sentence"] for finding in data["findings"])
+    assert all(finding["message"] in text and "\n" not in finding["message"] for finding in data["findings"])
     assert all(condition["label"] in text for condition in data["conditions"])
 
 
@@ -256,7 +256,7 @@ def axes_of(figure):  # type: ignore[no-untyped-def]
 
 
 def test_figures_name_units_and_conditions() -> None:
-    source = MadeUpCulture(seed=1).record(0.0)
+    source = SyntheticCulture(seed=1).record(0.0)
     responses = extract_responses(source)
     labels = [condition.label for condition in responses.conditions]
     raster = draw_raster(source, responses)

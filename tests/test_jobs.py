@@ -20,10 +20,10 @@ from animat.errors import AnimatError, InvalidFile
 from animat.execution.jobs import Job, Jobs, in_order
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, digest_of, receipt_path
-from animat.execution.task import Task, carry_out, told
+from animat.execution.task import Task, carry_out, reported
 from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from worker_tasks import Die, Fail, Join, Starve, Stumble
 
 CORE = min(os.sched_getaffinity(0))
@@ -124,9 +124,9 @@ def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
 
 
 def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
-    assert told(tmp_path / "notice.json") is None
+    assert reported(tmp_path / "notice.json") is None
     done = carry_out(Join("a"), tmp_path, tmp_path / "notice.json")
-    assert told(tmp_path / "notice.json") == [0.5, "half"]
+    assert reported(tmp_path / "notice.json") == [0.5, "half"]
     assert list(done.files) == ["a"]
 
 
@@ -186,28 +186,28 @@ def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
 def test_a_receipt_of_the_first_plan_is_read(tmp_path: Path) -> None:
     """As commit 5e75c96 wrote it, byte for byte: digests of later receipts rest on it."""
     text = (
-        '{\n "inputs": {\n  "record": "00"\n },\n "job": "limit/cartpole",\n'
-        ' "outputs": {\n  "limits/a.csv": "11"\n },\n "study": "22"\n}\n'
+        '{\n "inputs": {\n  "record": "00"\n },\n "job": "optimum/cartpole",\n'
+        ' "outputs": {\n  "optima/a.csv": "11"\n },\n "study": "22"\n}\n'
     )
-    (tmp_path / "limit+cartpole.json").write_text(text)
-    receipt = Receipt.load(tmp_path, "limit/cartpole")
-    assert receipt == Receipt("limit/cartpole", "22", {"record": "00"}, {"limits/a.csv": "11"})
+    (tmp_path / "optimum+cartpole.json").write_text(text)
+    receipt = Receipt.load(tmp_path, "optimum/cartpole")
+    assert receipt == Receipt("optimum/cartpole", "22", {"record": "00"}, {"optima/a.csv": "11"})
     receipt.save(tmp_path)
-    assert (tmp_path / "limit+cartpole.json").read_text() == text
-    (tmp_path / "limit+cartpole.json").write_text("{")
+    assert (tmp_path / "optimum+cartpole.json").read_text() == text
+    (tmp_path / "optimum+cartpole.json").write_text("{")
     with pytest.raises(InvalidFile, match="expected a job's receipt"):
-        Receipt.load(tmp_path, "limit/cartpole")
+        Receipt.load(tmp_path, "optimum/cartpole")
 
 
 def test_no_two_jobs_have_one_receipt(tmp_path: Path) -> None:
     """Names of robots and conditions may hold dots, spaces and dashes."""
-    jobs = ["limit/cartpole/over-time", "limit/cartpole.over-time", "limit.cartpole/over-time"]
+    jobs = ["optimum/cartpole/over-time", "optimum/cartpole.over-time", "optimum.cartpole/over-time"]
     assert len({receipt_path(tmp_path, job) for job in jobs}) == 3
 
 
 def test_a_recording_is_known_by_what_it_says_not_by_what_nwb_adds(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("again", 1), ("other", 2)):
-        write_nwb(make_up_recording(seed, patterns=5, channels=16), tmp_path / f"{name}.nwb")
+        write_nwb(synthetic_recording(seed, patterns=5, channels=16), tmp_path / f"{name}.nwb")
     made, again, other = (tmp_path / f"{name}.nwb" for name in ("a", "again", "other"))
     assert made.read_bytes() != again.read_bytes()
     assert digest_of(made) == digest_of(again) != digest_of(other)

@@ -1,4 +1,4 @@
-"""Training at the paper's length against what is possible: on made-up responses, and on recordings of virtual cultures.
+"""Training at the paper's length against what is possible, on synthetic responses and on virtual cultures.
 
 Five conditions answer with gamma distributions of shape 6 and means 30, 36, 42, 48, 54 Hz, in 20 bins over 0-120 Hz.
 By dynamic programming (`animat.evaluation.optimum`) no controller of the cartpole has a mean return above 18.5 with one
@@ -20,7 +20,7 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.neurons.made_up import made_up_simulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.recordings.reading import read_recordings
 from animat.responses.condition import Condition
@@ -32,9 +32,9 @@ from animat.training.specification import Training
 pytestmark = pytest.mark.long
 
 
-def made_up_timeline() -> SimulatorTimeline:
+def synthetic_timeline() -> SimulatorTimeline:
     return SimulatorTimeline(
-        simulators=jax.tree.map(lambda leaf: leaf[None], made_up_simulator()),
+        simulators=jax.tree.map(lambda leaf: leaf[None], synthetic_simulator()),
         start_min=np.zeros(1),
         conditions=tuple(Condition(f"{f:g} Hz", f, "Hz") for f in (5.0, 10.0, 20.0, 40.0, 80.0)),
         window_ms=(2.0, 10.0),
@@ -51,9 +51,9 @@ def test_policies_come_close_to_what_is_possible(
     mapping: str, at_least: float, at_most: float, random: float, tmp_path: Path
 ) -> None:
     training = Training(Cartpole(), mapping_named(mapping), policies=10, iterations=800_000, shadowing=False)
-    policies = train(training, made_up_timeline(), tmp_path)
+    policies = train(training, synthetic_timeline(), tmp_path)
     # Returns of episodes spread by 90: in 1,000 episodes of ten policies their mean is known to 0.9 only, here to 0.3.
-    rows = {row.name: row for row in evaluate(policies, made_up_timeline(), episodes=10_000).rows}
+    rows = {row.name: row for row in evaluate(policies, synthetic_timeline(), episodes=10_000).rows}
     trained = rows["policies"].mean_returns
     error = rows["policies"].episodes.returns.std() / np.sqrt(rows["policies"].episodes.returns.size)
     assert trained.mean() >= at_least
@@ -77,10 +77,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[int, SimulatorTim
 
 @pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()], ids=["cartpole", "navigation"])
-def test_policies_are_as_good_as_the_limit_allows(
+def test_policies_are_as_good_as_the_optimum_allows(
     robot: Cartpole | Navigation, mapping: str, recorded: dict[int, SimulatorTimeline], tmp_path: Path
 ) -> None:
-    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (limit - random).
+    """A score of 0.97 over three cultures, on the simulator trained on: (mean - random) / (optimum - random).
 
     None of the cultures makes up for another by more than the 0.01 that other seeds of training move a score.
     """
@@ -94,7 +94,7 @@ def test_policies_are_as_good_as_the_limit_allows(
         actors = networks_of(list(policies.values()), greedy=True)
         trained = roll_out(environment, simulator, actors, 4, episodes=2_000, seed=5).returns.mean()
         random = roll_out(environment, simulator, Uniform(), 1, episodes=20_000, seed=3).returns.mean()
-        limit = best_return(environment, simulator, episodes=0).value
-        scores.append((trained - random) / (limit - random))
+        optimum = best_return(environment, simulator, episodes=0).value
+        scores.append((trained - random) / (optimum - random))
     assert np.mean(scores) >= 0.97, scores
     assert min(scores) >= 0.96, scores

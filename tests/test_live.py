@@ -30,8 +30,8 @@ from animat.errors import (
 from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
-from animat.live.shadowing import Lived, live
-from animat.neurons.made_up import made_up_simulator
+from animat.live.shadowing import LiveRun, live
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.reading import read_recordings
@@ -45,13 +45,13 @@ from animat.training.specification import Training
 from cultures import small_culture
 from fake_culture import FakeCulture
 
-pytestmark = pytest.mark.usefixtures("few_redrawn")
+pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
-SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
+SMALL = SAC(environments=8, gradient_steps=1, batch=16, replay=1024, hidden=8)
 TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iterations=6000, seed=3, algorithm=SMALL)
 ONE = replace(TRAINING, policies=1)
 """In one process: for what has nothing to do with how many train."""
-PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
 PULSES = 5 * 40 * 2
 QUICK = Timetable(interval_min=10, duration_min=30, speed=1e6)
 
@@ -61,15 +61,15 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lived, Path, int]:
+def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[LiveRun, Path, int]:
     folder = tmp_path_factory.mktemp("live") / "live"
     with FakeCulture() as culture:
         found = live(TRAINING, culture, PROTOCOL, folder, timetable=QUICK, episodes=3)
         return found, folder, culture.delivered
 
 
-def test_the_culture_is_recorded_every_interval(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, _ = lived
+def test_the_culture_is_recorded_every_interval(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
     assert [file.name for file in found.recordings] == [f"recording_{m}_min.nwb" for m in ("00.2", "10.2", "20.2")]
     recordings = read_recordings([folder / "recordings"])
     np.testing.assert_allclose(np.diff([r.start_min for r in recordings]), 10, atol=1e-9)
@@ -78,8 +78,8 @@ def test_the_culture_is_recorded_every_interval(lived: tuple[Lived, Path, int]) 
     assert found.culture_min == pytest.approx(30.0)
 
 
-def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, _ = lived
+def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
     starts_min = [r.start_min for r in read_recordings([folder / "recordings"])]
     assert [swap["recorded_at_min"] for swap in found.swaps] == pytest.approx(starts_min[1:])
     assert all(swap["members"] == [0, 1] for swap in found.swaps)
@@ -100,8 +100,8 @@ def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(lived
         assert policy.presentation == PROTOCOL.presentation
 
 
-def test_what_happened_is_in_the_log_in_order(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, _ = lived
+def test_what_happened_is_in_the_log_in_order(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, _ = ran
     told = lines(folder)
     whats = [line["what"] for line in told]
     assert whats == [
@@ -114,8 +114,8 @@ def test_what_happened_is_in_the_log_in_order(lived: tuple[Lived, Path, int]) ->
     json.dumps(found.to_dict())
 
 
-def test_the_loop_runs_with_what_was_trained_on_last(lived: tuple[Lived, Path, int]) -> None:
-    found, folder, delivered = lived
+def test_the_loop_runs_with_what_was_trained_on_last(ran: tuple[LiveRun, Path, int]) -> None:
+    found, folder, delivered = ran
     gap = found.gap
     assert gap.session.ending.by == "plan"
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
@@ -142,17 +142,17 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
     timetable = replace(QUICK, interval_min=1, duration_min=3)
     with small_culture() as culture:
         found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=timetable, episodes=1)
-        lived_s = culture.now_s
+        ended_s = culture.now_s
     recordings = read_recordings(found.recordings)
     # After each recording, in case the run is killed, and after the loop.
     begun_s = [60 * each.start_min for each in recordings]
     assert [begun < kept < begun + 60 for begun, kept in zip(begun_s, after[:-1], strict=True)] == [True] * 3
-    assert after[-1] == lived_s > 3 * 60
+    assert after[-1] == ended_s > 3 * 60
     known = recorded_culture("virtual", recordings, [tmp_path / "live" / "recordings"])
     assert known == {"seed": 1, "state": tmp_path / "live" / "recordings" / "culture.state"}
     goes_on = small_culture()
     goes_on.restore_state(known["state"])
-    assert goes_on.now_s == lived_s
+    assert goes_on.now_s == ended_s
 
 
 @pytest.mark.oracle
@@ -172,7 +172,7 @@ def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Pa
 
 def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path) -> None:
     account = Account(Budget())
-    blocked = Protocol(pulses=2, patterns=8, presentations=40, setup_s=0.1)
+    blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
 
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")
@@ -192,7 +192,7 @@ def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path)
 def test_what_others_deliver_meanwhile_is_not_spent(fails: bool) -> None:
     """The culture counts all deliveries of a session, an account only those of its own recordings."""
     account = Account(Budget())
-    blocked = Protocol(pulses=2, patterns=8, presentations=40, setup_s=0.1)
+    blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
 
     class Other:
         """Stimulates after each block, as another thread would."""
@@ -231,7 +231,7 @@ def test_a_recording_that_cannot_be_used_is_kept_and_passed_over(tmp_path: Path)
             found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert len(found.recordings) == 3
     assert len(found.swaps) == 1
-    assert [line["sentence"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
+    assert [line["message"] for line in lines(tmp_path / "live") if line["what"] == "unusable"] == ["a dead window"]
 
 
 class Pressing:
@@ -278,7 +278,7 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
         assert lines(tmp_path / "live")[-1]["budget"]["pulses"] == culture.pulses == 2 * PULSES
     told = lines(tmp_path / "live")
     assert [line["what"] for line in told[-2:]] == ["fault", "end"]
-    assert told[-2]["sentence"] == "DeviceFailed: gone"
+    assert told[-2]["message"] == "DeviceFailed: gone"
     policies = load_policies(tmp_path / "live" / "policies")
     assert list(policies) == ["p0"]
     assert all(len(policy.learning_curve) for policy in policies.values())
@@ -302,7 +302,7 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
         assert culture.is_stopped
     written = lines(tmp_path / "live")
     assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
-    assert told in written[-2]["sentence"]
+    assert told in written[-2]["message"]
     assert f"ended before its time ({told}" in (what_stands(tmp_path / "live") or "")
 
 
@@ -426,7 +426,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--speed", "0"], "speed: expected a number above 0, got 0"),
         (["--duration-min", "-1"], "duration_min"),
         (["--interval-min", "0.1"], "interval_min: expected at least"),
-        (["--presentations", "0"], "presentations: expected at least 1"),
+        (["--trials", "0"], "trials: expected at least 1"),
         (["--pulses", "0"], "pulses: expected at least 1"),
         (["--episodes", "0"], "episodes: expected at least 1"),
         (["--policies", "0"], "policies: expected a whole number from 1"),
@@ -458,7 +458,7 @@ def test_what_cannot_be_is_refused_before_a_culture_is_opened(
 def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None:
     exchange = Exchange(tmp_path / "exchange")
     assert exchange.newest(-1) is None
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     for number in (0, 1, 2):
         exchange.publish(number, 10.0 * number, simulator)
     newest = exchange.newest(0)
@@ -489,7 +489,7 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
         raise DeviceFailed("gone")
 
     monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
-    given = ["live", "navigation", "--policies", "2", "--pulses", "1", "--presentations", "40", "--speed", "1e6"]
+    given = ["live", "navigation", "--policies", "2", "--pulses", "1", "--trials", "40", "--speed", "1e6"]
     given += ["--interval-min", "5", "--duration-min", "10", "--episodes", "1", "--json"]
     assert main([*given, "--out", str(tmp_path / "done")]) == 0
     printed = capsys.readouterr().out.splitlines()

@@ -28,21 +28,21 @@ from animat.cultures.living_series import record_living_series
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.errors import DeviceFailed, InvalidArgument, Mismatch
-from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.selection import Selection
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 from fake_culture import FakeCulture
 
-SHORT = Protocol((20.0, 80.0), patterns=5, presentations=5, setup_s=0.5, pause_s=0.2)
+SHORT = Protocol((20.0, 80.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 
 
 def replay() -> ReplayCulture:
-    return ReplayCulture([make_up_recording(1, channels=32, start_min=30.0)], seed=3)
+    return ReplayCulture([synthetic_recording(1, channels=32, start_min=30.0)], seed=3)
 
 
 def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_culture_that_fails_leaves_what_was_recorded_before(tmp_path: Path) ->
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused_before_any_stimulus(tmp_path: Path) -> None:
-    with replay() as culture, alone_in(tmp_path):
+    with replay() as culture, exclusive_lock(tmp_path):
         with pytest.raises(Mismatch, match="another run is at work in this folder"):
             record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         assert culture.delivered == 0
@@ -104,10 +104,10 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
     @contextmanager
     def ended_in_between(folder: Path) -> Iterator[None]:
         shutil.copytree(file.parent, folder)
-        with alone_in(folder):
+        with exclusive_lock(folder):
             yield
 
-    monkeypatch.setattr("animat.cultures.living_series.alone_in", ended_in_between)
+    monkeypatch.setattr("animat.cultures.living_series.exclusive_lock", ended_in_between)
     with replay() as culture:
         with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* got another \(protocol\."):
             record_living_series(culture, replace(SHORT, pulses=2), tmp_path / "series", sessions=2, interval_min=2.0)
@@ -212,26 +212,26 @@ def test_a_replay_of_other_recordings_is_refused(tmp_path: Path) -> None:
     with replay() as culture:
         record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         now_s = culture.now_s
-    with ReplayCulture([make_up_recording(2, channels=32, start_min=30.0)], seed=3) as other:
+    with ReplayCulture([synthetic_recording(2, channels=32, start_min=30.0)], seed=3) as other:
         other.rest(now_s - other.now_s)
         with pytest.raises(Mismatch, match="replayed seed: 1 there, 2 now"):
             record_living_series(other, SHORT, tmp_path, sessions=2, interval_min=2.0)
 
 
 def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_made_up_series(1, tmp_path / "made-up", sessions=1)
+    write_synthetic_series(1, tmp_path / "synthetic", sessions=1)
     command = [
         "record",
         "--culture",
         "replay",
         "--sessions",
         "2",
-        "--presentations",
+        "--trials",
         "2",
         "--out",
         str(tmp_path / "out"),
     ]
-    assert main([*command, "--recordings", str(tmp_path / "made-up"), "--json"]) == 0
+    assert main([*command, "--recordings", str(tmp_path / "synthetic"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     assert [Path(file).name for file in told["recordings"]] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
     assert read_recording(told["recordings"][1]).start_min == pytest.approx(10.0)
@@ -255,7 +255,7 @@ def test_a_kill_while_it_is_recorded_closes_the_culture(
     culture = FakeCulture(fault=kill, at=1)
     monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
     before = signal.getsignal(number)
-    given = ["--culture", "maxone", "--selection", "x.json", "--presentations", "2", "--out", str(tmp_path)]
+    given = ["--culture", "maxone", "--selection", "x.json", "--trials", "2", "--out", str(tmp_path)]
     assert main(["record", *given]) == 130
     assert not culture.is_open
     assert culture.deliveries == 2
@@ -282,7 +282,7 @@ def test_a_seed_below_0_is_refused_before_a_device_is_touched(
     assert culture.pulses == 0
     for make in (
         lambda: CL1Culture(seed=-1),
-        lambda: ReplayCulture([make_up_recording(1, channels=32)], seed=-1),
+        lambda: ReplayCulture([synthetic_recording(1, channels=32)], seed=-1),
         lambda: culture_of("maxone", seed=-1, selection="x.json"),
         lambda: culture_of("virtual", seed=-1),
     ):

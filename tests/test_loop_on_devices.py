@@ -12,7 +12,7 @@ import pytest
 
 import stand_in_cl
 import stand_in_maxlab
-from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
@@ -52,15 +52,15 @@ def loop_at(
         pulses=5,
         pulse=pulse,
         pause_s=0.1,
-        lead_in=0,
+        warm_up=0,
         on_late="stop",
     )
     with culture:
-        return run_session(culture, loop, [Contender("one", "", OneCondition(chosen))], tmp_path, episodes=2)
+        return run_session(culture, loop, [Agent("one", "", OneCondition(chosen))], tmp_path, episodes=2)
 
 
 def assert_in_time(session: Session, chosen: int, frame_s: float) -> None:
-    assert session.ending.by == "plan", session.ending.sentence
+    assert session.ending.by == "plan", session.ending.message
     ticks = session.ticks
     assert len(ticks) == 20
     assert [tick.late_s for tick in ticks] == [0.0] * 20
@@ -110,7 +110,7 @@ def test_a_maxone_is_in_time_however_long_its_sequences_take_to_make(
 
 def assert_on(session: Session, chosen: tuple[int, ...]) -> None:
     """All pulses were in time and on the chosen electrodes, as the session's recording tells."""
-    assert session.ending.by == "plan", session.ending.sentence
+    assert session.ending.by == "plan", session.ending.message
     assert [tick.late_s for tick in session.ticks] == [0.0] * 20
     stimuli = session.recording().stimuli
     assert len(stimuli) == 100
@@ -158,16 +158,16 @@ def test_a_cl1_that_is_gone_is_a_lost_connection(tmp_path: Path, monkeypatch: py
         loop_at(tmp_path, CL1Culture(), CL1_PULSE, 0)
     ending = read_session(tmp_path).ending
     assert ending.by == "culture"
-    assert "the connection to the culture is lost: DeviceFailed: CL1" in ending.sentence
-    assert "could not be interrupted" in ending.sentence
-    assert "BUT the culture could not be stopped" in ending.sentence
+    assert "the connection to the culture is lost: DeviceFailed: CL1" in ending.message
+    assert "could not be interrupted" in ending.message
+    assert "BUT the culture could not be stopped" in ending.message
 
 
 def test_a_cl1_whose_loop_is_late_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     neurons = stand_in_cl.install(monkeypatch)
     neurons.fail = TimeoutError("Loop fell behind by 1 frame (40 us)")
     ending = loop_at(tmp_path, CL1Culture(), CL1_PULSE, 0).ending
-    assert ending.sentence.startswith(
+    assert ending.message.startswith(
         "the culture raised DeviceFailed: CL1: expected a loop over 0.1 s, got TimeoutError"
     )
 
@@ -192,5 +192,5 @@ def test_a_maxone_that_is_gone_is_a_lost_connection(
         loop_at(tmp_path, MaxOneCulture(selection(), stream=Silent(rig), settle=False), BALANCED_PULSE, 0)
     ending = read_session(tmp_path).ending
     assert ending.by == "culture"
-    assert ending.sentence.startswith("the connection to the culture is lost: DeviceFailed")
-    assert "BUT the culture could not be stopped" in ending.sentence
+    assert ending.message.startswith("the connection to the culture is lost: DeviceFailed")
+    assert "BUT the culture could not be stopped" in ending.message

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from scipy.stats import kstest
 
-from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import Contender, InTurn
+from animat.closed_loop.agents import Agent, InTurn
+from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
 from animat.robots import Navigation, Robot
@@ -36,8 +36,8 @@ class Anywhere(Robot[NavigationState]):
     paper_iterations: ClassVar[int] = 1000
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        return COURSE.quantities
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return COURSE.observation_spec
 
     def reset(self, key: Array) -> NavigationState:
         x, y, heading = jax.random.uniform(key, (3,))
@@ -61,24 +61,24 @@ class Looking:
         return int(rng.integers(5))
 
 
-def starts_of(session: Session, contender: str) -> list[tuple[float, ...]]:
-    return [episode.start for episode in session.episodes if episode.contender == contender]
+def starts_of(session: Session, agent: str) -> list[tuple[float, ...]]:
+    return [episode.start for episode in session.episodes if episode.agent == agent]
 
 
-def lived(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
+def ran(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
     looking = Looking()
-    contenders = [
-        Contender("p0", "", looking),
+    agents = [
+        Agent("p0", "", looking),
         RANDOM,
-        Contender("silent", "", InTurn({"p0": looking, "p1": Looking()}), "silent"),
+        Agent("silent", "", InTurn({"p0": looking, "p1": Looking()}), "silent"),
     ]
     with FakeCulture(culture) as fake:
-        loop = loop_of(robot=Anywhere(), lead_in=1)
-        return run_session(fake, loop, contenders, folder, episodes=5, seed=seed), looking
+        loop = loop_of(robot=Anywhere(), warm_up=1)
+        return run_session(fake, loop, agents, folder, episodes=5, seed=seed), looking
 
 
 def test_each_episode_starts_where_the_robot_draws_it(tmp_path: Path) -> None:
-    session, looking = lived(tmp_path / "a", seed=3)
+    session, looking = ran(tmp_path / "a", seed=3)
     assert session.ending.by == "plan"
     starts = starts_of(session, "p0")
     assert len(set(starts)) == 5
@@ -92,20 +92,20 @@ def test_each_episode_starts_where_the_robot_draws_it(tmp_path: Path) -> None:
         after, _, _ = COURSE.advance(np.empty(0), state, np.float32(first.command))
         np.testing.assert_allclose(first.observation, COURSE.observe(after), atol=1e-6)
     # The seed decides, and the culture does not.
-    assert starts_of(lived(tmp_path / "b", seed=3, culture=2)[0], "random") == starts
-    assert not set(starts_of(lived(tmp_path / "c", seed=4)[0], "random")) & set(starts)
+    assert starts_of(ran(tmp_path / "b", seed=3, culture=2)[0], "random") == starts
+    assert not set(starts_of(ran(tmp_path / "c", seed=4)[0], "random")) & set(starts)
 
 
 def test_the_starts_are_those_of_the_robots_own_distribution() -> None:
-    body = Body(Anywhere(), np.random.default_rng(1))
-    starts = np.array([body.reset(number) for number in range(400)])
-    np.testing.assert_array_equal(body.reset(7), starts[7])
+    runner = RobotRunner(Anywhere(), np.random.default_rng(1))
+    starts = np.array([runner.reset(number) for number in range(400)])
+    np.testing.assert_array_equal(runner.reset(7), starts[7])
     for column, (low, width) in zip(starts.T, ((0, 1), (0, 1), (-np.pi, 2 * np.pi)), strict=True):
         assert kstest(column, "uniform", (low, width)).pvalue > 1e-3
 
 
 def test_a_robot_of_ones_own_is_recovered_with_its_starts(tmp_path: Path) -> None:
-    session, _ = lived(tmp_path, seed=3)
+    session, _ = ran(tmp_path, seed=3)
     table = session.ticks_file.read_bytes()
     assert b",x_m,y_m,heading_rad," in table.splitlines()[0]
     session.ticks_file.unlink()
@@ -125,5 +125,5 @@ def test_a_robot_that_cannot_start_ends_the_session(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         session = run_session(culture, loop_of(robot=Lost()), [RANDOM], tmp_path, episodes=1)
         assert session.ending.by == "robot"
-        assert "the robot starts at [nan, " in session.ending.sentence
+        assert "the robot starts at [nan, " in session.ending.message
         assert culture.pulses == 0

@@ -161,7 +161,7 @@ from animat.robots import ROBOTS, robot_from_dict, robot_named, robot_to_dict
 import numpy as np
 for name in ROBOTS:
     robot = robot_named(name, episode_limit=7)
-    assert robot_from_dict(robot_to_dict(robot)) == robot and robot.quantities and robot.caveats() is not None
+    assert robot_from_dict(robot_to_dict(robot)) == robot and robot.observation_spec and robot.caveats() is not None
 assert mapping_named("9-thresholds").command(5.0, np.arange(11.0)) == 0.2
 """
     subprocess.run([sys.executable, "-c", code], check=True)

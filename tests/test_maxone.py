@@ -143,7 +143,7 @@ def test_each_pattern_is_one_sequence_that_stays_on_the_device(rig: Rig) -> None
 
 def test_a_recording_is_delivered_to_the_sample_within_a_sequence(rig: Rig) -> None:
     rig.jitter = 13
-    protocol = Protocol(pulse=BALANCED_PULSE, order="mixed", pulses=5, presentations=4, setup_s=0.1)
+    protocol = Protocol(pulse=BALANCED_PULSE, order="mixed", pulses=5, trials=4, setup_s=0.1)
     with culture_on(rig) as culture:
         recording = culture.record(protocol, seed=1)
         asked = np.concatenate([block.stimuli.time_s for block in culture.schedule(protocol, 1).blocks])

@@ -21,7 +21,7 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return, best_returns
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.execution.training import train
@@ -32,7 +32,7 @@ from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
@@ -67,8 +67,8 @@ def chain(
     return replace(responses_of(*[[1.0]] * len(after_low)), presented=None, place=None, **columns, **changes)
 
 
-def pasts_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
-    """The past of each response as `Memory` says, in fractions."""
+def histories_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
+    """The history of each response as `Memory` says, in fractions."""
     decay, weight = Fraction(memory.decay), Fraction(memory.weight)
     x, burst, condition = (getattr(responses, name).tolist() for name in ("rate_hz", "is_burst", "condition"))
     kept = [(v, c) for v, is_burst, c in zip(x, burst, condition, strict=True) if not is_burst]
@@ -81,14 +81,14 @@ def pasts_by_hand(responses: Responses, memory: Memory) -> list[Fraction]:
         return sum(alike, Fraction(0)) / len(alike) if c >= 0 else Fraction(1, 2)
 
     presented, place = responses.presentations
-    past, pasts = Fraction(0), []
+    history, histories = Fraction(0), []
     columns = (presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested)
     for c, value, is_burst, is_rested in zip(*(column.tolist() for column in columns), strict=True):
-        past = Fraction(0) if is_rested else past
-        pasts.append(past)
+        history = Fraction(0) if is_rested else history
+        histories.append(history)
         left = (1 - decay) * (rank(value) + weight * mean(c)) / (1 + weight)
-        past = Fraction(1, 2) if is_burst else decay * past + left
-    return [pasts[row] for row in place]
+        history = Fraction(1, 2) if is_burst else decay * history + left
+    return [histories[row] for row in place]
 
 
 MEMORIES = st.builds(
@@ -107,8 +107,8 @@ MEMORIES = st.builds(
     st.integers(0, 16),
 )
 def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memory: Memory | None, at: int) -> None:
-    """All that had the very same past can be drawn, and nothing beyond the k nearest in rank; also where presentations
-    have no condition, or come after a rest."""
+    """All that had the very same history can be drawn, and nothing beyond the k nearest in rank; also where
+    presentations have no condition, or come after a rest."""
     every, every_x, bursts, sixth = (np.array(column) for column in zip(*rows, strict=True))
     place = np.flatnonzero(every >= 0)
     condition, x, burst = every[place], every_x[place], bursts[place]
@@ -127,27 +127,29 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memo
         return
     simulator = fit_memory(responses, memory=memory)
     memory = simulator.memory
-    pasts = [np.float32(float(past)) for past in pasts_by_hand(responses, memory)]
+    histories = [np.float32(float(history)) for history in histories_by_hand(responses, memory)]
     # Also exactly where a recorded one is.
-    last = np.float32(at / 16) if at % 2 else pasts[at % len(pasts)]
+    last = np.float32(at / 16) if at % 2 else histories[at % len(histories)]
     uniforms = jnp.linspace(0, 1, 400, endpoint=False)
     for c in (0, 1):
         mine = [i for i in range(len(x)) if condition[i] == c and not burst[i]]
         mine = [i for i in mine if sixth[place[i]] == 0 or place[i] == 0 or not bursts[place[i] - 1]] or mine
         k = int(simulator.nearest[c])
-        assert k == round(len(mine) ** memory.reach)
+        assert k == round(len(mine) ** memory.neighbour_exponent)
         assert 1 <= k <= len(mine) == simulator.followers[c]
-        np.testing.assert_allclose(simulator.before[c][: len(mine)], sorted(pasts[i] for i in mine), atol=1e-6)
+        np.testing.assert_allclose(simulator.before[c][: len(mine)], sorted(histories[i] for i in mine), atol=1e-6)
         answers = jax.vmap(simulator.answer, (None, 0, None))(jnp.int32(c), uniforms, jnp.float32(last))
         drawn = set(np.asarray(answers.rate_hz).tolist())
-        same = [i for i in mine if abs(pasts[i] - last) < 1e-6]
-        # Between this past and that of one that is drawn lie fewer than k others.
+        same = [i for i in mine if abs(histories[i] - last) < 1e-6]
+        # Between this history and that of one that is drawn lie fewer than k others.
         near = [
-            i for i in mine if sum(min(last, pasts[i]) + 1e-6 < pasts[j] < max(last, pasts[i]) - 1e-6 for j in mine) < k
+            i
+            for i in mine
+            if sum(min(last, histories[i]) + 1e-6 < histories[j] < max(last, histories[i]) - 1e-6 for j in mine) < k
         ]
         assert drawn <= {x[i] for i in near}
         if memory.decay == memory.weight == 0:
-            # Pasts are ranks then, the same to the last bit wherever the responses before are.
+            # Histories are ranks then, the same to the last bit wherever the responses before are.
             assert drawn >= {x[i] for i in same}
             if len(same) >= k:
                 assert drawn == {x[i] for i in same}
@@ -156,7 +158,7 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memo
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), MEMORIES)
 def test_what_is_remembered_of_an_answer_is_what_the_recording_remembered_of_it(seed: int, memory: Memory) -> None:
-    """Answered as it was recorded, a simulator comes through the pasts that the recording came through."""
+    """Answered as it was recorded, a simulator comes through the histories that the recording came through."""
     rng = np.random.default_rng(seed)
     n = 30
     responses = replace(
@@ -166,16 +168,16 @@ def test_what_is_remembered_of_an_answer_is_what_the_recording_remembered_of_it(
         active_ratio=np.full(n, 0.1),
         is_burst=np.zeros(n, bool),
     )
-    # Of one neighbour alone, and at its own past, that very response is drawn.
+    # Of one neighbour alone, and at its own history, that very response is drawn.
     simulator = replace(fit_memory(responses, memory=memory), nearest=jnp.ones(3, jnp.int32))
-    pasts = pasts_by_hand(responses, memory)
-    answers = jax.vmap(lambda condition, past: simulator.answer(condition, jnp.float32(0.5), past))(
-        jnp.int32(responses.condition), jnp.float32([float(past) for past in pasts[:n]])
+    histories = histories_by_hand(responses, memory)
+    answers = jax.vmap(lambda condition, history: simulator.answer(condition, jnp.float32(0.5), history))(
+        jnp.int32(responses.condition), jnp.float32([float(history) for history in histories[:n]])
     )
     for i in range(n - 1):
-        if sum(abs(float(past - pasts[i])) < 1e-6 for past in pasts) == 1:
+        if sum(abs(float(history - histories[i])) < 1e-6 for history in histories) == 1:
             assert float(answers.rate_hz[i]) == responses.rate_hz[i]
-            assert float(answers.past[i]) == pytest.approx(float(pasts[i + 1]), abs=1e-6)
+            assert float(answers.history[i]) == pytest.approx(float(histories[i + 1]), abs=1e-6)
 
 
 def test_what_was_recorded_first_follows_silence_and_what_follows_a_burst_is_known_to() -> None:
@@ -239,9 +241,9 @@ def test_a_known_chain_is_answered_as_it_is() -> None:
     for c in (0, 1):
         for last, chance in ((25.0, low[c]), (75.0, high[c])):
             lasts = jnp.linspace(last - 10, last + 10, 50)
-            pasts = jnp.mean(responses.rate_hz[:, None] < lasts, axis=0)
+            histories = jnp.mean(responses.rate_hz[:, None] < lasts, axis=0)
             x = jax.vmap(lambda at, c=c: jax.vmap(lambda u: simulator.answer(jnp.int32(c), u, at).rate_hz)(uniforms))(
-                pasts
+                histories
             )
             share = float(jnp.mean(x >= 50))
             # About 1,200 responses lie behind it.
@@ -261,12 +263,12 @@ def test_without_regard_to_the_last_it_is_the_empirical_simulator() -> None:
     np.testing.assert_array_equal(remembering.percentiles, plain.percentiles)
 
 
-def test_redrawn_responses_keep_what_was_before_them() -> None:
+def test_bootstrapped_responses_keep_what_was_before_them() -> None:
     responses = chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9))
-    redrawn = responses.redrawn(np.random.default_rng(0))
+    bootstrapped = responses.bootstrapped(np.random.default_rng(0))
     pairs = set(zip(responses.last_hz, responses.rate_hz, strict=True))
-    assert len(redrawn) == 500
-    assert set(zip(redrawn.last_hz, redrawn.rate_hz, strict=True)) <= pairs
+    assert len(bootstrapped) == 500
+    assert set(zip(bootstrapped.last_hz, bootstrapped.rate_hz, strict=True)) <= pairs
 
 
 def test_presentations_that_do_not_fit_are_refused() -> None:
@@ -285,13 +287,13 @@ def test_simulators_of_recordings_of_different_lengths_stack() -> None:
     timeline = fit_timeline(series, kind="memory")
     alone = fit_memory(series[0])
     uniforms = jnp.linspace(0, 1, 100, endpoint=False)
-    for past in (0.0, 0.3, 0.8, 1.0):
+    for history in (0.0, 0.3, 0.8, 1.0):
         drawn = [
-            jax.vmap(s.answer, (None, 0, None))(jnp.int32(1), uniforms, jnp.float32(past))
+            jax.vmap(s.answer, (None, 0, None))(jnp.int32(1), uniforms, jnp.float32(history))
             for s in (timeline.at(200.0), alone)
         ]
         np.testing.assert_array_equal(*(each.rate_hz for each in drawn))
-        np.testing.assert_array_equal(*(each.past for each in drawn))
+        np.testing.assert_array_equal(*(each.history for each in drawn))
     with pytest.raises(InvalidArgument, match="room"):
         fit_memory(series[1], room=20)
 
@@ -316,8 +318,8 @@ def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> 
         "empirical": "there are none",
         "memory": "similar history is drawn",
     }
-    for other, sentence in words.items():
-        assert any(sentence in text for text in said.values()) == (other == kind)
+    for other, message in words.items():
+        assert any(message in text for text in said.values()) == (other == kind)
 
 
 def test_an_animat_remembers() -> None:
@@ -335,12 +337,12 @@ def test_an_animat_remembers() -> None:
     animat = Animat(Cartpole(), Thresholds(1), 2)
     state = animat.reset(jax.random.key(0))
     assert float(state.neurons) == 0.5
-    for past, answer in ((0.8, 90.0), (0.2, 10.0)):
-        came = animat.step(jax.random.key(1), state._replace(neurons=jnp.float32(past)), jnp.int32(0), simulator)
+    for history, answer in ((0.8, 90.0), (0.2, 10.0)):
+        came = animat.step(jax.random.key(1), state._replace(neurons=jnp.float32(history)), jnp.int32(0), simulator)
         assert float(came.info["rate_hz"]) == answer
-        after = float(simulator.answer(jnp.int32(0), jnp.float32(0.5), jnp.float32(past)).past)
+        after = float(simulator.answer(jnp.int32(0), jnp.float32(0.5), jnp.float32(history)).history)
         assert float(came.neurons) == after
-        assert after not in (past, 0.5)
+        assert after not in (history, 0.5)
     # Without neurons nothing changes it.
     alone = WithoutNeurons(Cartpole(), (-1.0, 1.0))
     assert float(alone.step(jax.random.key(1), state, jnp.int32(0), None).neurons) == 0.5
@@ -368,7 +370,7 @@ def persistent(n: int = 10) -> MemorySimulator:
 
 
 @pytest.mark.parametrize("limit", [2, 60, *(pytest.param(limit, marks=pytest.mark.oracle) for limit in (1, 5))])
-def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
+def test_the_optimum_knows_what_the_neurons_remember(limit: int) -> None:
     """Up and down stairs with a coin that remembers, folded back by hand over step and last toss."""
     heads = np.array([[0.2, 0.5], [0.5, 0.8]])  # after tails and heads, of each action
     worth = np.zeros((5, 2))
@@ -384,7 +386,7 @@ def test_the_limit_knows_what_the_neurons_remember(limit: int) -> None:
     assert abs(found.monte_carlo - worth[2, 0]) < 4 * found.standard_error + 1e-6
 
 
-def test_cases_with_and_without_memory_have_the_limits_that_they_have_alone() -> None:
+def test_cases_with_and_without_memory_have_the_optima_that_they_have_alone() -> None:
     environment = Animat(Stairs(), Thresholds(1), 2)
     cases = [(environment, coins(3, 6)), (environment, persistent()), (environment, coins(1, 2))]
     together = best_returns(cases, grid=STEPS, episodes=500)
@@ -421,16 +423,16 @@ def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator()
 
 
 def test_without_memory_none_is_found_where_responses_are_of_few_spikes() -> None:
-    """Many responses are the same then, and pasts too."""
+    """Many responses are the same then, and histories too."""
     found = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         found.append(fit_memory(replace(independent(seed), rate_hz=rng.poisson(1.0, 500).astype(float))).memory)
-    assert all(memory == NO_MEMORY or memory.reach < 1 for memory in found)
+    assert all(memory == NO_MEMORY or memory.neighbour_exponent < 1 for memory in found)
     assert found.count(NO_MEMORY) >= 36
 
 
-def test_the_limit_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
+def test_the_optimum_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
     class Own(EmpiricalSimulator):
         has_memory = True
 
@@ -443,7 +445,7 @@ def test_the_limit_of_a_simulator_of_ones_own_that_remembers_is_refused() -> Non
 @pytest.mark.parametrize(
     "mapping", [Thresholds(1), *(pytest.param(other, marks=pytest.mark.oracle) for other in (Thresholds(9), Linear()))]
 )
-def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory(mapping: Any) -> None:
+def test_where_nothing_is_remembered_commands_and_optimum_are_those_without_memory(mapping: Any) -> None:
     responses = independent(0)
     simulator, plain = fit_memory(responses), fit_empirical(responses)
     assert np.all(simulator.nearest == simulator.followers)
@@ -456,15 +458,15 @@ def test_where_nothing_is_remembered_commands_and_limit_are_those_without_memory
         mean = sum(np.sum(each.levels * each.probabilities, axis=1) for each in row)
         np.testing.assert_allclose(mean, means, atol=0.01)
     if isinstance(mapping, Thresholds):
-        limits = [best_return(environment, each, resolution=0.4, episodes=0).value for each in (simulator, plain)]
-        assert limits[0] == pytest.approx(limits[1], abs=0.1)
+        optima = [best_return(environment, each, resolution=0.4, episodes=0).value for each in (simulator, plain)]
+        assert optima[0] == pytest.approx(optima[1], abs=0.1)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 def test_the_controller_that_remembers_gets_what_was_promised(robot: Any, mapping: Any) -> None:
-    """The limit's own controller, on the simulator with its memory of a real number, beside six classes of it."""
+    """The optimum's own controller, on the simulator with its memory of a real number, beside six classes of it."""
     chances = {"after_low": (0.05, 0.2, 0.35, 0.45, 0.5), "after_high": (0.25, 0.5, 0.75, 0.85, 0.9)}
     simulator = fit_memory(chain(2500, **chances))
     found = best_return(Animat(robot, mapping, 5), simulator, resolution=0.8, episodes=4000)
@@ -479,7 +481,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     chances = {"after_low": (0.05, 0.2, 0.35, 0.5, 0.6), "after_high": (0.25, 0.5, 0.75, 0.85, 0.95)}
     environment = Animat(Cartpole(), Thresholds(1), 5)
     culture = fit_memory(chain(40_000, seed=99, **chances))
-    rule = hand_made(environment, culture)
+    rule = heuristic_policy(environment, culture)
 
     def returns(simulator: MemorySimulator, episodes: int, seed: int) -> np.ndarray:
         return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()
@@ -487,13 +489,13 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     truth, covered = returns(culture, 20_000, 1).mean(), 0
     for seed in range(60):
         calibration = Calibration.of_series([chain(500, seed=seed, **chances)], kind="memory")
-        low, high = np.quantile([returns(each, 200, seed).mean() for each in calibration.redrawn], [0.025, 0.975])
+        low, high = np.quantile([returns(each, 200, seed).mean() for each in calibration.bootstraps], [0.025, 0.975])
         covered += low <= truth <= high
     # 57 of 60, standard deviation 1.7; nearest neighbours of so few responses blur the chain's step a little.
     assert 51 <= covered <= 60
 
 
-def test_an_environment_without_neurons_has_its_limit_whatever_simulator_is_beside_it() -> None:
+def test_an_environment_without_neurons_has_its_optimum_whatever_simulator_is_beside_it() -> None:
     """As a case of its own, and beside one whose neurons remember."""
     alone = best_return(WithoutNeurons(Stairs(5), (-1.0, 1.0)), None, grid=STEPS, episodes=10)
     both = [(WithoutNeurons(Stairs(5), (-1.0, 1.0)), persistent()), (Animat(Stairs(5), Thresholds(1), 2), persistent())]
@@ -506,14 +508,14 @@ def test_an_environment_without_neurons_has_its_limit_whatever_simulator_is_besi
 def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
     simulator = fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9)))
     environment = ShuffledDelivery(Animat(Stairs(), Thresholds(1), 2))
-    limit = best_return(environment, simulator, grid=STEPS, episodes=0)
+    optimum = best_return(environment, simulator, grid=STEPS, episodes=0)
     played = [
         roll_out(environment, simulator, actor, 1, episodes=4000, seed=1).returns
         for actor in (Uniform(), Constant(jnp.array([0])))
     ]
     for returns in played:
         # Six classes stand for a memory of a real number.
-        assert abs(returns.mean() - limit.value) < 5 * returns.std() / np.sqrt(4000) + 0.03
+        assert abs(returns.mean() - optimum.value) < 5 * returns.std() / np.sqrt(4000) + 0.03
 
 
 @settings(max_examples=30, deadline=None)
@@ -552,7 +554,7 @@ def test_what_a_simulator_with_memory_keeps_is_told_by_what_it_answers() -> None
 
 def test_too_few_to_draw_the_nearest_from_is_told() -> None:
     few = chain(40, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
-    # Always the nearest alone: what had an outlying past is drawn most often.
+    # Always the nearest alone: what had an outlying history is drawn most often.
     kept = fidelity(few, fit_memory(few, memory=Memory(0.0, 0.0, 0.0)))
     moved = replace(kept, in_simulator=kept.in_data + np.array([0.06, 0.0]))
     (found,) = moved.findings(of_memory=True)
@@ -566,19 +568,19 @@ def test_training_tells_what_is_remembered() -> None:
     series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
-    decay, weight, reach = fit_memory(series[0]).memory
+    decay, weight, neighbour_exponent = fit_memory(series[0]).memory
     assert first.startswith(
         f"memory at 0 min: {decay:.2g} of the history state is left by each trial, which weighs {weight:g} "
     )
-    assert f"one of the n^{reach:.2g} responses" in first
+    assert f"one of the n^{neighbour_exponent:.2g} responses" in first
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:
-    write_nwb(make_up_recording(1, channels=32), tmp_path / "made-up.nwb")
+    write_nwb(synthetic_recording(1, channels=32), tmp_path / "synthetic.nwb")
     with pytest.warns(UserWarning, match="presented in blocks"):
-        environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "made-up.nwb", kind="memory")
+        environment = gymnasium.make("Animat/Navigation-v0", recordings=tmp_path / "synthetic.nwb", kind="memory")
     environment.reset(seed=1)
     rates_hz = [environment.step(0)[4]["rate_hz"] for _ in range(20)]
     assert len(set(rates_hz)) > 1

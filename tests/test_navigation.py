@@ -152,8 +152,8 @@ def test_from_the_start_it_can_be_steered_to_the_goal() -> None:
 def test_twenty_iterations_as_printed_cannot_reach_the_goal_and_it_says_so() -> None:
     printed = Navigation.as_printed()
     assert printed.episode_limit == 20 and not printed.goal_reachable
-    (sentence,) = printed.caveats()
-    assert sentence.startswith("navigation: the goal cannot be reached: 20 iterations of 0.025 m cover 0.5 m")
+    (message,) = printed.caveats()
+    assert message.startswith("navigation: the goal cannot be reached: 20 iterations of 0.025 m cover 0.5 m")
     assert Navigation().goal_reachable and Navigation().caveats() == ()
     # Whatever is done, by any of 2,000 random ways of steering.
     for seed in range(20):

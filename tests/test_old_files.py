@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,21 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import read_session
-from animat.errors import Mismatch
+from animat.differences import fingerprint_of
+from animat.errors import InvalidFile, Mismatch
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
+from animat.stimulation.protocol import Protocol
 from animat.studies.plan import plan_study
 from animat.studies.run import run_study
 from animat.studies.toml import read_study
+from animat.training.folder import describe, expect_folder_for, is_ours
 from animat.training.policy import Policy
+from animat.training.settings import FORMER, SAC
+from animat.training.specification import Training
 from test_studies import Halts
 
-pytestmark = pytest.mark.usefixtures("in_this_process", "few_redrawn")
+pytestmark = pytest.mark.usefixtures("in_this_process", "few_bootstraps")
 
 ARCHIVE = Path(__file__).parent / "data" / "commit_5e75c96.tar.xz"
 
@@ -50,7 +56,7 @@ def test_recordings_are_what_they_were(
         assert recording.spike_times_s.sum() == pytest.approx(was["spike_times_s"], rel=1e-12)
         assert recording.stimuli.time_s.sum() == pytest.approx(was["stimulus_times_s"], rel=1e-12)
         assert sorted(set(recording.stimuli.frequency_hz.tolist())) == was["frequencies_hz"]
-        assert str(recording.presentation) == was["presentation"]
+        assert str(recording.presentation) == was["presentation"].replace("a presentation", "a trial")
     assert [each.rate_hz.tolist() for each in extract_series(recordings)] == told["rate_hz"]
     assert main(["inspect", str(old / "recordings")]) == 0
     assert capsys.readouterr().out.count("usable") == 2
@@ -78,7 +84,8 @@ def test_a_session_is_read_and_its_recording_written_again(old: Path, told: dict
     was = told["session"]
     assert session.ending.by == was["ended_by"]
     assert sum(episode.pulses for episode in session.episodes) == was["pulses"]
-    ticks = [[t.contender, t.delivered, t.rate_hz, t.command, t.reward] for t in session.ticks]
+    assert "warm-up" in {tick.handled for tick in session.ticks}
+    ticks = [[t.agent, t.delivered, t.rate_hz, t.command, t.reward] for t in session.ticks]
     assert ticks == was["ticks"]
     for name in ("session.nwb", "ticks.csv"):
         (tmp_path / "session" / name).unlink()
@@ -96,3 +103,62 @@ def test_a_study_is_read_and_its_folder_left_to_the_version_that_began_it(old: P
     with pytest.raises(Mismatch, match=r"got one of another .*; give another folder"):
         run_study(study, folder, base=tmp_path / "old", executor=Halts())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_studys_former_keys_are_read_by_their_names_of_today(tmp_path: Path) -> None:
+    former, today = tmp_path / "former.toml", tmp_path / "today.toml"
+    text = """optimum_resolution = 0.5
+optimum_episodes = 7
+[culture]
+kind = "synthetic"
+trials = 40
+[simulators]
+allow = ["dead-window"]
+[[robots]]
+name = "navigation"
+optimum_resolution = 0.4
+[algorithm]
+gradient_steps = 1
+tau = 0.5
+[[arms]]
+name = "linear"
+mapping = "linear"
+"""
+    today.write_text(text)
+    for now, before in (
+        ("optimum", "limit"),
+        ("allow", "despite"),
+        ("arms", "conditions"),
+        ("gradient_steps", "updates"),
+        ("tau", "follow"),
+        ("synthetic", "made-up"),
+        ("trials", "presentations"),
+    ):
+        text = text.replace(now, before)
+    former.write_text(text)
+    assert read_study(former) == read_study(today)
+    former.write_text("limit_resolution = 0.5\noptimum_resolution = 0.5\n")
+    with pytest.raises(InvalidFile, match="limit_resolution: no such setting at the top"):
+        read_study(former)
+
+
+def test_a_trainings_folder_goes_on_by_the_former_names_of_its_settings(tmp_path: Path) -> None:
+    training = Training("cartpole", None, policies=1, iterations=100)
+    manifest = describe(training, None)
+    settings = manifest["training"]["algorithm"]
+    former = {before: settings.pop(today) for before, today in FORMER.items()}
+    settings |= former
+    # The fingerprint that 0.1.0 made is over the former names.
+    told = {name: value for name, value in manifest.items() if name not in ("sources", "fingerprint")}
+    assert manifest["fingerprint"] == fingerprint_of(told)
+    (tmp_path / "training.json").write_text(json.dumps(manifest))
+    expect_folder_for(training, tmp_path)
+    assert is_ours(tmp_path, describe(training, None))
+    with pytest.raises(Mismatch, match=r"training\.algorithm\.tau: 0\.005 there, 0\.1 now"):
+        expect_folder_for(replace(training, algorithm=SAC(tau=0.1)), tmp_path)
+
+
+def test_a_protocol_of_presentations_is_one_of_trials() -> None:
+    protocol = Protocol(order="mixed", trials=40)
+    former = protocol.to_json().replace("trials", "presentations")
+    assert "presentations" in former and Protocol.from_json(former) == protocol

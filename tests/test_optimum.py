@@ -19,15 +19,15 @@ from animat.evaluation.commands import commands_of
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.evaluation.sweeping import cubic
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import EmpiricalSimulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole
 from animat.robots.grid import Axis, Grid, grid_for
 from animat.robots.navigation import Navigation, NavigationState
 from animat.wrappers import ShuffledDelivery
 
-SIMULATOR = made_up_simulator()
+SIMULATOR = synthetic_simulator()
 
 
 def coins(*heads: int) -> EmpiricalSimulator:
@@ -52,7 +52,7 @@ class Stairs(Robot[StairState]):
     paper_iterations: ClassVar[int] = 0
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("step", "1", 1.0),)
 
     def reset(self, key: Any) -> StairState:
@@ -169,7 +169,7 @@ def test_cartpole_tried_to_the_end() -> None:
 @pytest.mark.parametrize(
     ("robot", "resolution"), [pytest.param(Cartpole(), 0.75, marks=pytest.mark.oracle), (Navigation(), 0.5)]
 )
-def test_where_nothing_can_be_chosen_the_limit_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
+def test_where_nothing_can_be_chosen_the_optimum_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
     """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
     environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
     found = best_return(environment, SIMULATOR, resolution=resolution, episodes=0)
@@ -189,7 +189,7 @@ def test_a_pole_is_balanced_without_neurons() -> None:
 def test_more_separated_conditions_allow_more() -> None:
     robot = Navigation()
     means = [[42.0 + spread * (i - 2) for i in range(5)] for spread in (0.0, 3.0, 6.0, 9.0)]
-    cases = [(Animat(robot, Thresholds(1), 5), made_up_simulator(m)) for m in means]
+    cases = [(Animat(robot, Thresholds(1), 5), synthetic_simulator(m)) for m in means]
     found = best_returns(cases, resolution=0.5, episodes=0)
     values = [optimum.value for optimum in found]
     assert values == sorted(values)
@@ -226,9 +226,9 @@ def test_a_value_that_its_controller_does_not_get_is_told() -> None:
     assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
     assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # nothing is drawn: the two are alike as they are printed
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
-    assert "between the two" in above.sentence and above.value == pytest.approx(2.1)
+    assert "between the two" in above.message and above.value == pytest.approx(2.1)
     (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)
-    assert "too rough" in below.sentence
+    assert "too rough" in below.message
 
 
 def test_a_grid_too_rough_is_noticed() -> None:
@@ -236,7 +236,7 @@ def test_a_grid_too_rough_is_noticed() -> None:
     grid = grid_for(Navigation()).scaled(0.12)
     found = best_return(WithoutNeurons(Navigation(), None), None, grid=grid, episodes=200)
     (told,) = found.findings()
-    assert told.name == "limit"
+    assert told.name == "optimum"
 
 
 def test_the_grid_error_looks_at_headings_too() -> None:

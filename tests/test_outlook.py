@@ -63,13 +63,13 @@ def test_the_minutes_to_a_change_are_fewer_the_less_is_known() -> None:
 
 
 def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
-    loop = Loop(Navigation(), Thresholds(1), CONDITIONS, np.arange(11.0), pulses=1, pause_s=3.0, lead_in=2)  # type: ignore[arg-type]
+    loop = Loop(Navigation(), Thresholds(1), CONDITIONS, np.arange(11.0), pulses=1, pause_s=3.0, warm_up=2)  # type: ignore[arg-type]
     calibration: Any = SimpleNamespace(drift=MedianDrift(-0.01, 0.005), start_min=10.0)
     plan = [(4, np.array([10.0, 80.0]), True), (2, np.array([10.0, 80.0]), False)]
     account = Account(Budget(pulses=188))
     account.pulses = 94
     found = outlook(loop, calibration, plan, account, 15.0)
-    # Stimulated episodes have 94 pulses, and lead in by two of each; in silence nothing does.
+    # Stimulated episodes have 94 pulses, and a warm-up of two of each; in silence there is none.
     total_s = 4 * (3 + 12 / 5 + 82 / 80) + 2 * (3 + 10 / 5 + 80 / 80)
     assert found.planned_min == pytest.approx(total_s / 60)
     assert found.drifted_min == pytest.approx((-100 * math.log(0.75) - 5, -50 * math.log(0.75) - 5))
@@ -82,7 +82,7 @@ def test_one_line_tells_it() -> None:
     line = str(Outlook(26.2, (24.0, 11.0), math.inf))
     assert line == (
         "the session is planned for about 26 min of the culture's time; by the recordings' drift the median response "
-        "has changed by 25 % in 24 min (11 min at least), beyond which following thresholds may not help; the plan is "
+        "has changed by 25 % in 24 min (11 min at least), beyond which adaptive thresholds may not help; the plan is "
         "longer: ask for fewer --episodes"
     )
     assert str(Outlook(26.2, (-5.0, -9.0), 30.0)).endswith("the plan is longer: ask for fewer --episodes")

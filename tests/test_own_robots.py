@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.contenders import HandMadeRule
+from animat.closed_loop.agents import HeuristicController
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument
-from animat.evaluation.hand_made import HandMade
+from animat.evaluation.heuristic import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
@@ -50,7 +50,7 @@ class Slider(Robot[At]):
     paper_iterations: ClassVar[int] = 1000
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("x", "m", 1.0),)
 
     def reset(self, key: Any) -> At:
@@ -158,10 +158,10 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"noise_size": -1}, "noise_size: expected a whole number"),
         ({"episode_limit": 0}, "episode_limit: expected a whole number"),
         ({"name": None}, "name: expected a text"),
-        ({"quantities": ()}, "quantities: expected a tuple of Quantity"),
-        ({"quantities": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
-        ({"quantities": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
-        ({"quantities": (Quantity("x", "m", np.nan),)}, "x: expected a scale from 1e-12 to 1e.12, got nan"),
+        ({"observation_spec": ()}, "observation_spec: expected a tuple of Quantity"),
+        ({"observation_spec": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
+        ({"observation_spec": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
+        ({"observation_spec": (Quantity("x", "m", np.nan),)}, "x: expected a scale from 1e-12 to 1e.12, got nan"),
         ({"__hash__": None}, "expected a frozen dataclass"),
     ],
 )
@@ -178,7 +178,9 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
 @pytest.mark.parametrize("scale", [1e-12, 1e12, *(pytest.param(x, marks=pytest.mark.oracle) for x in (1e-7, 1e7))])
 def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
     # In the unit that the robot is observed in, it moves as far as the scale says.
-    robot = slider(quantities=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale]))
+    robot = slider(
+        observation_spec=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale])
+    )
     for policy in train(training(robot, "1-threshold"), timeline_of(), None).values():
         assert np.all(np.isfinite(policy.act_greedily(np.array([scale], np.float32))))
 
@@ -234,9 +236,9 @@ def test_a_heuristic_s_command_is_one(wanted: float) -> None:
 def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: float, nearest: int) -> None:
     robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
     means = (-0.4, 0.1, 0.4)
-    assert HandMadeRule(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
+    assert HeuristicController(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
     environment = Animat(robot, Thresholds(1), 3)
-    rule = HandMade(jnp.arange(3), jnp.asarray(means, jnp.float32))
+    rule = HeuristicPolicy(jnp.arange(3), jnp.asarray(means, jnp.float32))
     assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros((1, 1))).tolist() == [nearest]
 
 

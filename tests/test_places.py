@@ -17,8 +17,8 @@ from animat.cli.record import Record
 from animat.cli.responses import Fitting
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import write_made_up_series
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.conditions import conditions_named
 from animat.stimulation.places import check_places, electrodes_of, read_places
 from animat.stimulation.protocol import Protocol
@@ -79,7 +79,7 @@ def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, t
 
 @pytest.mark.parametrize("order", ["mixed", "blocked"])
 def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
-    protocol = Protocol((5.0, 20.0), order, 2, presentations=7, places=LISTED)  # type: ignore[arg-type]
+    protocol = Protocol((5.0, 20.0), order, 2, trials=7, places=LISTED)  # type: ignore[arg-type]
     assert Protocol.from_json(protocol.to_json()) == protocol
     # The second place is the third of the culture's patterns.
     patterns = np.array([[0, 2, -1], [3, 9, 0], [7, 5, -1]])
@@ -105,7 +105,7 @@ def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
 
 def test_in_a_mixed_recording_a_place_may_follow_itself() -> None:
     """As in a closed loop: a round of all places before any comes again would never show it."""
-    protocol = Protocol((10.0,), "mixed", presentations=500, places=LISTED)
+    protocol = Protocol((10.0,), "mixed", trials=500, places=LISTED)
     (block,) = make_schedule(protocol, np.zeros((100, 1), np.int64), 0, places=LISTED).blocks
     first = block.stimuli.electrodes[:, 0]
     share = float(np.mean(first[1:] == first[:-1]))
@@ -118,7 +118,7 @@ def test_a_protocol_without_places_is_written_as_before() -> None:
 
 
 def test_halves_of_a_virtual_culture_are_recorded_and_sorted(tmp_path: Path) -> None:
-    protocol = Protocol((20.0,), "mixed", presentations=3, places="halves", setup_s=0.0, pause_s=0.1)
+    protocol = Protocol((20.0,), "mixed", trials=3, places="halves", setup_s=0.0, pause_s=0.1)
     with small_culture() as culture:
         recording = culture.record(protocol)
         x_of = dict(zip(culture.channels.electrode.tolist(), culture.channels.x_um.tolist(), strict=True))
@@ -136,7 +136,7 @@ def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixtur
     file.write_text("[[1, 2]")
     assert main(["record", "--places", str(file), "--out", str(out)]) == 1
     assert "places.json: places: expected JSON" in capsys.readouterr().err
-    assert main(["record", "--culture", "made-up", "--places", "halves", "--out", str(out)]) == 1
+    assert main(["record", "--culture", "synthetic", "--places", "halves", "--out", str(out)]) == 1
     assert "no places; --culture virtual takes others" in capsys.readouterr().err
     assert not out.exists()
 
@@ -152,7 +152,7 @@ def test_the_command_says_how_to_train_on_places(
 
 
 def test_recordings_of_places_that_are_mixed_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (file,) = write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    (file,) = write_synthetic_series(0, tmp_path / "recordings", sessions=1)
     write_nwb(replace(read_recording(file), protocol=Protocol(places="halves")), tmp_path / "places.nwb")
     for path, is_told in ((file, False), (tmp_path / "places.nwb", True)):
         Fitting().timeline([path])

@@ -71,7 +71,7 @@ def two_forces() -> Policy:
 
 
 def continuous(mean: float | None = None, log_std: float = 0.0) -> Policy:
-    n = len(Navigation().quantities)
+    n = len(Navigation().observation_spec)
     parts = layers(2, n, 8, 8, 2)
     if mean is not None:
         parts["weights"] = (*parts["weights"][:-1], np.zeros((8, 2), np.float32))

@@ -77,7 +77,7 @@ protocols = st.builds(
     order=st.sampled_from(["blocked", "mixed"]),
     pulses=st.integers(1, 4),
     patterns=st.integers(1, 6),
-    presentations=st.integers(1, 9),
+    trials=st.integers(1, 9),
     setup_s=st.floats(0, 5),
     pause_s=st.floats(0, 5),
     tail_s=st.floats(0, 1),
@@ -90,7 +90,7 @@ protocols = st.builds(
 def test_a_schedule_does_what_its_protocol_says(protocol: Protocol, seed: int) -> None:
     schedule = make_schedule(protocol, PATTERNS, seed)
     assert Protocol.from_json(protocol.to_json()) == protocol
-    assert len(schedule) == len(protocol.frequencies_hz) * protocol.presentations * protocol.pulses
+    assert len(schedule) == len(protocol.frequencies_hz) * protocol.trials * protocol.pulses
     assert len(schedule.blocks) == (len(protocol.frequencies_hz) if protocol.order == "blocked" else 1)
     read: dict[float, list[int]] = {f: [] for f in protocol.frequencies_hz}
     presentations = []
@@ -130,7 +130,7 @@ def test_the_same_seed_is_the_same_schedule() -> None:
 
 
 def test_one_pattern_can_be_repeated() -> None:
-    schedule = make_schedule(Protocol(patterns=1, presentations=10, pulses=3), PATTERNS, 0)
+    schedule = make_schedule(Protocol(patterns=1, trials=10, pulses=3), PATTERNS, 0)
     assert all(np.all(block.stimuli.pattern == 0) for block in schedule.blocks)
 
 
@@ -143,7 +143,7 @@ def test_one_pattern_can_be_repeated() -> None:
         ({"order": "shuffled"}, "order: expected 'blocked' or 'mixed'"),
         ({"pulses": 0}, "pulses: expected at least 1"),
         ({"patterns": 0}, "patterns: expected at least 1"),
-        ({"presentations": 0}, "presentations: expected at least 1"),
+        ({"trials": 0}, "trials: expected at least 1"),
         ({"pause_s": float("nan")}, "pause_s: expected a finite number"),
     ],
 )
@@ -180,7 +180,7 @@ NOT_PROTOCOLS = {
     '{"pulses": 2.5}': "pulses: expected a whole number, got 2.5",
     '{"pulses": true}': "pulses: expected a whole number, got True",
     '{"patterns": "20"}': "patterns: expected a whole number, got '20'",
-    '{"presentations": 0}': "presentations: expected at least 1",
+    '{"trials": 0}': "trials: expected at least 1",
     '{"order": "shuffled"}': "order: expected 'blocked' or 'mixed'",
     '{"order": ["mixed"]}': "order: expected 'blocked' or 'mixed'",
     '{"frequencies_hz": 5}': "frequencies_hz: expected a list, got 5",

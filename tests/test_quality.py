@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from animat.recordings.findings import Finding
-from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import SyntheticCulture
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from test_inspection import answering
@@ -53,13 +53,13 @@ def test_an_artefact_counted_as_spikes(until_ms: float, severity: str) -> None:
     found = findings(with_spikes(source, np.vstack([spikes_of(source), artefact])))["artefact-spikes"]
     assert found.severity == severity
     assert found.value == pytest.approx(60, rel=0.05)
-    assert f"from 0 to {until_ms:g} ms there are 6" in found.sentence
-    assert ("begin it at 3.5 ms or later" in found.sentence) == (until_ms > 2)
+    assert f"from 0 to {until_ms:g} ms there are 6" in found.message
+    assert ("begin it at 3.5 ms or later" in found.message) == (until_ms > 2)
 
 
 def test_a_strong_response_is_no_artefact() -> None:
     assert "artefact-spikes" not in findings(answering({5: 60.0, 10: 90.0}))
-    assert "artefact-spikes" not in findings(MadeUpCulture(seed=2).record(0.0))
+    assert "artefact-spikes" not in findings(SyntheticCulture(seed=2).record(0.0))
 
 
 @pytest.mark.parametrize("peak_ms", [2.6, 3.0, 4.0])
@@ -72,7 +72,7 @@ def test_an_early_and_sharp_response_is_no_artefact_and_hides_none(peak_ms: floa
     artefact = [(t + 1e-3 * rng.uniform(0, 0.5), c) for t in source.stimuli.time_s for c in range(5)]
     found = findings(with_spikes(source, np.vstack([response, artefact])))["artefact-spikes"]
     assert found.severity == "note"
-    assert "from 0 to 0.5 ms there are 5" in found.sentence
+    assert "from 0 to 0.5 ms there are 5" in found.message
 
 
 @pytest.mark.parametrize("hit", [1, 2])
@@ -92,7 +92,7 @@ def test_a_blanked_stretch_is_told_from_a_quiet_culture(until_ms: float, severit
     since = since_ms(source, spikes[:, 0])
     found = findings(with_spikes(source, spikes[(since < -3) | (since > until_ms)]))["blanked-window"]
     assert found.severity == severity
-    assert f"from -3 to {until_ms:g} ms around a stimulus next to nothing" in found.sentence
+    assert f"from -3 to {until_ms:g} ms around a stimulus next to nothing" in found.message
     assert found.value == pytest.approx(max(until_ms - 2, 0) / 8, abs=0.08)
     assert "blanked-window" not in findings(source)
 
@@ -111,10 +111,10 @@ def test_a_condition_whose_window_is_dead_is_told_though_the_others_respond() ->
     found = findings(recording(kept, stimulus_s, 20, 101.0, frequency_hz=frequency_hz))
     assert "dead-window" not in found
     assert found["dead-condition"].severity == "warning"
-    assert "5 Hz (" in found["dead-condition"].sentence
-    assert "10 Hz (" not in found["dead-condition"].sentence
+    assert "5 Hz (" in found["dead-condition"].message
+    assert "10 Hz (" not in found["dead-condition"].message
     assert found["dead-condition"].value == pytest.approx(0.9, abs=0.2)
-    assert "its response is at 30 to 80 ms" in found["dead-condition"].sentence
+    assert "its response is at 30 to 80 ms" in found["dead-condition"].message
 
 
 def drifting(change: float, blocked: bool, seed: int = 0) -> Recording:
@@ -137,7 +137,7 @@ def test_drift_within_a_recording(change: float, blocked: bool) -> None:
     assert found.severity == "warning"
     # Over the time that a condition is presented for: in blocks of two, half of the recording.
     assert found.value == pytest.approx(change / 2 if blocked else change, abs=0.15)
-    assert ("responses rise by" in found.sentence) == (change > 0)
+    assert ("responses rise by" in found.message) == (change > 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -151,7 +151,7 @@ def test_channels_that_fire_as_no_neurons_do() -> None:
     hum = np.column_stack([np.arange(0, 10, 0.008), np.full(1250, 39)])
     found = {f.name: f for f in noticed(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
     assert (found["noisy-channels"].severity, found["noisy-channels"].value) == ("warning", 1)
-    assert "1 of 40 channels (39) fire as no neurons do and hold 76 % of all spikes" in found["noisy-channels"].sentence
+    assert "1 of 40 channels (39) fire as no neurons do and hold 76 % of all spikes" in found["noisy-channels"].message
     assert (found["silent-channels"].severity, found["silent-channels"].value) == ("note", 9)
     found = {f.name: f for f in noticed(recording(usual[:20], [1], 40, 10.0))}
     assert found["silent-channels"].severity == "warning"
@@ -163,7 +163,7 @@ def test_the_organoid_on_a_maxone_can_be_used_with_care(real_data: Path) -> None
     found = {f.name: f for f in inspection.findings}
     assert inspection.verdict == "usable with care"
     assert found["blanked-window"].severity == "note"
-    assert "to 3 ms around a stimulus next to nothing was recorded" in found["blanked-window"].sentence
+    assert "to 3 ms around a stimulus next to nothing was recorded" in found["blanked-window"].message
     assert "artefact-spikes" not in found
 
 
@@ -172,5 +172,5 @@ def test_brainoware_cannot_be_used_in_the_papers_window(real_data: Path) -> None
     found = {f.name: f for f in inspection.findings}
     assert inspection.verdict == "not usable"
     assert found["dead-window"].severity == "refuse"
-    assert "an artefact counted as spikes" in found["artefact-spikes"].sentence
+    assert "an artefact counted as spikes" in found["artefact-spikes"].message
     assert found["artefact-spikes"].severity == "warning"

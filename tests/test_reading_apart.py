@@ -12,14 +12,14 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings import apart
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("apart") / "a.nwb"
-    write_nwb(make_up_recording(5, patterns=4, channels=16, start_min=20.0), file)
+    write_nwb(synthetic_recording(5, patterns=4, channels=16, start_min=20.0), file)
     return file
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.recordings.made_up import MadeUpCulture
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.response_table import ResponseTable
+from animat.recordings.synthetic import SyntheticCulture
 from animat.responses.extraction import extract_responses, responses_of
 from animat.responses.readouts import ALL, Readouts, count_readouts, read_readouts, readouts_on
 from animat.responses.series import extract_series
@@ -24,7 +24,7 @@ WINDOW_MS = (2.0, 10.0)
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    return MadeUpCulture(1, patterns=12, channels=32, burst_share=0.1).record()
+    return SyntheticCulture(1, patterns=12, channels=32, burst_share=0.1).record()
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_responses_that_are_chosen_keep_their_readouts(recording: Recording, hal
     some = responses.only([3, 1])
     np.testing.assert_array_equal(some.read_of(0), responses.read_of(3))
     # Each response that is drawn anew is one of its condition, with both of its readouts.
-    anew = responses.redrawn(np.random.default_rng(0))
+    anew = responses.bootstrapped(np.random.default_rng(0))
     for condition in range(len(responses.conditions)):
         known = set(map(tuple, responses.read_of(condition).tolist()))
         assert set(map(tuple, anew.read_of(condition).tolist())) <= known

@@ -1,4 +1,4 @@
-"""Predicted against lived return: what is in the table is what the simulator and the session say."""
+"""Predicted against measured return: what is in the table is what the simulator and the session say."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from animat.cli import main
-from animat.closed_loop.contenders import HandMadeRule
-from animat.closed_loop.following import Following
+from animat.closed_loop.adaptive import AdaptiveThresholds
+from animat.closed_loop.agents import HeuristicController
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -28,13 +28,13 @@ from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.verdict import Beside
 from animat.neurons.kinds import Kind
-from animat.neurons.made_up import LABELS, MEANS_HZ
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
+from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
@@ -54,7 +54,7 @@ from animat.training.policy import Policy
 from animat.wrappers import ShuffledDelivery
 from fake_culture import FakeCulture
 
-PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=40, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def series(recordings: list[Recording]) -> list[Responses]:
 def policy_of(seed: int, series: list[Responses], robot: Robot[Any] | None = None, **changed: Any) -> Policy:
     rng = np.random.default_rng(seed)
     robot = robot or Navigation(episode_limit=8)
-    inputs = len(robot.quantities)
+    inputs = len(robot.observation_spec)
     sizes = ((inputs, 16), (16, 16), (16, 5))
     given: dict[str, Any] = {
         "weights": tuple(rng.standard_normal(s).astype(np.float32) for s in sizes),
@@ -105,39 +105,39 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
     """A run with random stimuli as its only control, its policies and what was told."""
     told: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("animat.reality_gap.calibration.REDRAWN", 4)
-        return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, tell=told.append), told
+        patch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
+        return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=told.append), told
 
 
 def test_the_table_holds_what_the_simulator_and_the_session_say(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.reality_gap.calibration.REDRAWN", 40)
+    monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 40)
     gap, policies = run(tmp_path, series)
     rows = {row.name: row for row in gap.rows}
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
-    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "made by hand"]
+    assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "heuristic"]
     assert gap.session.ending.by == "plan"
     assert gap.findings == Calibration.of_series(series).findings
 
-    lived: dict[str, list[float]] = {}
+    measured: dict[str, list[float]] = {}
     for tick in read_session(tmp_path).ticks:
-        if tick.handled == "lead-in":
+        if tick.handled == "warm-up":
             continue
         assert tick.reward is not None
-        episodes = lived.setdefault(tick.contender, [])
+        episodes = measured.setdefault(tick.agent, [])
         if tick.iteration == 0:
             episodes.append(0.0)
         episodes[-1] += tick.reward
-    for name, returns in lived.items():
-        np.testing.assert_allclose(rows[name].lived, returns)
+    for name, returns in measured.items():
+        np.testing.assert_allclose(rows[name].measured, returns)
         assert len(returns) == 4
-    np.testing.assert_allclose(np.sort(rows["policies"].lived), np.sort(lived["p0"] + lived["p1"]))
+    np.testing.assert_allclose(np.sort(rows["policies"].measured), np.sort(measured["p0"] + measured["p1"]))
 
     calibration = Calibration.of_series(series)
     environment = Animat(policies["p0"].robot, Thresholds(1), 5)
     both = networks_of(list(policies.values()), greedy=True)
-    simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.redrawn]
+    simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.bootstraps]
     rolled = [
         roll_out(environment, simulator, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, i))
         for i, simulator in enumerate(simulators)
@@ -162,23 +162,24 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
         error = np.hypot(*(each.std() / np.sqrt(each.size) for each in (returns, rows[name].predicted)))
         assert abs(returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
-    limit = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
-    assert gap.limit == pytest.approx(limit)
-    won = rows["policies"].lived.mean() - rows["policies"].predicted.mean()
-    assert gap.gap_share == pytest.approx(won / (limit - rows["random"].predicted.mean()))
-    assert gap.session.log.header["contenders"][-2]["in_turn"] == ["p0", "p1"]
-    # A silent culture commands -1 throughout; the robot of the test has no noise: one return, and it is lived too.
+    optimum = best_return(environment, calibration.simulator, resolution=0.5, episodes=0).value
+    assert gap.optimum == pytest.approx(optimum)
+    won = rows["policies"].measured.mean() - rows["policies"].predicted.mean()
+    assert gap.gap_share == pytest.approx(won / (optimum - rows["random"].predicted.mean()))
+    assert gap.session.log.header["agents"][-2]["in_turn"] == ["p0", "p1"]
+    # A silent culture commands -1 throughout; the robot of the test has no noise: one return, predicted and measured.
     assert np.ptp(rows["silent"].predicted) == 0
     assert rows["silent"].pulses_per_action == 0
     assert all(row.pulses_per_action == 2 for row in gap.rows if row.name != "silent")
 
     for row in gap.rows[3:]:
-        expected = mannwhitneyu(rows["policies"].lived, row.lived, alternative="two-sided", method="asymptotic")
+        expected = mannwhitneyu(rows["policies"].measured, row.measured, alternative="two-sided", method="asymptotic")
         assert row.beside is not None
         assert row.beside.p == pytest.approx(min(1.0, expected.pvalue))
-        assert row.beside.wins == pytest.approx(expected.statistic / (len(rows["policies"].lived) * len(row.lived)))
+        pairs = len(rows["policies"].measured) * len(row.measured)
+        assert row.beside.wins == pytest.approx(expected.statistic / pairs)
     for row in gap.rows:
-        assert row.gap.value == pytest.approx(row.lived.mean() - row.predicted.mean())
+        assert row.gap.value == pytest.approx(row.measured.mean() - row.predicted.mean())
         assert row.gap.low <= row.gap.value + 1e-9
         assert row.gap.value <= row.gap.high + 1e-9
     told = json.loads(json.dumps(gap.to_dict()))
@@ -190,7 +191,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     assert gap.verdict() in text
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     tmp_path: Path, series: list[Responses]
 ) -> None:
@@ -199,13 +200,13 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     with FakeCulture() as culture:
         gap = run_policies({"p0": policy_of(0, series)}, culture, few, tmp_path, episodes=1, with_controls=False)
     told = json.loads(json.dumps(gap.to_dict()))
-    assert (told["limit"], told["gap_share"]) == (None, None)
-    (sentence,) = [finding.sentence for finding in gap.findings if finding.name == "no-limit"]
-    assert sentence == "no optimal return: these conditions have too few responses: 80 Hz (3)"
-    assert sentence in gap.to_text() and "optimal return on this" not in gap.to_text()
+    assert (told["optimum"], told["gap_share"]) == (None, None)
+    (message,) = [finding.message for finding in gap.findings if finding.name == "no-optimum"]
+    assert message == "no optimal return: these conditions have too few responses: 80 Hz (3)"
+    assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,9 +233,9 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     gap, _ = run(tmp_path, series, with_controls=False)
     policies, *each, random = gap.rows
 
-    def verdict(p: float, wins: float, lived: float) -> str:
+    def verdict(p: float, wins: float, measured: float) -> str:
         control = replace(random, beside=Beside(p, wins, 20, 20))
-        rows = (replace(policies, lived=np.full(20, lived)), *each, control)
+        rows = (replace(policies, measured=np.full(20, measured)), *each, control)
         return replace(gap, rows=rows).verdict()
 
     high = float(policies.predicted.max()) + 1
@@ -243,43 +244,43 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     at = float(policies.predicted.mean())
     assert verdict(0.001, 0.9, at).endswith("of the pairs of episodes or more)")
     looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, how often"
-    for lived, less in ((at - 1e3, "less"), (at + 1e3, "more")):
+    for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         told = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
             "(looked for: "
         )
-        assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, lived)
-    uncertain = replace(gap, rows=(replace(policies, lived=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
+        assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, measured)
+    uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
         f"; their measured return is 20.0 less than predicted, within what the recording's {gap.responses} responses "
         "and 10 episodes can tell"
     )
     reasons = (Finding("a", "note", "it rained"), Finding("b", "note", "it snowed"))
-    explained = replace(gap, rows=(replace(policies, lived=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
+    explained = replace(gap, rows=(replace(policies, measured=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
     assert explained.verdict().endswith("less than predicted: it rained; it snowed")
     assert [each["name"] for each in explained.to_dict()["reasons"]] == ["a", "b"]
 
 
-def test_what_policies_were_answered_is_as_the_log_and_the_followed_median_have_it(without_controls: Ran) -> None:
+def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_it(without_controls: Ran) -> None:
     gap, policies, told = without_controls
     assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
-    assert gap.loop.following is not None
-    following, p50_hz, passed = Following(gap.loop.following), gap.loop.percentiles[5], []
-    ticks, episode = [tick for tick in gap.session.ticks if tick.contender in policies], -1
+    assert gap.loop.adaptive_from is not None
+    thresholds, p50_hz, passed = AdaptiveThresholds(gap.loop.adaptive_from), gap.loop.percentiles[5], []
+    ticks, episode = [tick for tick in gap.session.ticks if tick.agent in policies], -1
     for tick in gap.session.ticks:
         if tick.episode != episode:
-            episode, p50_hz = tick.episode, following.percentiles()[5] if following.seen else p50_hz
-        if tick.contender in policies:
+            episode, p50_hz = tick.episode, thresholds.percentiles()[5] if thresholds.seen else p50_hz
+        if tick.agent in policies:
             passed.append(tick.rate_hz >= p50_hz)
         if not tick.is_burst:
-            following.add(tick.delivered, tick.rate_hz)
+            thresholds.add(tick.delivered, tick.rate_hz)
     found = answered(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.passed, passed)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
     np.testing.assert_array_equal(found.responses.rate_hz, [tick.rate_hz for tick in ticks])
     np.testing.assert_array_equal(found.responses.time_s, [tick.read_after_s for tick in ticks])
     np.testing.assert_array_equal(found.late_s, [tick.late_s for tick in ticks])
-    np.testing.assert_allclose(np.sort(found.returns), np.sort(gap.rows[0].lived))
+    np.testing.assert_allclose(np.sort(found.returns), np.sort(gap.rows[0].measured))
     rewards = np.bincount(found.episode, [tick.reward or 0.0 for tick in ticks])
     np.testing.assert_allclose(rewards, found.returns)
     assert found.passes.presented.sum() == len(ticks)
@@ -309,38 +310,38 @@ def test_a_policy_may_have_the_name_of_a_control_that_is_not_run(tmp_path: Path,
     assert gap.rows[0].pulses_per_action == 2
 
 
-def test_what_was_not_lived_is_named(without_controls: Ran) -> None:
+def test_what_was_not_measured_is_named(without_controls: Ran) -> None:
     gap = without_controls[0]
     policies, *others = gap.rows
     none = np.empty(0)
-    no_controls = replace(gap, rows=(policies, *(replace(row, lived=none, beside=None) for row in others)))
+    no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, beside=None) for row in others)))
     assert no_controls.verdict().startswith("no control ran to its end")
-    no_policy = replace(gap, rows=(replace(policies, lived=none), *(replace(row, beside=None) for row in others)))
+    no_policy = replace(gap, rows=(replace(policies, measured=none), *(replace(row, beside=None) for row in others)))
     assert no_policy.verdict().startswith("no episode of a policy ran to its end")
 
 
 @pytest.mark.oracle
-def test_a_prediction_with_memory_is_told_to_lack_a_lead_in(tmp_path: Path, series: list[Responses]) -> None:
+def test_a_prediction_with_memory_is_told_to_lack_a_warm_up(tmp_path: Path, series: list[Responses]) -> None:
     remembering = Calibration.of_series(series, kind="memory")
     policies = {"p0": policy_of(0, series)}
-    for pulses, lead_in, told in ((1, 0, True), (1, 1, False), (2, 0, False)):
+    for pulses, warm_up, told in ((1, 0, True), (1, 1, False), (2, 0, False)):
         with FakeCulture() as culture:
             gap = run_policies(
                 policies,
                 culture,
                 remembering,
-                tmp_path / f"{pulses}-{lead_in}",
+                tmp_path / f"{pulses}-{warm_up}",
                 episodes=1,
                 with_controls=False,
                 pulses=pulses,
-                lead_in=lead_in,
+                warm_up=warm_up,
             )
-        assert ("no-lead-in" in {finding.name for finding in gap.findings}) == told
+        assert ("no-warm-up" in {finding.name for finding in gap.findings}) == told
 
 
 def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> None:
     gap = without_controls[0]
-    row = replace(gap.rows[0], lived=gap.rows[0].lived[:1] - 100)
+    row = replace(gap.rows[0], measured=gap.rows[0].measured[:1] - 100)
     assert (row.gap.low, row.gap.high) == (-np.inf, np.inf)
     alone = replace(gap, rows=(row, *gap.rows[1:]))
     assert "less than predicted" not in alone.verdict()
@@ -350,31 +351,37 @@ def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> 
 
 
 @pytest.mark.oracle
-def test_held_percentiles_are_the_same_whatever_is_redrawn(tmp_path: Path, series: list[Responses]) -> None:
+def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
-    moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.redrawn}
+    moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.bootstraps}
     assert len(moving) > 50
-    held = calibration.holding(calibration.simulator.percentiles)
-    for each in (held.simulator, *held.redrawn):
+    fixed = calibration.with_percentiles(calibration.simulator.percentiles)
+    for each in (fixed.simulator, *fixed.bootstraps):
         np.testing.assert_array_equal(each.percentiles, calibration.simulator.percentiles)
     policy = policy_of(0, series, provenance={"training": {"percentiles": "first"}})
     first = Calibration.of_series(series, policy, at_min=series[-1].start_min)
-    for each in (first.simulator, *first.redrawn):
+    for each in (first.simulator, *first.bootstraps):
         np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
-    for follow in (True, False):
+    for adaptive in (True, False):
         with FakeCulture() as culture:
-            lived = run_policies(
-                {"p": policy}, culture, first, tmp_path / str(follow), episodes=1, with_controls=False, follow=follow
+            gap = run_policies(
+                {"p": policy},
+                culture,
+                first,
+                tmp_path / str(adaptive),
+                episodes=1,
+                with_controls=False,
+                adaptive=adaptive,
             )
-        assert ("moving-percentiles" in [finding.name for finding in lived.findings]) == follow
-    gap, _ = run(tmp_path / "held", series, with_controls=False, follow=False)
-    other, _ = run(tmp_path / "follow", series, with_controls=False, follow=True)
+        assert ("moving-percentiles" in [finding.name for finding in gap.findings]) == adaptive
+    gap, _ = run(tmp_path / "fixed", series, with_controls=False, adaptive=False)
+    other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
     assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
     np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[0].predicted)
 
 
 @pytest.mark.oracle
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
     tmp_path: Path, series: list[Responses]
 ) -> None:
@@ -390,9 +397,9 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
                 episodes=1,
                 with_controls=False,
             )
-        warnings = [f.sentence for f in gap.findings if f.name == "no-memory"]
+        warnings = [f.message for f in gap.findings if f.name == "no-memory"]
         assert len(warnings) == warned
-        assert all("66 %" in sentence and "--simulator memory" in sentence for sentence in warnings)
+        assert all("66 %" in message and "--simulator memory" in message for message in warnings)
         assert not any(f.name == "other-simulator" for f in gap.findings)
     trained = {"simulators": {"kind": "empirical", "bins": None, "range_hz": None}}
     with FakeCulture() as culture:
@@ -400,14 +407,14 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
         gap = run_policies(
             {"p": policy}, culture, Calibration.of_series(found), tmp_path / "other", episodes=1, with_controls=False
         )
-    (other,) = (f.sentence for f in gap.findings if f.name == "other-simulator")
+    (other,) = (f.message for f in gap.findings if f.name == "other-simulator")
     assert "kind empirical, here memory" in other
     with pytest.raises(Mismatch, match="the same fitted as p"):
         check_policies({"p": policy, "q": policy_of(0, series)})
 
 
 def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
-    """n made-up responses to each of five conditions; of culture and recording alike."""
+    """n synthetic responses to each of five conditions; of culture and recording alike."""
     return Responses(
         condition=np.repeat(np.arange(5), n),
         rate_hz=np.concatenate([rng.gamma(6, mean_hz / 6, n) for mean_hz in MEANS_HZ]),
@@ -422,12 +429,12 @@ def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
 
 
 @pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])
-def test_simulators_of_redrawn_responses_have_the_shape_of_the_recordings(kind: Kind, few_redrawn: None) -> None:
+def test_simulators_of_bootstrapped_responses_have_the_recordings_shape(kind: Kind, few_bootstraps: None) -> None:
     rng = np.random.default_rng(1)
     series = [drawn_responses(rng, 40), replace(drawn_responses(rng, 90), start_min=10.0)]
     calibration = Calibration.of_series(series, at_min=0.0, kind=kind)
     shapes = {
-        tuple(leaf.shape for leaf in jax.tree.leaves(each)) for each in (calibration.simulator, *calibration.redrawn)
+        tuple(leaf.shape for leaf in jax.tree.leaves(each)) for each in (calibration.simulator, *calibration.bootstraps)
     }
     assert len(shapes) == 1
 
@@ -439,12 +446,12 @@ def test_no_two_roll_outs_have_the_same_draws() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("mapping", "held"),
+    ("mapping", "fixed"),
     [(Thresholds(1), False), (Thresholds(9), False), (Thresholds(1), True), (Linear(), True)],
-    ids=["1 threshold", "9 thresholds", "1 threshold, held", "linear, held"],
+    ids=["1 threshold", "9 thresholds", "1 threshold, fixed", "linear, fixed"],
 )
 def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
-    mapping: Mapping, held: bool, series: list[Responses], tmp_path: Path
+    mapping: Mapping, fixed: bool, series: list[Responses], tmp_path: Path
 ) -> None:
     """A culture that does answer as its recording's distribution says, and 100 responses of it in each recording."""
     gap, _ = run(tmp_path, series, with_controls=False)
@@ -452,7 +459,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     rng = np.random.default_rng(5)
     environment = Animat(Cartpole(), mapping, 5)
     culture = fit_empirical(drawn_responses(rng, 50_000))
-    rule = hand_made(environment, culture)
+    rule = heuristic_policy(environment, culture)
 
     def returns(simulator: NeuronSimulator, episodes: int, seed: int) -> np.ndarray:
         return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()
@@ -461,16 +468,16 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     for seed in range(recordings):
         calibration = Calibration.of_series([drawn_responses(rng, 100)])
         living = culture
-        if held:
+        if fixed:
             percentiles = calibration.simulator.percentiles
-            calibration, living = calibration.holding(percentiles), replace(culture, percentiles=percentiles)
+            calibration, living = calibration.with_percentiles(percentiles), replace(culture, percentiles=percentiles)
         row = replace(
             gap.rows[0],
             predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),
             predicted_anew=np.array(
-                [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.redrawn)]
+                [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.bootstraps)]
             ),
-            lived=returns(living, 40, 1000 + seed),
+            measured=returns(living, 40, 1000 + seed),
         )
         covered += row.gap.low <= 0 <= row.gap.high
     # 114 of 120, standard deviation 2.4.
@@ -481,19 +488,21 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
 def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
     rng, widths = np.random.default_rng(3), []
     environment = Animat(Cartpole(), Thresholds(1), 5)
-    rule = hand_made(environment, fit_empirical(drawn_responses(rng, 5_000)))
+    rule = heuristic_policy(environment, fit_empirical(drawn_responses(rng, 5_000)))
     for n in (50, 800):
         calibration = Calibration.of_series([drawn_responses(rng, n)])
-        means = [roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.redrawn]
+        means = [
+            roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.bootstraps
+        ]
         widths.append(np.std(means))
-        percentiles = [np.asarray(s.percentiles) for s in calibration.redrawn]
+        percentiles = [np.asarray(s.percentiles) for s in calibration.bootstraps]
         assert np.ptp(percentiles, axis=0).min() > 0
     # As the square root of sixteen times as many.
     assert 2.5 < widths[0] / widths[1] < 6
 
 
-@pytest.mark.usefixtures("few_redrawn")
-def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
+@pytest.mark.usefixtures("few_bootstraps")
+def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[Responses]) -> None:
     simulator = Calibration.of_series(series).simulator
     rng = np.random.default_rng(1)
     for robot, low, high in (
@@ -501,13 +510,13 @@ def test_the_hand_made_rule_is_the_same_on_simulator_and_culture(series: list[Re
         (Navigation(), [0, 0, -np.pi], [1, 1, np.pi]),
     ):
         environment: Animat[Any] = Animat(robot, Thresholds(1), 5)
-        rule = hand_made(environment, simulator)
+        rule = heuristic_policy(environment, simulator)
         assert int(np.argmax(rule.means)) == 4
         observed = rng.uniform(low, high, (500, len(low)))
         rule = jax.tree.map(lambda x: x[0], rule)
         predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
-        lived = [HandMadeRule(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
-        np.testing.assert_array_equal(np.asarray(predicted), lived)
+        chosen = [HeuristicController(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
+        np.testing.assert_array_equal(np.asarray(predicted), chosen)
 
 
 @pytest.mark.oracle
@@ -533,7 +542,7 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     )
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 @pytest.mark.parametrize(("rest_min", "warned"), [(20.0, False), (45.0, True)])
 def test_a_recording_much_older_than_the_culture_is_said_to_be(
     tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
@@ -549,7 +558,7 @@ def test_a_recording_much_older_than_the_culture_is_said_to_be(
     assert [finding.value for finding in found] == ([pytest.approx(age_min)] if warned else [])
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     one, other = policy_of(0, series), policy_of(0, series, presentation=Presentation("mixed", 5))
@@ -562,24 +571,24 @@ def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series
         with pytest.raises(Mismatch, match="80 Hz, 40 Hz"):
             run_policies({"a": wrong}, culture, calibration, tmp_path)
         gap = run_policies({"b": other}, culture, calibration, tmp_path, episodes=1, with_controls=False)
-    assert "from a recording presented mixed, 2 pulses" in gap.findings[0].sentence
+    assert "from a recording presented mixed, 2 pulses" in gap.findings[0].message
     assert gap.loop.pulses == 5
 
 
-@pytest.mark.usefixtures("few_redrawn")
-def test_a_budget_that_ends_early_leaves_what_was_lived(tmp_path: Path, series: list[Responses]) -> None:
+@pytest.mark.usefixtures("few_bootstraps")
+def test_a_budget_that_ends_early_leaves_what_was_measured(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, account=Account(Budget(pulses=60)), with_controls=False)
     assert gap.session.ending.by == "budget"
     assert gap.account.pulses <= 60
-    assert sum(len(row.lived) for row in gap.rows[1:]) < 12
+    assert sum(len(row.measured) for row in gap.rows[1:]) < 12
     assert "60 pulses" in gap.to_text()
     gap, _ = run(tmp_path / "none", series, account=Account(Budget(pulses=0)), with_controls=False)
-    assert all(len(row.lived) == 0 for row in gap.rows)
-    assert gap.to_dict()["rows"][0]["lived"] is None
+    assert all(len(row.measured) == 0 for row in gap.rows)
+    assert gap.to_dict()["rows"][0]["measured"] is None
     gap.to_text()
 
 
-@pytest.mark.usefixtures("few_redrawn")
+@pytest.mark.usefixtures("few_bootstraps")
 class TestCommand:
     """`animat run` and `animat recover`, on a replay of recordings: quick, and with no culture but theirs."""
 
@@ -613,7 +622,7 @@ class TestCommand:
         told = json.loads(printed.out.splitlines()[-1])
         assert len(told["rows"]) == 12
         assert told["session"]["ended_by"] == "plan"
-        assert "made by hand" in printed.out
+        assert "heuristic" in printed.out
         (folder / "session" / "session.nwb").unlink()
         assert main(["recover", str(folder / "session"), "--json"]) == 0
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == told["session"]["ticks"]
@@ -734,8 +743,8 @@ class TestCommand:
             (["--seed", "-1"], "--seed: expected 0 or more"),
             (["--pulses", "0"], "pulses: expected at least 1"),
             (["--pause-s", "-1"], "pause_s: expected a finite number from 0"),
-            (["--lead-in", "-1"], "lead_in: expected a whole number from 0 to 100, got -1"),
-            (["--lead-in", "101"], "lead_in: expected a whole number from 0 to 100, got 101"),
+            (["--warm-up", "-1"], "warm_up: expected a whole number from 0 to 100, got -1"),
+            (["--warm-up", "101"], "warm_up: expected a whole number from 0 to 100, got 101"),
             (["--patience-s", "nan"], "patience_s: expected a finite number from 0"),
             (["--patience-s", "0"], "patience_s: expected above 0 s"),
             (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),

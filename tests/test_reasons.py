@@ -1,4 +1,4 @@
-"""Why a return differs from its prediction: each reason is named where made-up sessions have it, and else rarely."""
+"""Why a return differs from its prediction: each reason is named where synthetic sessions have it, and else rarely."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EVERY = np.arange(EPISODES * ACTIONS)
 
 
 def session(seed: int, *, gap: int = -1, **changed: Any) -> Evidence:
-    """A made-up one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
+    """A synthetic one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
     one condition more or less; what is told of it is changed by functions of the arrays."""
     rng = np.random.default_rng(seed)
     recorded = rng.normal(MEANS_HZ[:, None], 4.0, (2, RECORDED))
@@ -95,7 +95,7 @@ def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "presentation": (
         {"calibration": {"presentation": Presentation("blocked", 1)}},
-        "the recording was presented blocked, 1 pulse a presentation, the loop mixed, 1 pulse a presentation",
+        "the recording was presented blocked, 1 pulse a trial, the loop mixed, 1 pulse a trial",
     ),
     "few-samples": (
         {"calibration": {"responses_hz": (np.ones(7), np.full(200, 14.0))}},
@@ -103,7 +103,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "lateness": (
         {"late_s": lambda condition, _: np.where(condition == 1, 0.0026, 0.0)},
-        "pulses came late: 80 Hz in 100 % of its presentations, by 2.6 ms of its 12.5 on average",
+        "pulses came late: 80 Hz in 100 % of its trials, by 2.6 ms of its 12.5 on average",
     ),
     "bursts": (
         {"is_burst": lambda *_: EVERY % 10 == 0},
@@ -124,7 +124,7 @@ def test_a_reason_is_named_with_its_number_where_the_session_has_it(name: str) -
     assert len(CASES) == len(CHECKS)
     others = []
     for seed in range(20):
-        named = {found.name: found.sentence for found in reasons(session(seed, **changed))}
+        named = {found.name: found.message for found in reasons(session(seed, **changed))}
         assert words in named.pop(name)
         # What is changed may show in the share that passes P50 too.
         others += [other for other in named if other != "answers"]
@@ -210,6 +210,6 @@ def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
     assert check(on_halves(same, same)) is None
     found, alone = check(on_halves(same, other)), check(other)
     assert found is not None and alone is not None
-    assert "80 Hz on right in " in found.sentence and "on left" not in found.sentence
+    assert "80 Hz on right in " in found.message and "on left" not in found.message
     # What is told of it is what would be told of it alone.
-    assert found.sentence.replace(" on right", "") == alone.sentence
+    assert found.message.replace(" on right", "") == alone.message

@@ -17,27 +17,27 @@ from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
 from animat.cultures.series import check_interval
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.schedule import make_schedule
 
 PATTERNS = np.arange(500).reshape(100, 5)
-MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, presentations=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)
+MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, trials=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)
 
 
 @pytest.fixture(scope="module")
-def made_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("made-up") / "made-up.nwb"
-    write_nwb(make_up_recording(1, patterns=6, channels=16), file)
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("synthetic") / "synthetic.nwb"
+    write_nwb(synthetic_recording(1, patterns=6, channels=16), file)
     return file
 
 
 @pytest.fixture
-def replayed(made_up: Path, tmp_path: Path) -> list[str]:
-    """The command that records a replay of a made-up recording, as far as the protocol."""
-    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(made_up), "--out",
+def replayed(synthetic: Path, tmp_path: Path) -> list[str]:
+    """The command that records a replay of a synthetic recording, as far as the protocol."""
+    return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(synthetic), "--out",
             str(tmp_path / "out")]  # fmt: skip
 
 
@@ -49,7 +49,7 @@ def test_a_culture_is_recorded_as_the_file_says(
     (file,) = json.loads(capsys.readouterr().out.splitlines()[-1])["recordings"]
     recording = read_recording(file)
     assert recording.protocol == MINE
-    assert str(recording.presentation) == "mixed, 3 pulses a presentation"
+    assert str(recording.presentation) == "mixed, 3 pulses a trial"
     frequency_hz, times = np.unique(recording.stimuli.frequency_hz, return_counts=True)
     assert (frequency_hz.tolist(), times.tolist()) == ([5.0, 40.0], [6, 6])
     assert recording.stimuli.time_s[0] == pytest.approx(3.0)
@@ -64,10 +64,10 @@ def test_a_culture_is_recorded_as_the_file_says(
 
 def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path: Path) -> None:
     """Patterns are as many as the culture has, which a replay of six has fewer of than usual; order and pulses too."""
-    (tmp_path / "mine.json").write_text('{"presentations": 6}')
+    (tmp_path / "mine.json").write_text('{"trials": 6}')
     assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 0
     recording = read_recording(tmp_path / "out" / "recording_0000_min.nwb")
-    assert recording.protocol == Protocol(patterns=6, presentations=6, pulse=pulse_for("replay"))
+    assert recording.protocol == Protocol(patterns=6, trials=6, pulse=pulse_for("replay"))
 
 
 def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +80,7 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
     assert main(["record", "--pulses", "5", "--out", str(tmp_path / "out")]) == 0
     assert main(["record", "--out", str(tmp_path / "out")]) == 0
     assert main(["record", "--paper", "--out", str(tmp_path / "out")]) == 0
-    mixed = Protocol(order="mixed", presentations=500)
+    mixed = Protocol(order="mixed", trials=500)
     # What a file leaves out is the paper's.
     assert asked == [Protocol((5, 20), setup_s=0), replace(mixed, pulses=5), mixed, Protocol()]
 
@@ -104,7 +104,7 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
         ('{"pulses": 0}', [], "mine.json: pulses: expected at least 1"),
         ('{"setup_s": 700}', ["--sessions", "2"], "interval_min: expected at least"),
         (MINE.to_json(), ["--order", "mixed"], "--protocol: expected it alone, got --order too"),
-        (MINE.to_json(), ["--pulses", "1", "--presentations", "100"], "got --pulses, --presentations too"),
+        (MINE.to_json(), ["--pulses", "1", "--trials", "100"], "got --pulses, --trials too"),
     ],
 )
 def test_what_cannot_be_is_one_line_before_a_culture_is_opened(
@@ -155,9 +155,9 @@ def test_pulses_faster_than_the_response_window_are_warned_of(
         ({"interval_min": 7.0, "paper": True}, 7.0),
         ({"paper": True}, 10.0),
         ({"protocol": Path("mine.json")}, 10.0),
-        ({"presentations": 800}, 10.0),
+        ({"trials": 800}, 10.0),
         ({"places": "halves"}, 10.0),
-        ({"culture": "made-up"}, 10.0),
+        ({"culture": "synthetic"}, 10.0),
     ],
 )
 def test_recordings_are_as_far_apart_as_the_usual_ones_take(options: dict[str, Any], interval_min: float) -> None:
@@ -169,12 +169,12 @@ def test_halves_fit_into_the_usual_interval() -> None:
     check_interval(record._protocol(), 2, record._interval_min)
 
 
-def test_made_up_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_synthetic_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.json").write_text(MINE.to_json())
-    command = ["record", "--culture", "made-up", "--out", str(tmp_path / "out")]
+    command = ["record", "--culture", "synthetic", "--out", str(tmp_path / "out")]
     for more in (["--protocol", str(tmp_path / "mine.json")], ["--pulses", "0"], ["--order", "mixed"]):
         assert main([*command, *more]) == 1
-        assert "--protocol: made-up recordings are blocked" in capsys.readouterr().err
+        assert "--protocol: synthetic recordings are blocked" in capsys.readouterr().err
 
 
 def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Pa
     assert set(json.loads(example)) == set(json.loads(protocol.to_json()))
     assert protocol.pulse == BALANCED_PULSE
     schedule = make_schedule(protocol, PATTERNS, seed=1)
-    stimulated_s = sum(protocol.pulses * protocol.presentations / f for f in protocol.frequencies_hz)
+    stimulated_s = sum(protocol.pulses * protocol.trials / f for f in protocol.frequencies_hz)
     told = re.search(r"([\d,]+)\s+pulses, ([\d.]+) s of stimulation, ([\d.]+) s with set-up and pause", page)
     assert told is not None
     pulses, stimulated, whole = told.groups()

@@ -146,7 +146,7 @@ def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
     with pytest.raises(InvalidArgument, match="protocol: expected JSON"):
         from_words({"protocol": "mixed"})
     found = noticed(recording(findings=noted))
-    assert [(f.name, f.severity, f.sentence) for f in found[:2]] == [
+    assert [(f.name, f.severity, f.message) for f in found[:2]] == [
         ("a-thing", "warning", "something: odd"),
         ("another", "note", "less odd"),
     ]

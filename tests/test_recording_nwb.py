@@ -15,9 +15,9 @@ from hypothesis.extra import numpy as npst
 
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import read_nwb, write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
@@ -68,8 +68,8 @@ def recordings(draw: st.DrawFn, max_channels: int = 6) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def made_up() -> Recording:
-    return make_up_recording(3, start_min=20.0, patterns=12, channels=32)
+def synthetic() -> Recording:
+    return synthetic_recording(3, start_min=20.0, patterns=12, channels=32)
 
 
 @FEW
@@ -95,7 +95,7 @@ def test_a_recording_of_205_000_spikes_on_1024_channels_reads_back_equal(tmp_pat
         spike_times_s=np.sort(np.round(rng.uniform(-1, 100, 205_000) * 20_000) / 20_000),
         spike_channels=rng.integers(0, 1024, 205_000),
         channels=Channels(np.arange(1024).astype(str), np.arange(1024), rng.random(1024), rng.random(1024)),
-        stimuli=make_up_recording(0).stimuli,
+        stimuli=synthetic_recording(0).stimuli,
         sampling_rate_hz=20_000.0,
         start_s=-1.0,
         duration_s=101.0,
@@ -104,33 +104,33 @@ def test_a_recording_of_205_000_spikes_on_1024_channels_reads_back_equal(tmp_pat
     assert read_nwb(tmp_path / "a.nwb").equals(recording)
 
 
-def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(made_up: Recording, tmp_path: Path) -> None:
+def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(synthetic: Recording, tmp_path: Path) -> None:
     import pynwb
 
-    write_nwb(made_up, tmp_path / "a.nwb")
+    write_nwb(synthetic, tmp_path / "a.nwb")
     with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r") as nwb_io:
         nwb = nwb_io.read()
-        assert len(nwb.units) == len(made_up.channels)
-        for channel in range(len(made_up.channels)):
-            expected_s = made_up.spike_times_s[made_up.spike_channels == channel]
+        assert len(nwb.units) == len(synthetic.channels)
+        for channel in range(len(synthetic.channels)):
+            expected_s = synthetic.spike_times_s[synthetic.spike_channels == channel]
             np.testing.assert_array_equal(nwb.units["spike_times"][channel], expected_s)
             region = nwb.units["electrodes"][channel]
-            assert region["label"].tolist() == [made_up.channels.label[channel]]
+            assert region["label"].tolist() == [synthetic.channels.label[channel]]
         electrodes = nwb.electrodes.to_dataframe()
-        np.testing.assert_array_equal(electrodes["electrode_id"], made_up.channels.electrode)
-        np.testing.assert_array_equal(electrodes["rel_x"], made_up.channels.x_um)
+        np.testing.assert_array_equal(electrodes["electrode_id"], synthetic.channels.electrode)
+        np.testing.assert_array_equal(electrodes["rel_x"], synthetic.channels.x_um)
         stimuli = nwb.stimulus["stimuli"].to_dataframe()
-        np.testing.assert_array_equal(stimuli["start_time"], made_up.stimuli.time_s)
-        np.testing.assert_array_equal(stimuli["frequency_hz"], made_up.stimuli.frequency_hz)
-        np.testing.assert_array_equal(np.stack(stimuli["electrode_ids"].tolist()), made_up.stimuli.electrodes)
-        np.testing.assert_array_equal(nwb.units["obs_intervals"][0], [[made_up.start_s, made_up.stop_s]])
+        np.testing.assert_array_equal(stimuli["start_time"], synthetic.stimuli.time_s)
+        np.testing.assert_array_equal(stimuli["frequency_hz"], synthetic.stimuli.frequency_hz)
+        np.testing.assert_array_equal(np.stack(stimuli["electrode_ids"].tolist()), synthetic.stimuli.electrodes)
+        np.testing.assert_array_equal(nwb.units["obs_intervals"][0], [[synthetic.start_s, synthetic.stop_s]])
         assert nwb.units.resolution == 1 / 20_000
 
 
-def test_who_recorded_what_goes_into_the_fields_of_nwb(made_up: Recording, tmp_path: Path) -> None:
+def test_who_recorded_what_goes_into_the_fields_of_nwb(synthetic: Recording, tmp_path: Path) -> None:
     import pynwb
 
-    write_nwb(with_subject(made_up), tmp_path / "a.nwb")
+    write_nwb(with_subject(synthetic), tmp_path / "a.nwb")
     with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r") as nwb_io:
         nwb = nwb_io.read()
         assert nwb.experimenter == ("Doe, Jane", "Roe, Richard")
@@ -140,22 +140,22 @@ def test_who_recorded_what_goes_into_the_fields_of_nwb(made_up: Recording, tmp_p
 
 
 @pytest.mark.oracle
-def test_nwbinspector_finds_nothing_critical_and_no_violation(made_up: Recording, tmp_path: Path) -> None:
+def test_nwbinspector_finds_nothing_critical_and_no_violation(synthetic: Recording, tmp_path: Path) -> None:
     pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
     from nwbinspector import Importance, inspect_nwbfile
 
-    write_nwb(with_subject(made_up), tmp_path / "a.nwb")
+    write_nwb(with_subject(synthetic), tmp_path / "a.nwb")
     messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "a.nwb")))
     # What is left is a suggestion: the table of scalars has one row.
     assert [m.check_function_name for m in messages if m.importance != Importance.BEST_PRACTICE_SUGGESTION] == []
 
 
 @pytest.mark.oracle
-def test_nwbinspector_finds_nothing_critical_in_what_a_culture_records(made_up: Recording, tmp_path: Path) -> None:
+def test_nwbinspector_finds_nothing_critical_in_what_a_culture_records(synthetic: Recording, tmp_path: Path) -> None:
     pytest.importorskip("nwbinspector", reason="nwbinspector is not installed")
     from nwbinspector import Importance, inspect_nwbfile
 
-    write_nwb(made_up, tmp_path / "a.nwb")
+    write_nwb(synthetic, tmp_path / "a.nwb")
     messages = list(inspect_nwbfile(nwbfile_path=str(tmp_path / "a.nwb")))
     grave = (Importance.CRITICAL, Importance.ERROR, Importance.PYNWB_VALIDATION)
     assert [m.check_function_name for m in messages if m.importance in grave] == []
@@ -184,9 +184,9 @@ def with_subject(recording: Recording) -> Recording:
 
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_one_clear_line(made_up: Recording, tmp_path: Path, share: float) -> None:
+def test_a_truncated_file_is_one_clear_line(synthetic: Recording, tmp_path: Path, share: float) -> None:
     path = tmp_path / "a.nwb"
-    write_nwb(made_up, path)
+    write_nwb(synthetic, path)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(
@@ -196,9 +196,9 @@ def test_a_truncated_file_is_one_clear_line(made_up: Recording, tmp_path: Path, 
     assert "\n" not in str(caught.value)
 
 
-def test_damage_anywhere_in_the_file_is_an_error_of_ours_or_harmless(made_up: Recording, tmp_path: Path) -> None:
+def test_damage_anywhere_in_the_file_is_an_error_of_ours_or_harmless(synthetic: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
-    write_nwb(made_up, path)
+    write_nwb(synthetic, path)
     content = path.read_bytes()
     rng = np.random.default_rng(0)
     for start in rng.integers(8, len(content) - 64, 60).tolist():
@@ -225,8 +225,8 @@ def test_another_programs_files_are_refused(tmp_path: Path) -> None:
         read_recording(tmp_path / "b.nwb")
 
 
-def test_a_file_of_a_later_format_version_is_refused(made_up: Recording, tmp_path: Path) -> None:
-    write_nwb(made_up, tmp_path / "a.nwb")
+def test_a_file_of_a_later_format_version_is_refused(synthetic: Recording, tmp_path: Path) -> None:
+    write_nwb(synthetic, tmp_path / "a.nwb")
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
         file["processing/ecephys/animat_recording/format_version"][0] = 2
     with pytest.raises(InvalidFile, match="expected format version 1 or older, got 2: update animat"):
@@ -238,12 +238,12 @@ def test_a_file_of_a_later_format_version_is_refused(made_up: Recording, tmp_pat
     [({"source": "a\0b"}, "without null characters"), ({"recorded_at": "yesterday"}, "ISO 8601 date")],
 )
 def test_text_that_the_file_cannot_hold_is_refused(
-    made_up: Recording, tmp_path: Path, provenance: dict[str, str], message: str
+    synthetic: Recording, tmp_path: Path, provenance: dict[str, str], message: str
 ) -> None:
     import dataclasses
 
     with pytest.raises(InvalidArgument, match=message):
-        write_nwb(dataclasses.replace(made_up, provenance=provenance), tmp_path / "a.nwb")
+        write_nwb(dataclasses.replace(synthetic, provenance=provenance), tmp_path / "a.nwb")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -251,8 +251,8 @@ SAVE_ON_A_FULL_DISK = """
 import resource, signal, sys
 from animat.errors import InvalidFile
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
-recording = make_up_recording(4)
+from animat.recordings.synthetic import synthetic_recording
+recording = synthetic_recording(4)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 try:
@@ -263,9 +263,9 @@ except InvalidFile as error:
 """
 
 
-def test_a_full_disk_leaves_the_old_file_whole(made_up: Recording, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_old_file_whole(synthetic: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
-    write_nwb(made_up, path)
+    write_nwb(synthetic, path)
     before = path.read_bytes()
     assert len(before) > 100_000
     done = subprocess.run(
@@ -275,4 +275,4 @@ def test_a_full_disk_leaves_the_old_file_whole(made_up: Recording, tmp_path: Pat
     assert "a.nwb: cannot be written: File too large; what stood there before is unchanged" in done.stdout
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["a.nwb"]
-    assert read_nwb(path).equals(made_up)
+    assert read_nwb(path).equals(synthetic)

@@ -56,7 +56,7 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
 
 def said(recording: Recording) -> dict[str, str]:
     """What was noticed when it was read, by name."""
-    return {finding.name: finding.sentence for finding in recording.findings}
+    return {finding.name: finding.message for finding in recording.findings}
 
 
 @FEW
@@ -373,8 +373,8 @@ def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
     assert len(recording.stimuli) == 0
     refusal = next(finding for finding in noticed(recording) if finding.name == "no-stimuli")
     assert refusal.severity == "refuse"
-    assert "1 spikes but no stimuli" in refusal.sentence
-    assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.sentence
+    assert "1 spikes but no stimuli" in refusal.message
+    assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.message
 
 
 def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tmp_path: Path) -> None:

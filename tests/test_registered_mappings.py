@@ -20,10 +20,10 @@ from animat.coding.mapping import REGISTRY, mapping_from_data, mapping_named, ma
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.recordings.made_up import write_made_up_series
+from animat.recordings.synthetic import write_synthetic_series
 from animat.studies.run import run_study
 from animat.studies.source import Source
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -102,7 +102,7 @@ def test_its_commands_are_those_that_the_robot_gets(package: Path) -> None:
 
 @pytest.mark.oracle
 def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: Any) -> None:
-    write_made_up_series(0, "recordings", sessions=1)
+    write_synthetic_series(0, "recordings", sessions=1)
     few = ["--recordings", "recordings", "--policies", "1", "--iterations", "256", "--workers", "1"]
     assert main(["train", "cartpole", *few, "--mapping", STEEP]) == 0
     forget()
@@ -119,13 +119,13 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 @pytest.mark.oracle
 def test_a_study_has_conditions_with_it(package: Path) -> None:
     study = Study(
-        culture=Source("made-up", sessions=1, presentations=40, channels=16),
-        robots=(Body("cartpole", iterations=240),),
-        conditions=(StudyCondition("steep", mapping=STEEP), StudyCondition("one threshold")),
+        culture=Source("synthetic", sessions=1, trials=40, channels=16),
+        robots=(RobotSpec("cartpole", iterations=240),),
+        arms=(Arm("steep", mapping=STEEP), Arm("one threshold")),
         policies=1,
         episodes=2,
         episodes_over_time=2,
-        algorithm={"environments": 8, "updates": 1, "batch": 16, "replay": 256, "hidden": 8},
+        algorithm={"environments": 8, "gradient_steps": 1, "batch": 16, "replay": 256, "hidden": 8},
     )
     (package / "study.toml").write_text(study_to_toml(study))
     assert read_study(package / "study.toml") == study
@@ -142,7 +142,7 @@ def test_an_installed_package_announces_its_mappings(package: Path, monkeypatch:
     monkeypatch.setattr("importlib.metadata.entry_points", found)
     with pytest.raises(InvalidArgument, match="expected one of 1-threshold, 9-thresholds, linear, steep, flat, got 'x"):
         mapping_named("x")
-    assert StudyCondition("a", mapping="steep").mapping == STEEP
+    assert Arm("a", mapping="steep").mapping == STEEP
     assert mapping_from_data("steep") == mapping_named(STEEP)
     with pytest.raises(InvalidArgument, match="to have the name 'flat', got 'steep'"):
         mapping_named("flat")

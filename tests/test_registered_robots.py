@@ -22,7 +22,7 @@ from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.recordings.made_up import write_made_up_series
+from animat.recordings.synthetic import write_synthetic_series
 from animat.robots import (
     ROBOTS,
     Cartpole,
@@ -37,7 +37,7 @@ from animat.robots import (
 from animat.robots.capabilities import WITHOUT, lacking
 from animat.studies.run import run_study
 from animat.studies.source import Source
-from animat.studies.specification import Body, Study
+from animat.studies.specification import RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -108,32 +108,32 @@ def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path)
     assert "my_package" not in sys.modules
     robot_named(ROVER)
     loaded = load_policies(package / "policies")
-    evaluation = evaluate(loaded, timeline_of(), episodes=5, limit_resolution=1.0)
+    evaluation = evaluate(loaded, timeline_of(), episodes=5, optimum_resolution=1.0)
     assert evaluation.robot == "rover" and evaluation.names == tuple(trained)
-    assert "rover has no method `value_grid`" in (evaluation.no_limit or "")
+    assert "rover has no method `value_grid`" in (evaluation.no_optimum or "")
     assert "no heuristic policy among the controls: rover has no method `heuristic`" in evaluation.to_text()
 
 
 @pytest.mark.oracle
 def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: Any) -> None:
-    write_made_up_series(0, "recordings", sessions=1)
+    write_synthetic_series(0, "recordings", sessions=1)
     few = ["--recordings", "recordings", "--policies", "1", "--iterations", "256", "--workers", "1"]
     assert main(["train", ROVER, *few, "--parameters", "episode_limit=12"]) == 0
     forget()
     assert main(["evaluate", "--recordings", "recordings"]) == 1
     assert f"--robot {ROVER}" in capsys.readouterr().err
     asked = ["--recordings", "recordings", "--robot", ROVER, "--episodes", "2", "--json"]
-    assert main(["evaluate", *asked, "--limit"]) == 0
+    assert main(["evaluate", *asked, "--optimum"]) == 0
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
-    assert told["robot"] == "rover" and told["limit"] is None and "value_grid" in told["no_limit"]
+    assert told["robot"] == "rover" and told["optimum"] is None and "value_grid" in told["no_optimum"]
     assert "no heuristic policy among the controls: rover has no method `heuristic`" in said
     forget()
     assert main(["run", *asked, "--culture", "replay"]) == 0
     said = capsys.readouterr().out
     told = json.loads(said.splitlines()[-1])
-    assert "made by hand" not in {row["name"] for row in told["rows"]}
-    assert {"no-heuristic", "no-limit"} <= {finding["name"] for finding in told["findings"]}
+    assert "heuristic" not in {row["name"] for row in told["rows"]}
+    assert {"no-heuristic", "no-optimum"} <= {finding["name"] for finding in told["findings"]}
     assert "no optimal return: rover has no method `value_grid`" in said
 
 
@@ -141,19 +141,19 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
-        culture=Source("made-up", sessions=1, presentations=40, channels=16),
-        robots=(Body("rover", iterations=240),),
+        culture=Source("synthetic", sessions=1, trials=40, channels=16),
+        robots=(RobotSpec("rover", iterations=240),),
         policies=1,
         episodes=2,
         episodes_over_time=2,
-        algorithm={"environments": 8, "updates": 1, "batch": 16, "replay": 256, "hidden": 8},
+        algorithm={"environments": 8, "gradient_steps": 1, "batch": 16, "replay": 256, "hidden": 8},
     )
     (package / "study.toml").write_text(study_to_toml(study))
     assert read_study(package / "study.toml") == study and study.robots[0].kind == ROVER
     ran = run_study(study, package / "study", workers=1)
     page = ran.report.read_text()
-    for sentence in lacking(robot_named("rover")).values():
-        assert sentence in page
+    for message in lacking(robot_named("rover")).values():
+        assert message in page
     assert not list((package / "study" / "figures").glob("rover-frames*"))
 
 
@@ -241,10 +241,10 @@ def test_robots_are_listed_with_what_each_can_do(
     assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
     assert "  no heuristic policy among the controls: rover has no method `heuristic`" in said
     assert "ModuleNotFoundError" in told["unusable"]["tank"] and "tank cannot be used: " in said
-    quantities = property(lambda self: ("x",))
-    monkeypatch.setattr(type(robot_named("rover")), "quantities", quantities)
+    observation_spec = property(lambda self: ("x",))
+    monkeypatch.setattr(type(robot_named("rover")), "observation_spec", observation_spec)
     assert main(["robots"]) == 1
-    assert "rover cannot be used: Rover.quantities: expected a tuple of Quantity" in capsys.readouterr().out
+    assert "rover cannot be used: Rover.observation_spec: expected a tuple of Quantity" in capsys.readouterr().out
     assert main(["robots", "my_nowhere:Tank"]) == 1
     assert capsys.readouterr().err.startswith("animat: robot: expected my_nowhere:Tank to be importable")
 
@@ -288,7 +288,7 @@ def test_a_bad_robot_ends_in_a_line_before_anything_is_read_or_recorded(
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1 and re.search(words, said[0])
     with pytest.raises(InvalidArgument, match=words):
-        run_study(Study(robots=(Body("rover", kind=at),)), package / "study")
+        run_study(Study(robots=(RobotSpec("rover", kind=at),)), package / "study")
     assert not list((package / "study").glob("recordings/*"))
 
 

@@ -1,4 +1,4 @@
-"""What the report says of its numbers: outcomes, limits, scores, decisions, and what is left out."""
+"""What the report says of its numbers: outcomes, optima, scores, decisions, and what is left out."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from animat.report.learning_curves import LearningCurve, draw_learning_curves
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.robots import Cartpole
 from animat.studies.differences import came_out_otherwise, decisions, explain
-from animat.studies.learned import as_good_as_the_limit_allows, known_of, learned_of
-from animat.studies.limits import kinds_of, rough_kinds
+from animat.studies.learned import beside_the_optimum, known_of, learned_of
+from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
-from animat.studies.places import limits_file
+from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper
-from animat.studies.results import ComparedReturns, Limit, Score, write_typed
+from animat.studies.results import ComparedReturns, Score, StudyOptimum, write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.source import Source
-from animat.studies.specification import Body, Simulators, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 
 ROW = ComparedReturns(
     comparison="c", robot="cartpole", first="a", second="b", at_min=140.0, episodes=100, n=10, mean_first=5.0,
-    mean_second=16.0, score_first=0.5, score_second=0.6, random_second=-80.0, limit_first=90.0, limit_second=80.0,
-    limit_error_first=0.5, limit_error_second=0.5, u=50.0, p_normal=0.5, p_exact=0.5, p_holm=1.0, effect=0.0,
+    mean_second=16.0, score_first=0.5, score_second=0.6, random_second=-80.0, optimum_first=90.0, optimum_second=80.0,
+    optimum_error_first=0.5, optimum_error_second=0.5, u=50.0, p_normal=0.5, p_exact=0.5, p_holm=1.0, effect=0.0,
     effect_low_95=-1.0, effect_high_95=1.0, outcome=NONE, paper_u=0.0, paper_p=1.83e-4, as_in_paper="no",
 )  # fmt: skip
 
@@ -74,36 +74,36 @@ def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
 
 
-# --- what a limit says ----------------------------------------------------------------------------------------------
+# --- what an optimum says --------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_knows_what_its_limit_says() -> None:
+def test_a_comparison_knows_what_its_optimum_says() -> None:
     assert "other way round" in explain(ROW)
     assert "take more policies" in explain(replace(ROW, n=4))
-    assert "nothing to learn" in explain(replace(ROW, limit_second=-79.8))
-    assert "no limit" in explain(replace(ROW, limit_second=None))
-    assert "leaves room" in explain(replace(ROW, limit_second=100.0))
+    assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
+    assert "no optimum" in explain(replace(ROW, optimum_second=None))
+    assert "leaves room" in explain(replace(ROW, optimum_second=100.0))
 
 
-def test_there_is_room_as_long_as_the_second_limit_is_far_above_the_first_condition() -> None:
-    """The first is near its own limit of 60; the second could have 100, and has a third of the way."""
-    row = replace(ROW, limit_first=60.0, limit_second=100.0, mean_first=56.0, score_first=0.97, score_second=0.3)
+def test_there_is_room_as_long_as_the_second_optimum_is_far_above_the_first_arm() -> None:
+    """The first is near its own optimum of 60; the second could have 100, and has a third of the way."""
+    row = replace(ROW, optimum_first=60.0, optimum_second=100.0, mean_first=56.0, score_first=0.97, score_second=0.3)
     assert "no room" not in explain(row)
     assert "leaves room, 44.0 above a" in explain(row)
     assert "no room is left" in explain(replace(row, mean_first=96.0))
-    assert "at its limit" in explain(replace(row, score_second=0.98))
-    assert "at its limit" not in explain(replace(row, score_second=0.96))
+    assert "at its optimum" in explain(replace(row, score_second=0.98))
+    assert "at its optimum" not in explain(replace(row, score_second=0.96))
 
 
-def test_limits_are_in_order_only_where_they_lie_apart_by_more_than_their_errors() -> None:
-    close = replace(ROW, limit_first=119.95, limit_second=119.94, limit_error_first=0.4, limit_error_second=2.2)
+def test_optima_are_in_order_only_where_they_lie_apart_by_more_than_their_errors() -> None:
+    close = replace(ROW, optimum_first=119.95, optimum_second=119.94, optimum_error_first=0.4, optimum_error_second=2.2)
     assert "other way round" not in explain(close)
     assert "same within their errors" in explain(close)
-    assert "other way round" in explain(replace(close, limit_first=122.6))
+    assert "other way round" in explain(replace(close, optimum_first=122.6))
 
 
-def test_a_control_is_given_no_limit() -> None:
-    words = explain(replace(ROW, limit_first=None, limit_error_first=None))
+def test_a_control_is_given_no_optimum() -> None:
+    words = explain(replace(ROW, optimum_first=None, optimum_error_first=None))
     assert "a cannot do better than random actions" in words and "for a" not in words
 
 
@@ -133,12 +133,12 @@ def test_decisions_follow_a_changed_study() -> None:
     changed = replace(
         paper_study(),
         robots=(
-            Body("cartpole", parameters={"pole_mass_kg": 0.55, "angle_limit_rad": 0.4}),
-            Body("navigation", parameters={"episode_limit": 20}),
+            RobotSpec("cartpole", parameters={"pole_mass_kg": 0.55, "angle_limit_rad": 0.4}),
+            RobotSpec("navigation", parameters={"episode_limit": 20}),
         ),
         culture=Source("files", files=("mine",)),
         simulators=Simulators(bins=40, range_hz=60.0),
-        conditions=paper_study().conditions[:2],
+        arms=paper_study().arms[:2],
         comparisons=(),
         actions="drawn",
     )
@@ -153,7 +153,7 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "Nine levels without zero" not in told and "Most probable actions" not in told
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
-    alone = dict(decisions(replace(changed, robots=(Body("navigation"),))))
+    alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
     assert "Pole mass" not in alone
 
 
@@ -162,103 +162,105 @@ def test_decisions_follow_a_changed_study() -> None:
 
 def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
     """The pole mass as printed beside the simulator's, in one study."""
-    printed = Body("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
-    study = Study(robots=(Body("cartpole"), printed))
+    printed = RobotSpec("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
+    study = Study(robots=(RobotSpec("cartpole"), printed))
     assert printed.robot() == Cartpole(pole_mass_kg=0.55)
     assert printed.trained_for == Cartpole().paper_iterations
     (tmp_path / "study.toml").write_text(study_to_toml(study))
     assert read_study(tmp_path / "study.toml") == study
     names = [job.name for job in plan_study(study, tmp_path)]
     assert len(set(names)) == len(names) and "train/as printed/1-threshold/p0" in names
-    assert training_of(study, printed, StudyCondition("a", mapping="none")).commands == (-1.0, 1.0)
+    assert training_of(study, printed, Arm("a", mapping="none")).commands == (-1.0, 1.0)
     told = [words for name, words in decisions(study) if name == "Pole mass"]
     assert len(told) == 2 and "0.55 kg, chosen" in told[1]
     with pytest.raises(InvalidArgument, match="expected each name once"):
-        Study(robots=(Body("cartpole"), Body("cartpole", parameters={"pole_mass_kg": 0.55})))
+        Study(robots=(RobotSpec("cartpole"), RobotSpec("cartpole", parameters={"pole_mass_kg": 0.55})))
     with pytest.raises(InvalidArgument, match=r"^name: expected letters"):
-        Body("a/b", kind="cartpole")
+        RobotSpec("a/b", kind="cartpole")
     with pytest.raises(InvalidArgument, match="culture"):
-        Body("culture", kind="cartpole")
+        RobotSpec("culture", kind="cartpole")
     with pytest.raises(InvalidArgument, match="cartpole, navigation"):
-        Body("as printed")
+        RobotSpec("as printed")
 
 
-# --- learning as good as the limit allows -----------------------------------------------------------------------------
+# --- learning as good as the optimum allows ---------------------------------------------------------------------------
 
 
 def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     study = paper_study()
-    assert study.minutes_of(study.condition("without shadowing"), 0.0, 140.0) == {140.0: 100, 0.0: 100}
-    assert study.minutes_of(study.condition("9 thresholds"), 0.0, 140.0) == {140.0: 100}
-    assert study.minutes_of(study.condition("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
-    assert study.limit_minutes(0.0, 140.0) == [0.0, 140.0]
-    control = StudyCondition("c", shadowing=False, delivery="shuffled")
+    assert study.minutes_of(study.arm("without shadowing"), 0.0, 140.0) == {140.0: 100, 0.0: 100}
+    assert study.minutes_of(study.arm("9 thresholds"), 0.0, 140.0) == {140.0: 100}
+    assert study.minutes_of(study.arm("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
+    assert study.optimum_minutes(0.0, 140.0) == [0.0, 140.0]
+    control = Arm("c", shadowing=False, delivery="shuffled")
     assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
 
 
 LEARNED = Score(
-    robot="cartpole", condition="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
+    robot="cartpole", arm="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
     mean_return=96.0, standard_deviation=3.0, interquartile_mean=96.0, low_95=95.0, high_95=97.0, random=-80.0,
-    limit=110.0, limit_grid_error=0.1, limit_run=105.0, limit_run_standard_error=0.1, limit_without_clock=100.0,
-    normalised_score=0.88, score_without_clock=0.9,
+    optimum=110.0, optimum_grid_error=0.1, optimum_run=105.0, optimum_run_standard_error=0.1,
+    optimum_without_clock=100.0, normalised_score=0.88, score_without_clock=0.9,
 )  # fmt: skip
 
 
 def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
-    rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, condition="1 threshold")]
+    rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, arm="1 threshold")]
     assert learned_of(paper_study(), rows) == [LEARNED]
 
 
-def test_what_was_learned_stands_between_random_actions_and_the_limit() -> None:
-    table = as_good_as_the_limit_allows(paper_study(), [replace(LEARNED, limit=120.0)])
+def test_what_was_learned_stands_between_random_actions_and_the_optimum() -> None:
+    table = beside_the_optimum(paper_study(), [replace(LEARNED, optimum=120.0)])
     (shown,) = (dict(zip(table.head, row, strict=True)) for row in table.rows)
-    assert (shown["random"], shown["limit"], shown["score"]) == (-80.0, 120.0, 0.88)
-    assert table.head.index("mean ± s.e.") < table.head.index("random") < table.head.index("limit")
+    assert (shown["random"], shown["optimum"], shown["score"]) == (-80.0, 120.0, 0.88)
+    assert table.head.index("mean ± s.e.") < table.head.index("random") < table.head.index("optimum")
 
 
 def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
-    body = Body("cartpole")
-    assert known_of(replace(LEARNED, normalised_score=0.98), body) == "reached"
-    assert known_of(replace(LEARNED, normalised_score=None), body).startswith("nothing to learn")
-    assert known_of(replace(LEARNED, limit=None, normalised_score=None), body).startswith(
-        "no limit: conditions with few"
+    spec = RobotSpec("cartpole")
+    assert known_of(replace(LEARNED, normalised_score=0.98), spec) == "reached"
+    assert known_of(replace(LEARNED, normalised_score=None), spec).startswith("nothing to learn")
+    assert known_of(replace(LEARNED, optimum=None, normalised_score=None), spec).startswith(
+        "no optimum: conditions with few"
     )
-    assert known_of(LEARNED, body).endswith("short by 0.09, which neither the clock nor the grid explains")
-    assert "short by the clock" in known_of(replace(LEARNED, score_without_clock=0.99), body)
-    assert "its controller was seen to get" in known_of(replace(LEARNED, limit_run=100.0), body)
-    assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, Body("cartpole", iterations=60_000))
+    assert known_of(LEARNED, spec).endswith("short by 0.09, which neither the clock nor the grid explains")
+    assert "short by the clock" in known_of(replace(LEARNED, score_without_clock=0.99), spec)
+    assert "its controller was seen to get" in known_of(replace(LEARNED, optimum_run=100.0), spec)
+    assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, RobotSpec("cartpole", iterations=60_000))
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
 
 
 def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path: Path) -> None:
-    study = Study(robots=(Body("cartpole"),), conditions=(StudyCondition("linear", mapping="linear"),
-                                                         StudyCondition("1 threshold")))  # fmt: skip
+    study = Study(robots=(RobotSpec("cartpole"),), arms=(Arm("linear", mapping="linear"),
+                                                         Arm("1 threshold")))  # fmt: skip
     labels = tuple(f"{i} Hz" for i in range(13))
     in_data, in_simulator = np.full((2, 13), 0.5), np.full((2, 13), 0.5)
     in_data[1, [0, 12]], in_simulator[1, [0, 12]] = (0.13, 0.9), (0.28, 0.88)
     kept = {10.0 * i: Fidelity(labels, in_data[i], in_simulator[i], 0) for i in range(2)}
-    unknown = dict.fromkeys(field.name for field in fields(Limit))
+    unknown = dict.fromkeys(field.name for field in fields(StudyOptimum))
     told = {"robot": "cartpole", "percentiles": "moving"}
-    limits = [
-        Limit(**unknown | told | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"})
+    optima = [
+        StudyOptimum(
+            **unknown | told | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"}
+        )
         for m, x in (("9-thresholds", 99.0), ("1-threshold", 42.0))
         for at in (0.0, 10.0)
     ]
-    write_typed(limits_file(tmp_path, "cartpole", "over-time"), limits)
+    write_typed(optima_file(tmp_path, "cartpole", "over-time"), optima)
     table = controllability_shown(study, tmp_path, kept)
-    assert table.head[-3:] == ("difference, data", "difference, simulator", "limit, cartpole")
+    assert table.head[-3:] == ("difference, data", "difference, simulator", "optimum, cartpole")
     assert table.marked == (1,)
     assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"
     # Over all conditions, also those that there is no column for.
     assert table.rows[1][-3:] == pytest.approx((0.77, 0.6, 42.0))
-    assert table.rows[0][-1] is None, "a limit of some conditions is none of all"
+    assert table.rows[0][-1] is None, "an optimum of some conditions is none of all"
     assert len(table.head) == 1 + 12 + 3
     assert "1 more conditions are in the file" in table.note
 
 
-def test_every_mapping_has_limits_of_its_own_over_time() -> None:
+def test_every_mapping_has_optima_of_its_own_over_time() -> None:
     study = paper_study()
     assert [kind.mapping for kind in kinds_of(study)] == ["1-threshold", "9-thresholds", "linear", "none"]
     assert [kind.mapping for kind in rough_kinds(study)] == ["1-threshold", "9-thresholds"]
@@ -279,9 +281,9 @@ def test_every_line_of_a_figure_is_in_its_legend() -> None:
     }  # fmt: skip
 
 
-def test_the_limit_steps_with_the_simulator_in_use() -> None:
-    limit = np.array([1.0, 1.0, 7.0])
-    curve = LearningCurve("a", np.array([1000.0, 2000.0, 3000.0]), np.zeros((2, 3)), None, limit)
+def test_the_optimum_steps_with_the_simulator_in_use() -> None:
+    optimum = np.array([1.0, 1.0, 7.0])
+    curve = LearningCurve("a", np.array([1000.0, 2000.0, 3000.0]), np.zeros((2, 3)), None, optimum)
     figure = draw_learning_curves([curve], "cartpole")
     (line,) = [line for line in figure.axes[0].lines if line.get_label() == "optimal return"]
     assert line.get_drawstyle() == "steps-pre"
@@ -289,7 +291,7 @@ def test_the_limit_steps_with_the_simulator_in_use() -> None:
     assert np.asarray(line.get_ydata()).tolist() == [1, 1, 1, 7]
 
 
-def test_limits_over_time_are_said_to_be_rough_and_no_condition_is_lost_unsaid() -> None:
+def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> None:
     minutes = np.array([0.0, 10.0])
     courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(6))
     panels = [
@@ -305,7 +307,7 @@ def test_limits_over_time_are_said_to_be_rough_and_no_condition_is_lost_unsaid()
         "linear",
         "c5",
     } <= said
-    assert "2 more conditions" in figure.axes[0].get_title(loc="left")
+    assert "2 more arms" in figure.axes[0].get_title(loc="left")
     colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
     (dashed,) = [line for line in figure.axes[0].lines if "rough" in str(line.get_label())]
     assert len(colours) == 6 and dashed.get_color() not in colours

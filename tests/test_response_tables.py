@@ -10,11 +10,11 @@ import pytest
 
 from animat.cli import main
 from animat.errors import AnimatError, InvalidFile
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording, read_source, read_sources
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.recordings.synthetic import synthetic_recording
 from animat.report.inspection import inspection_text
 from animat.responses.conditions import ByInterval, ByPattern, Conditions
 from animat.responses.extraction import extract_responses, responses_of_table
@@ -44,7 +44,7 @@ def test_a_table_has_the_responses_of_the_recording_that_it_was_counted_in(
     form: str, kind: str, tmp_path: Path
 ) -> None:
     window_ms = (3.0, 9.0)
-    recording = make_up_recording(3, patterns=8, channels=24)
+    recording = synthetic_recording(3, patterns=8, channels=24)
     values = counts_of(recording, window_ms) / (1.0 if kind == "count" else 0.006)
     stimuli = recording.stimuli
     if form == "npz":
@@ -260,4 +260,4 @@ def test_rows_without_times_drift_in_their_order(tmp_path: Path) -> None:
         if name == "rising":
             # From 0.5 to 1.5 of the mean.
             assert found["drift"].value == pytest.approx(1.0, abs=0.1)
-            assert "in the order of the rows" in found["drift"].sentence
+            assert "in the order of the rows" in found["drift"].message

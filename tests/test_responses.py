@@ -238,7 +238,7 @@ def test_a_response_put_into_poisson_spikes_is_found() -> None:
     assert (found.start_ms, found.end_ms) == pytest.approx((20, 60), abs=1.5)
     findings = {f.name: f for f in extract_responses(source).findings}
     outside = findings.get("dead-window") or findings["response-elsewhere"]
-    assert f"use --window-ms {found.start_ms:g} {found.end_ms:g}" in outside.sentence
+    assert f"use --window-ms {found.start_ms:g} {found.end_ms:g}" in outside.message
 
 
 def test_histogram_bins_add_up_to_the_window() -> None:

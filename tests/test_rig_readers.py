@@ -33,7 +33,7 @@ TABLE = mapping_table([3, 9, 40], [1000, 2000, 26_399])
 
 
 def found(recording: Recording) -> dict[str, str]:
-    return {finding.name: finding.sentence for finding in noticed(recording)}
+    return {finding.name: finding.message for finding in noticed(recording)}
 
 
 def said(frequency: float, presentation: int) -> str:

@@ -57,10 +57,10 @@ def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
 
 def test_observations_are_the_quantities_in_order(robot: Robot) -> None:
     observation = robot.observe(robot.reset(jax.random.key(0)))
-    assert observation.shape == (len(robot.quantities),)
+    assert observation.shape == (len(robot.observation_spec),)
     assert observation.dtype == jnp.float32
-    assert len({quantity.name for quantity in robot.quantities}) == len(robot.quantities)
-    for quantity in robot.quantities:
+    assert len({quantity.name for quantity in robot.observation_spec}) == len(robot.observation_spec)
+    for quantity in robot.observation_spec:
         assert quantity.scale > 0 and np.isfinite(quantity.scale) and quantity.unit
         assert quantity.low <= 0 <= quantity.high and np.isfinite([quantity.low, quantity.high]).all()
 
@@ -95,7 +95,7 @@ def test_no_observation_of_an_episode_passes_the_bounds(robot: Robot, policy: st
     observations, rewards, terminated = play(robot, policy, episodes=200, iterations=robot.episode_limit)
     ended_before = np.cumsum(terminated, axis=0) - terminated > 0
     in_episodes = observations[~ended_before]
-    low, high = np.array([(q.low, q.high) for q in robot.quantities], np.float32).T
+    low, high = np.array([(q.low, q.high) for q in robot.observation_spec], np.float32).T
     assert np.all(in_episodes >= low) and np.all(in_episodes <= high)
     assert np.all(np.isfinite(in_episodes)) and np.all(np.isfinite(rewards[~ended_before]))
 

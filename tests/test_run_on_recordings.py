@@ -20,8 +20,8 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.series import extract_series
@@ -31,20 +31,20 @@ from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
 
-pytestmark = pytest.mark.usefixtures("few_redrawn")
+pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
 RULE = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=8)
-PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, presentations=20, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=20, setup_s=0.1)
 FIVE_HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 
 
 def policy_of(seed: int, frequencies_hz: tuple[float, ...] = FIVE_HZ) -> Policy:
     rng, robot, n = np.random.default_rng(seed), Navigation(episode_limit=8), len(frequencies_hz)
-    sizes = ((len(robot.quantities), 16), (16, 16), (16, n))
+    sizes = ((len(robot.observation_spec), 16), (16, 16), (16, n))
     return Policy(
         weights=tuple(rng.standard_normal(size).astype(np.float32) for size in sizes),
         biases=tuple(np.zeros(size[1], np.float32) for size in sizes),
-        scales=np.ones(len(robot.quantities), np.float32),
+        scales=np.ones(len(robot.observation_spec), np.float32),
         robot=robot,
         mapping=Thresholds(1),
         conditions=tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in frequencies_hz),
@@ -108,7 +108,7 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
     options = [word.replace("{state}", str(series / STATE_FILE)) for word in more]
     assert run(tmp_path / "session", policy_of(0), recordings, *options) == 0
     printed = capsys.readouterr()
-    found = {f["name"]: f["sentence"] for f in json.loads(printed.out.splitlines()[-1])["findings"]}
+    found = {f["name"]: f["message"] for f in json.loads(printed.out.splitlines()[-1])["findings"]}
     assert ("other-culture" in found) == bool(words)
     assert words in found.get("other-culture", "")
     before_the_first_pulse = printed.err.split("the session is planned for")[0]
@@ -118,8 +118,8 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
 def test_recordings_of_no_virtual_culture_are_told(
     tmp_path: Path, small_ones: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_nwb(make_up_recording(1, patterns=40, channels=32), tmp_path / "made-up.nwb")
-    assert run(tmp_path / "session", policy_of(0), tmp_path / "made-up.nwb") == 0
+    write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
+    assert run(tmp_path / "session", policy_of(0), tmp_path / "synthetic.nwb") == 0
     assert "the recordings are of no virtual culture, and this is virtual culture 1" in capsys.readouterr().err
 
 
@@ -197,7 +197,7 @@ def test_the_simulator_that_predicts_is_made_as_the_policies_unless_asked_otherw
 
     def take(policies: Any, culture: Any, calibration: Calibration, *_: Any, **__: Any) -> None:
         assert type(calibration.simulator) is kind
-        assert all(type(each) is kind for each in calibration.redrawn)
+        assert all(type(each) is kind for each in calibration.bootstraps)
         if numbers is not None:
             assert calibration.simulator.edges_hz.shape == (numbers,)  # type: ignore[attr-defined]
         raise Taken

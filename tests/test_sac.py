@@ -32,7 +32,7 @@ from animat.training.sac import (
 from animat.training.settings import SAC
 from two_wheels import Wheels
 
-SETTINGS = SAC(discount=0.9, entropy_share=0.3, entropy_nats=-0.5)
+SETTINGS = SAC(discount=0.9, target_entropy_ratio=0.3, entropy_nats=-0.5)
 N, HIDDEN, ACTIONS, SIZE = 3, 5, 4, 12
 LOSSES = ("critics", "actor", "alpha")
 
@@ -50,7 +50,7 @@ compiled_gradients = jax.jit(jax.jacrev(all_losses))
 def reference_losses(trained: Trained, targets: Network, batch: Batch, uniforms: jax.Array | None) -> np.ndarray:
     trained, targets, batch = reference.in_float64((trained, targets, batch))
     if uniforms is None:
-        wanted = SETTINGS.entropy_share * math.log(ACTIONS)
+        wanted = SETTINGS.target_entropy_ratio * math.log(ACTIONS)
         return np.array(
             reference.discrete_losses(trained, targets, batch, discount=SETTINGS.discount, entropy_wanted=wanted)
         )
@@ -202,7 +202,7 @@ def test_actions_are_valid_and_possible_at_both_ends_of_the_uniforms(logits: lis
 
 def test_continuous_actions_follow_the_squashed_normal() -> None:
     environment = WithoutNeurons(Navigation(), None)
-    n = len(environment.quantities)
+    n = len(environment.observation_spec)
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 2)), jnp.array([[0.4, -0.7]])))
     uniforms = jax.random.uniform(jax.random.key(12), (20_000, 1))
     drawn = np.asarray(draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
@@ -212,7 +212,7 @@ def test_continuous_actions_follow_the_squashed_normal() -> None:
 
 def test_each_of_several_commands_follows_its_own_squashed_normal() -> None:
     environment = WithoutNeurons(Wheels(), None)
-    n = len(environment.quantities)
+    n = len(environment.observation_spec)
     outputs = jnp.array([[0.4, -1.0, -0.7, 0.2]])  # two means, then two log deviations
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 4)), outputs))
     uniforms = jax.random.uniform(jax.random.key(13), (20_000, 2))
@@ -237,7 +237,7 @@ def test_a_stack_of_networks_is_each_of_them() -> None:
 # --- settings -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["environments", "updates", "batch", "replay", "hidden"])
+@pytest.mark.parametrize("name", ["environments", "gradient_steps", "batch", "replay", "hidden"])
 def test_settings_refuse_counts_below_one(name: str) -> None:
     with pytest.raises(InvalidArgument, match=f"^{name}: expected at least 1, got 0"):
         replace(SAC(), **{name: 0})
@@ -246,8 +246,8 @@ def test_settings_refuse_counts_below_one(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *[(name, value) for name in ("learning_rate", "reward_scale", "first_alpha") for value in (0.0, math.inf)],
-        *[(name, value) for name in ("discount", "follow", "entropy_share") for value in (-0.1, 1.1)],
+        *[(name, value) for name in ("learning_rate", "reward_scale", "initial_alpha") for value in (0.0, math.inf)],
+        *[(name, value) for name in ("discount", "tau", "target_entropy_ratio") for value in (-0.1, 1.1)],
         ("entropy_nats", math.nan),
         ("learning_rate", math.nan),
         ("discount", math.nan),

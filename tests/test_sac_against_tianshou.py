@@ -25,7 +25,7 @@ tianshou_discrete_sac: Any = pytest.importorskip("tianshou.algorithm.modelfree.d
 tianshou_torch: Any = pytest.importorskip("tianshou.utils.torch_utils", reason=WHY)
 
 N, HIDDEN, ACTIONS, SIZE = 4, 16, 5, 64
-SETTINGS = SAC(discount=0.97, entropy_share=0.3, entropy_nats=-0.8)
+SETTINGS = SAC(discount=0.97, target_entropy_ratio=0.3, entropy_nats=-0.8)
 
 
 def as_modules(network: Network, which: int | None = None) -> Any:
@@ -169,7 +169,7 @@ def test_discrete_losses_targets_and_gradients(seed: int) -> None:
         actor=Outputs(actor, with_state=True, without_time=True), action_space=gymnasium.spaces.Discrete(ACTIONS)
     )
     wrapped = [Outputs(critic, with_state=False) for critic in critics]
-    wanted = SETTINGS.entropy_share * math.log(ACTIONS)
+    wanted = SETTINGS.target_entropy_ratio * math.log(ACTIONS)
     algorithm = tianshou_discrete_sac.DiscreteSAC(policy=policy, **shared_arguments(trained, wrapped, wanted))
     give_targets(algorithm, targets, lambda module: Outputs(module, with_state=False))
     statistics, their_targets = updated(algorithm, in_buffer(batch, continuous=False))

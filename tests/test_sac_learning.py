@@ -16,8 +16,8 @@ from scipy.optimize import brentq
 
 from animat.coding.mapping import mapping_named
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.training.sac import (
@@ -37,7 +37,7 @@ from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit
 from sac_toys import Follower, FollowerOfTwo, Payer
 
-SMALL = SAC(environments=2, updates=2, batch=8, replay=10, hidden=8)
+SMALL = SAC(environments=2, gradient_steps=2, batch=8, replay=10, hidden=8)
 DISCRETE = (-1.0, 1.0)
 
 compiled_begin = jax.jit(begin, static_argnums=(0, 1))
@@ -114,7 +114,7 @@ def test_returns_are_counted_in_the_tasks_own_units() -> None:
 
 
 def test_only_what_was_written_is_learned_from() -> None:
-    settings = SAC(environments=2, updates=4, batch=64, replay=2000, hidden=8)
+    settings = SAC(environments=2, gradient_steps=4, batch=64, replay=2000, hidden=8)
     environment = WithoutNeurons(Cartpole(), DISCRETE)
     learner = start(environment, settings, jax.random.key(0))
     poisoned = learner._replace(replay=jnp.full_like(learner.replay, jnp.nan))
@@ -130,11 +130,11 @@ def test_only_what_was_written_is_learned_from() -> None:
 @pytest.mark.parametrize("commands", [DISCRETE, None])
 def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[float, ...] | None) -> None:
     # One transition remembered, so the batch is known: that row, over and over.
-    settings = SAC(environments=1, updates=1, batch=4, replay=10, hidden=8, follow=0.25, learning_rate=0.01)
+    settings = SAC(environments=1, gradient_steps=1, batch=4, replay=10, hidden=8, tau=0.25, learning_rate=0.01)
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
     after, _ = trained_for(environment, settings, 1, learner=before)
-    n = len(environment.quantities) + 1
+    n = len(environment.observation_spec) + 1
     rows = jnp.tile(after.replay[:1], (4, 1))
     action = rows[:, 2 * n] if commands is not None else rows[:, 2 * n : 2 * n + 1]
     batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, 2 * n + 1], rows[:, 2 * n + 2])
@@ -164,8 +164,8 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
 # --- what it converges to -------------------------------------------------------------------------------------------
 
 CLOSED_FORM = SAC(
-    environments=4, updates=4, batch=32, replay=1024, hidden=16, learning_rate=3e-3, discount=0.6, follow=0.05,
-    reward_scale=0.5, entropy_share=0.5,
+    environments=4, gradient_steps=4, batch=32, replay=1024, hidden=16, learning_rate=3e-3, discount=0.6, tau=0.05,
+    reward_scale=0.5, target_entropy_ratio=0.5,
 )  # fmt: skip
 
 
@@ -175,7 +175,7 @@ def soft_solution(pay: float) -> tuple[float, float, float]:
     Critics differ by their rewards alone, so pi = softmax(rewards / alpha), alpha such that H(pi) is what is wanted,
     and V = sum pi r + alpha H(pi) + discount V.
     """
-    wanted = CLOSED_FORM.entropy_share * math.log(2)
+    wanted = CLOSED_FORM.target_entropy_ratio * math.log(2)
     p = brentq(lambda p: -p * math.log(p) - (1 - p) * math.log(1 - p) - wanted, 0.5, 1 - 1e-9)
     alpha = 2 * pay / math.log(p / (1 - p))
     return alpha, p, ((2 * p - 1) * pay + alpha * wanted) / (1 - CLOSED_FORM.discount)
@@ -210,8 +210,8 @@ def test_critics_converge_to_the_closed_form(limit: int, ends: bool) -> None:
 
 
 TRIVIAL = SAC(
-    environments=8, updates=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5, reward_scale=1.0,
-    entropy_nats=-2.0,
+    environments=8, gradient_steps=4, batch=64, replay=8192, hidden=32, learning_rate=3e-3, discount=0.5,
+    reward_scale=1.0, entropy_nats=-2.0,
 )  # fmt: skip
 
 
@@ -241,7 +241,7 @@ def test_two_commands_each_follow_their_own() -> None:
 @pytest.mark.oracle
 def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
     """Where gradients are all but 0, steps of their noise put units out: two of three with Adam's usual epsilon."""
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     environment = Animat(Navigation(), mapping_named("1-threshold"), simulator.n_conditions)
     settings = SAC(replay=16_384)
     keys = jax.random.split(jax.random.key(1), 8)
@@ -250,7 +250,7 @@ def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
     learners, _ = run(learners, simulator, jnp.int32(0), jnp.int32(400))
 
     def alive(actor: Network, replay: jax.Array) -> jax.Array:
-        hidden = replay[:8_000, : len(environment.quantities)]
+        hidden = replay[:8_000, : len(environment.observation_spec)]
         for layer in actor[:-1]:
             hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
         return jnp.mean(jnp.any(hidden > 0, axis=0))
@@ -262,7 +262,7 @@ def test_most_hidden_units_outlive_a_start_that_finds_nothing() -> None:
 
 
 def animat() -> tuple[Environment[Any], NeuronSimulator]:
-    simulator = made_up_simulator()
+    simulator = synthetic_simulator()
     return Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions), simulator
 
 
@@ -309,6 +309,6 @@ def test_another_simulator_is_data_and_compiles_nothing() -> None:
     environment, simulator = animat()
     learner, _ = trained_for(environment, SMALL, 2, seed=7, simulator=simulator)
     compiled = compiled_chunk._cache_size()  # type: ignore[attr-defined]
-    other = made_up_simulator((50, 40, 30, 20, 10))
+    other = synthetic_simulator((50, 40, 30, 20, 10))
     chunk(environment, SMALL, learner, other, 2, 3)
     assert compiled_chunk._cache_size() == compiled  # type: ignore[attr-defined]

@@ -10,8 +10,8 @@ import pytest
 from matplotlib.colors import to_hex
 
 from animat.errors import InvalidArgument, Mismatch
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.report.array import draw_array, draw_selection
 from animat.report.drift import draw_drift
 from animat.report.first_and_last import draw_first_and_last
@@ -27,7 +27,7 @@ from animat.stimulation.selection import Selection
 
 @pytest.fixture(scope="module")
 def recordings() -> list[Recording]:
-    return [make_up_recording(1, start_min=m, patterns=40, channels=64) for m in (0.0, 30.0, 60.0)]
+    return [synthetic_recording(1, start_min=m, patterns=40, channels=64) for m in (0.0, 30.0, 60.0)]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_a_series_has_its_figures(recordings: list[Recording], series: list[Resp
 def test_the_array_shows_every_site_and_counts_what_it_cannot_place(recordings: list[Recording]) -> None:
     axes = draw_array(recordings[0]).axes[0]
     assert len(axes.collections[0].get_offsets()) == 64
-    # Made-up cultures stimulate electrodes that no channel reads.
+    # Synthetic cultures stimulate electrodes that no channel reads.
     assert len(axes.collections) == 1
     assert "32 stimulated electrodes that no channel reads are not drawn" in axes.figure.get_suptitle()
     unknown = recordings[0].channels.x_um.copy()

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from animat.cli import main
-from animat.closed_loop.contenders import Contender, OneCondition
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
@@ -32,8 +32,8 @@ from fake_culture import FakeCulture
 from test_closed_loop import RANDOM, loop_of
 
 
-def lived(folder: Path, **changed: Any) -> Session:
-    silent = Contender("silent", "", OneCondition(0), "silent")
+def ran(folder: Path, **changed: Any) -> Session:
+    silent = Agent("silent", "", OneCondition(0), "silent")
     with FakeCulture(3) as culture:
         return run_session(culture, loop_of(**changed), [RANDOM, silent], folder, episodes=3)
 
@@ -62,7 +62,7 @@ def as_logged(folder: Path) -> dict[str, Any]:
 
 
 def test_a_killed_session_is_recovered_to_the_bits_that_it_would_have_written(tmp_path: Path) -> None:
-    session = lived(tmp_path / "whole", pulses=3, lead_in=1, burst_threshold=0.9, on_burst="repeat")
+    session = ran(tmp_path / "whole", pulses=3, warm_up=1, burst_threshold=0.9, on_burst="repeat")
     killed = tmp_path / "killed"
     killed.mkdir()
     (killed / LOG_FILE).write_bytes((tmp_path / "whole" / LOG_FILE).read_bytes())
@@ -107,7 +107,7 @@ def test_a_table_that_cannot_be_written_on_the_way_is_made_in_the_end(
 
     monkeypatch.setattr(TickTable, "add", failing)
     monkeypatch.setattr(Session, "write", noting)
-    session = lived(tmp_path)
+    session = ran(tmp_path)
     # The first one, which was given up, takes no room beside the second.
     assert not there
     assert session.ending.by == "plan"
@@ -119,7 +119,7 @@ def test_a_table_that_cannot_be_written_on_the_way_is_made_in_the_end(
 
 def long_log(folder: Path, ticks: int) -> None:
     """A log of so many ticks, as the loop writes it, with the spikes of all at the same times after each pulse."""
-    header = read_log(lived(folder / "short").folder / LOG_FILE).header
+    header = read_log(ran(folder / "short").folder / LOG_FILE).header
     last = next(w for w in read_log(folder / "short" / LOG_FILE).records.words() if w["kind"] == "seen" and w["tick"])
     log = LogWriter(folder / "long" / LOG_FILE, header)
     spikes_s, channels = np.linspace(0.001, 0.009, 40), np.arange(40) % 16
@@ -205,7 +205,7 @@ def test_spikes_that_cannot_be_are_refused_in_blocks_too(
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], bytes]:
     """The header of a session's log, and what comes after it."""
-    session = lived(tmp_path_factory.mktemp("whole"))
+    session = ran(tmp_path_factory.mktemp("whole"))
     data = (session.folder / LOG_FILE).read_bytes()
     return session.log.header, data[8 + 16 + struct.unpack_from("<4sIII", data, 8)[1] :]
 
@@ -229,7 +229,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], byt
         ("loop", None, "loop.pulses: expected a whole number, got None"),
         ("loop.pulses", 0, "pulses"),
         ("loop.conditions", "5 Hz", "loop.conditions: expected a list of texts"),
-        ("contenders", [{"name": 1}], "contenders[0].name: expected text, got 1"),
+        ("agents", [{"name": 1}], "agents[0].name: expected text, got 1"),
         ("observed", {"x": 1}, "observed: expected a list of texts"),
     ],
 )

@@ -111,9 +111,9 @@ def test_memory_chooses_the_trial_that_it_would_with_one_readout() -> None:
     responses, memory = of_halves(), Memory(0.3, 0.5, 0.7)
     both = fit_memory(responses, memory=memory)
     one = fit_memory(replace(responses, readouts=Readouts(), readout_hz=None), memory=memory)
-    for u, past in np.random.default_rng(0).random((50, 2), np.float32):
-        here, there = (each.answer(jnp.int32(1), jnp.float32(u), jnp.float32(past)) for each in (both, one))
-        assert here.past == there.past
+    for u, history in np.random.default_rng(0).random((50, 2), np.float32):
+        here, there = (each.answer(jnp.int32(1), jnp.float32(u), jnp.float32(history)) for each in (both, one))
+        assert here.history == there.history
         # x of all channels is the mean of the halves.
         np.testing.assert_allclose(np.mean(here.rate_hz), there.rate_hz, rtol=1e-6)
 
@@ -129,7 +129,7 @@ def test_percentiles_and_shares_are_of_each_readout() -> None:
         for c in range(3):
             share = (responses.read_of(c) >= np.median(responses.read_hz, axis=0)).mean(axis=0)
             np.testing.assert_allclose(kept.in_data[c], share)
-            # With memory, those whose pasts are at the ends are neighbours less often.
+            # With memory, those whose histories are at the ends are neighbours less often.
             np.testing.assert_allclose(kept.in_simulator[c], share, atol=0.05 if kind == "memory" else 0.01)
         np.testing.assert_array_equal(drawn(silenced(simulator), 10), np.zeros((3, 10, 2)))
 
@@ -137,7 +137,7 @@ def test_percentiles_and_shares_are_of_each_readout() -> None:
 def test_what_a_range_loses_is_told_with_its_readout() -> None:
     kept = fidelity(of_halves(), fit_simulator(of_halves(), kind="histogram", bins=2, range_hz=200.0))
     (finding,) = [each for each in kept.findings() if each.name == "binning"]
-    assert " Hz on left from " in finding.sentence or " Hz on right from " in finding.sentence
+    assert " Hz on left from " in finding.message or " Hz on right from " in finding.message
 
 
 def test_timelines_stack_them_and_refuse_others() -> None:

@@ -185,7 +185,7 @@ def test_a_timelines_edges_are_each_recordings_own_unless_a_range_is_given() -> 
     assert [float(own.at(minute).edges_hz[-1]) for minute in (0.0, 10.0)] == [55.0, 155.0]
     assert [float(given.at(minute).edges_hz[-1]) for minute in (0.0, 10.0)] == [120.0, 120.0]
     assert [kept.n_above_range for kept in given.fidelities] == [0, 9]
-    above = [f.sentence for f in given.findings if f.name == "above-range"]
+    above = [f.message for f in given.findings if f.name == "above-range"]
     assert len(above) == 1
     assert above[0].startswith("at 10 min: 9 responses")
 

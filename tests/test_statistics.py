@@ -154,7 +154,7 @@ def test_normalised_score() -> None:
     assert normalised_score(-80, -80, 17) == 0
     assert normalised_score(17, -80, 17) == 1
     assert normalised_score(0, -50, 50) == 0.5
-    with pytest.raises(InvalidArgument, match="limit"):
+    with pytest.raises(InvalidArgument, match="optimum"):
         normalised_score(1.0, 2.0, 2.0)
 
 

@@ -31,16 +31,16 @@ from animat.cultures.kinds import recorded_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
-from animat.neurons.made_up import made_up_simulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.progress import Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
-from animat.recordings.made_up import make_up_recording, write_made_up_series
 from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.report.html import cell, with_error
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
@@ -55,15 +55,15 @@ from animat.studies.recording import Record
 from animat.studies.run import Ran, run_study
 from animat.studies.simulating import Fit, load_timeline
 from animat.studies.source import Source
-from animat.studies.specification import Body, Compared, Simulators, Study, StudyCondition
+from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
 from animat.training.policy import Policy
-from animat.writing import LOCK, alone_in
+from animat.writing import LOCK, exclusive_lock
 from cultures import small_culture
 
 TINY = Path(__file__).parent / "tiny_study.toml"
-CONTROLS = [condition.name for condition in read_study(TINY).conditions if condition.delivery == "shuffled"]
+CONTROLS = [arm.name for arm in read_study(TINY).arms if arm.delivery == "shuffled"]
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +210,7 @@ def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused(finished: Path) -> None:
-    with alone_in(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
+    with exclusive_lock(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
         run_study(read_study(TINY), finished, base=TINY.parent)
     assert run_study(read_study(TINY), finished, base=TINY.parent).done_now == {}
 
@@ -314,7 +314,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
 ) -> None:
     rule = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=100)
     monkeypatch.setattr("animat.cultures.virtual.VirtualCulture", partial(small_culture, rule=rule))
-    study = Study(culture=Source(sessions=2, interval_min=2.0, presentations=2))
+    study = Study(culture=Source(sessions=2, interval_min=2.0, trials=2))
 
     def record(name: str) -> Receipt:
         done = carry_out(Record(study, tmp_path), tmp_path / name, tmp_path / "told")
@@ -353,7 +353,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
         assert record("killed") == undisturbed
 
 
-@pytest.mark.parametrize("kind", ["virtual", "made-up"])
+@pytest.mark.parametrize("kind", ["virtual", "synthetic"])
 def test_a_study_of_a_virtual_culture_is_one_of_its_tissue_s_revision(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -385,7 +385,7 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, mo
     monkeypatch.setattr("animat.studies.pictures.save_figure", lambda figure, path: path)
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
-        made = make_up_recording(1, patterns=20, channels=channels)
+        made = synthetic_recording(1, patterns=20, channels=channels)
         write_nwb(replace(made, start_min=minute), folder / "recordings" / recording_name(minute))
     study = Study(culture=Source("files", files=("recordings",)))
     CulturePictures(study).run(folder, Silent())
@@ -394,7 +394,7 @@ def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, mo
 
 def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None:
     for i, start_min in enumerate((1234567.0, 1234567.25)):
-        write_nwb(make_up_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
+        write_nwb(synthetic_recording(1, start_min=start_min, patterns=5, channels=16), tmp_path / f"{i}.nwb")
     study = Study(culture=Source("files", files=("0.nwb", "1.nwb")))
     with pytest.raises(InvalidFile, match=r"two that would both be recording_1\.23457e"):
         Record(study, tmp_path).run(tmp_path / "study", Silent())
@@ -402,14 +402,14 @@ def test_recordings_whose_names_would_be_one_are_refused(tmp_path: Path) -> None
 
 def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
     made = tmp_path / "made"
-    write_made_up_series(1, made, sessions=2, patterns=5, channels=16)
-    study = Study(culture=Source("files", files=("made",)), robots=(Body("navigation", iterations=100),))
+    write_synthetic_series(1, made, sessions=2, patterns=5, channels=16)
+    study = Study(culture=Source("files", files=("made",)), robots=(RobotSpec("navigation", iterations=100),))
     with pytest.raises(AnimatError, match="fit: halted"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
     written = tmp_path / "study" / "study.toml"
     assert read_study(written) == study
     assert written.read_text().startswith("# files: as seen from where the specification lay.")
-    write_nwb(make_up_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
+    write_nwb(synthetic_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
 
@@ -441,9 +441,9 @@ def episodes_in(folder: Path, **columns: str) -> list[dict[str, str]]:
 def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
     (told,) = rows(finished / "tables/comparisons.csv")
     means = []
-    for condition in ("before training", "1 threshold"):
+    for arm in ("before training", "1 threshold"):
         returns = defaultdict(list)
-        for row in episodes_in(finished, arm=condition, agent="policy", at_min="0.0", over_time="False"):
+        for row in episodes_in(finished, arm=arm, agent="policy", at_min="0.0", over_time="False"):
             returns[row["actor"]].append(float(row["return"]))
         assert {len(of_policy) for of_policy in returns.values()} == {5}
         means.append([np.mean(of_policy) for of_policy in returns.values()])
@@ -454,14 +454,14 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
     assert (float(told["paper_p"]), told["as_in_paper"]) == (PRINTED[told["comparison"], "navigation"].p, "cannot tell")
 
 
-def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -> None:
-    """From the episodes and the limits themselves, not from other columns of the table."""
+def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path) -> None:
+    """From the episodes and the optima themselves, not from other columns of the table."""
     arm_of = {
         "none": "without neurons",
         "1-threshold": "1-threshold",
-        "9-thresholds": "9-thresholds, percentiles held",
+        "9-thresholds": "9-thresholds, percentiles fixed",
     }
-    limits = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/limits.csv")}
+    optima = {(row["mapping"], float(row["at_min"])): row for row in rows(finished / "tables/optima.csv")}
 
     def returns_of(arm: str, agent: str, at_min: str) -> np.ndarray:
         """All have as many episodes."""
@@ -473,23 +473,23 @@ def test_scores_are_places_on_the_way_from_random_to_the_limit(finished: Path) -
     for row in scores:
         mapping, at_min = row["mapping"], float(row["at_min"])
         random_ = returns_of(arm_of[mapping], "random", row["at_min"]).mean()
-        policies = returns_of(row["condition"], "policy", row["at_min"])
-        if row["condition"] in CONTROLS:
-            # Whatever it chooses is as good as random: it has no limit of its own.
-            assert (row["limit"], row["normalised_score"]) == ("", "")
+        policies = returns_of(row["arm"], "policy", row["at_min"])
+        if row["arm"] in CONTROLS:
+            # Whatever it chooses is as good as random: it has no optimum of its own.
+            assert (row["optimum"], row["normalised_score"]) == ("", "")
             continue
-        limit = limits[mapping, at_min]
-        best = float(limit["best_return"])
+        optimum = optima[mapping, at_min]
+        best = float(optimum["best_return"])
         assert float(row["normalised_score"]) == pytest.approx((policies.mean() - random_) / (best - random_))
         error = policies.std(ddof=1) / np.sqrt(len(policies))
-        assert policies.mean() < best + float(limit["grid_error"]) + 4 * error
+        assert policies.mean() < best + float(optimum["grid_error"]) + 4 * error
     controls = rows(finished / "tables/controls.csv")
     names = {row["control"] for row in controls if row["mapping"] == "1-threshold"}
-    assert {"random", "silent", "shuffled", "made by hand", "constant 80 Hz"} <= names
+    assert {"random", "silent", "shuffled", "heuristic", "constant 80 Hz"} <= names
 
 
-def test_limits_have_intervals_where_conditions_are_evaluated_through_thresholds(finished: Path) -> None:
-    for row in rows(finished / "tables/limits.csv"):
+def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(finished: Path) -> None:
+    for row in rows(finished / "tables/optima.csv"):
         assert row["left_out"] == ""
         evaluated = row["mapping"] != "none" and (row["mapping"] == "1-threshold" or float(row["at_min"]) == 140)
         assert bool(row["low_95"]) == bool(row["high_95"]) == evaluated
@@ -509,10 +509,10 @@ def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
     assert before.probabilities(np.zeros(3, np.float32)) == pytest.approx(np.full(5, 0.2), abs=0.01)
 
 
-def test_no_two_conditions_start_from_the_same_networks() -> None:
+def test_no_two_arms_start_from_the_same_networks() -> None:
     study = paper_study()
-    pairs = [(body, condition) for body in study.robots for condition in study.conditions]
-    assert len({training_of(study, body, condition).seed for body, condition in pairs}) == len(pairs)
+    pairs = [(spec, arm) for spec in study.robots for arm in study.arms]
+    assert len({training_of(study, spec, arm).seed for spec, arm in pairs}) == len(pairs)
 
 
 def test_simulators_are_kept_whole(finished: Path) -> None:
@@ -556,7 +556,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
             assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
         assert f'href="figures/{stem}.svg"' in page
     assert page.count("<img ") == page.count("data:image/png;base64,") == len(expected)
-    tables = ("Comparisons", "Every condition", "Optimal returns", "Controllability of every recording")
+    tables = ("Comparisons", "Every arm", "Optimal returns", "Controllability of every recording")
     for title in (*tables, "Controls"):
         assert f"<caption>{title}</caption>" in page
     assert "<dt>Pole mass</dt>" not in page, "there is no cartpole in this study"
@@ -564,7 +564,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
         assert f"<dt>{decision}</dt>" in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
-        "scores", "comparisons", "controls", "heuristic", "learning-curves", "limits", "controllability", "findings",
+        "scores", "comparisons", "controls", "heuristic", "learning-curves", "optima", "controllability", "findings",
         "culture-array", "culture-psth", "culture-bursts", "culture-conditions", "culture-drift",
         "navigation-learning", "navigation-over-time", "navigation-paths", "episodes",
     }  # fmt: skip
@@ -577,7 +577,7 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
     since_s = (first.spike_times_s[:, None] - first.stimuli.time_s)[:, first.stimuli.is_last_of_presentation]
     for row in psth:
         low_s, high_s = float(row["from_ms"]) * 1e-3, float(row["to_ms"]) * 1e-3
-        # Spikes of made-up recordings lie on no edge.
+        # Spikes of synthetic recordings lie on no edge.
         spikes = np.count_nonzero((since_s > low_s) & (since_s < high_s))
         assert int(row["spikes"]) == spikes
         exposure_s = (high_s - low_s) * since_s.shape[1] * 32
@@ -616,11 +616,11 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
 def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path) -> None:
     curves: dict[tuple[str, str], list[float]] = defaultdict(list)
     for row in rows(finished / "tables/learning-curves.csv"):
-        curves[row["condition"], row["iterations"]] += [float(row["mean_return"])] if row["mean_return"] else []
+        curves[row["arm"], row["iterations"]] += [float(row["mean_return"])] if row["mean_return"] else []
     learning = rows(finished / "tables/navigation-learning.csv")
-    assert [(row["condition"], row["iterations"]) for row in learning] == list(curves)
+    assert [(row["arm"], row["iterations"]) for row in learning] == list(curves)
     for row in learning:
-        of = curves[row["condition"], row["iterations"]]
+        of = curves[row["arm"], row["iterations"]]
         assert int(row["policies"]) == len(of)
         if not of:
             assert row["mean_return"] == row["low_95"] == row["high_95"] == ""
@@ -630,10 +630,10 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
         # other.
         assert [float(row["low_95"]), float(row["high_95"])] == pytest.approx([min(of), max(of)])
     course = rows(finished / "tables/navigation-over-time.csv")
-    assert {row["condition"] for row in course} == {"before training", "1 threshold", "control"}
+    assert {row["arm"] for row in course} == {"before training", "1 threshold", "control"}
     for row in course:
         returns = defaultdict(list)
-        for each in episodes_in(finished, arm=row["condition"], at_min=row["at_min"], over_time="True"):
+        for each in episodes_in(finished, arm=row["arm"], at_min=row["at_min"], over_time="True"):
             returns[each["actor"]].append(float(each["return"]))
         means = [np.mean(of_policy) for of_policy in returns.values()]
         told = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
@@ -698,16 +698,16 @@ def test_a_study_written_as_toml_is_read_as_the_same(study: Study, tmp_path: Pat
 def test_the_paper_is_kept_to() -> None:
     study = paper_study()
     assert (study.policies, study.culture.sessions, study.culture.interval_min) == (10, 15, 10.0)
-    assert [body.trained_for for body in study.robots] == [800_000, 500_000]
+    assert [spec.trained_for for spec in study.robots] == [800_000, 500_000]
     assert {(c.at_min, c.episodes) for c in study.comparisons} == {(0.0, 30), (140.0, 100)}
-    assert {(c.name, body.name) for c in study.comparisons for body in study.robots} == set(PRINTED)
+    assert {(c.name, spec.name) for c in study.comparisons for spec in study.robots} == set(PRINTED)
     assert {job.name.split("/")[0] for job in plan_study(paper_study(quick=True), Path())} == {
         job.name.split("/")[0] for job in plan_study(study, Path())
     }
 
 
 COMPARED = (
-    "[[conditions]]\nname = '1 threshold'\n[[conditions]]\nname = 'b'\n"
+    "[[arms]]\nname = '1 threshold'\n[[arms]]\nname = 'b'\n"
     "[[comparisons]]\nname = 'a'\nfirst = '1 threshold'\nsecond = 'b'\nat_min = {}"
 )
 
@@ -721,22 +721,22 @@ COMPARED = (
         ("policies = ", "expected TOML"),
         ("# nothing yet", "expected the settings of a study, got none"),
         ("seed = true", "seed: expected a whole number, got True"),
-        ("conditions = []", "conditions: expected at least one"),
+        ("arms = []", "arms: expected at least one"),
         ("robots = 'cartpole'", "robots: expected a list"),
         ("[[robots]]\nname = 'cart'", "robot: expected one of cartpole, navigation, got 'cart'"),
         ("[[robots]]\niterations = 3", "robots.name: expected to be given"),
         ("[[robots]]\nname = 'cartpole'\nparameters = { mass = 1 }", "expected parameters among"),
-        ("[[conditions]]\nname = 'a/b'", "conditions.name: expected letters"),
-        ("[[conditions]]\nname = '10'", "which in a table would be a number"),
-        ("[[conditions]]\nname = 'a'\n[[conditions]]\nname = 'A'", "expected each name once"),
-        ("[[conditions]]\nname = 'a'\nmapping = '2'", "conditions.mapping: expected one of"),
+        ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
+        ("[[arms]]\nname = '10'", "which in a table would be a number"),
+        ("[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'", "expected each name once"),
+        ("[[arms]]\nname = 'a'\nmapping = '2'", "arms.mapping: expected one of"),
         (
-            "[[conditions]]\nname = 'a'\ndelivery = 'none'",
-            "conditions.delivery: expected 'chosen' or 'shuffled', got 'none'",
+            "[[arms]]\nname = 'a'\ndelivery = 'none'",
+            "arms.delivery: expected 'chosen' or 'shuffled', got 'none'",
         ),
-        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the conditions"),
-        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another condition"),
-        ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual', 'made-up' or 'files', got 'alive'"),
+        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the arms"),
+        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another arm"),
+        ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual', 'synthetic' or 'files', got 'alive'"),
         ("[culture]\nkind = 'files'", "culture.files: expected some"),
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
         ("[culture]\ninterval_min = inf", "culture.interval_min: expected a finite number, got inf"),
@@ -767,10 +767,10 @@ COMPARED = (
                 ("", "policies"),
                 ("", "episodes"),
                 ("", "episodes_over_time"),
-                ("", "limit_episodes"),
+                ("", "optimum_episodes"),
                 ("[culture]\n", "sessions"),
-                ("[culture]\n", "presentations"),
-                ("[culture]\nkind = 'made-up'\n", "channels"),
+                ("[culture]\n", "trials"),
+                ("[culture]\nkind = 'synthetic'\n", "channels"),
                 ("[[robots]]\nname = 'cartpole'\n", "iterations"),
                 ("[algorithm]\n", "hidden"),
                 ("[algorithm]\n", "environments"),
@@ -778,14 +778,14 @@ COMPARED = (
         ],
         ("policies = 1000\nepisodes = 5001", "episodes: expected at most 5,000,000 of all policies together"),
         (
-            "policies = 1000\nconditions = [{name = 'a'}, {name = 'b'}]\nrobots = ["
+            "policies = 1000\narms = [{name = 'a'}, {name = 'b'}]\nrobots = ["
             + ", ".join(f"{{name = 'r{i}', kind = 'cartpole'}}" for i in range(11))
             + "]",
             "policies: expected at most 20,000 in a study, got 22,000",
         ),
-        ("limit_resolution = 3.0", "limit_resolution: expected at most 2.0, got 3.0"),
+        ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2.0, got 3.0"),
         ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
-        ("[culture]\nkind = 'made-up'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
+        ("[culture]\nkind = 'synthetic'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
         (f"policies = {'9' * 5000}", "expected TOML, got a mistake: Exceeds the limit (4300 digits)"),
         (f"policies = 0x{'f' * 5000}", "policies: expected at most 1,000, got a number of 20,000 bits"),
         (f"training_min = 0x{'f' * 5000}", "training_min: expected a number, got a number of 20,000 bits"),
@@ -793,7 +793,7 @@ COMPARED = (
         (f"title = {'{a=' * 20_000}", "nested without end"),
         (f"{'a.' * 20_000}b = 1", "a: no such setting at the top"),
         ("'a\\nb' = 1", "a\\nb"),
-        (f"conditions = [{'{name = 1},' * 1001}]", "conditions.name: expected text, got 1"),
+        (f"arms = [{'{name = 1},' * 1001}]", "arms.name: expected text, got 1"),
         (f"culture = {{files = {['a'] * 1001}}}", "culture.files: expected at most 1,000 entries, got "),
         ("#" * 2**20 + "\n", "expected at most 1,048,576 bytes"),
         ("[culture]\nkind = 'files'\nfiles = ['']", "culture.files: expected names of files, got ''"),
@@ -838,20 +838,20 @@ def test_choices_are_checked_from_python_too() -> None:
     for make in (
         lambda: Source(kind="alive"),  # type: ignore[arg-type]
         lambda: Simulators(kind="exact"),  # type: ignore[arg-type]
-        lambda: StudyCondition("a", delivery="none"),  # type: ignore[arg-type]
+        lambda: Arm("a", delivery="none"),  # type: ignore[arg-type]
         lambda: Study(actions="best"),  # type: ignore[arg-type]
     ):
         with pytest.raises(InvalidArgument, match=r"(kind|delivery|actions): expected '\w"):
             make()
 
 
-PAIR = (StudyCondition("1 threshold"), StudyCondition("control", delivery="shuffled"))
+PAIR = (Arm("1 threshold"), Arm("control", delivery="shuffled"))
 
 
 def test_comparisons_are_made_at_the_nearest_recording() -> None:
     def at(minutes: list[float | None], start_min: list[float]) -> list[float | None]:
         compared = tuple(Compared(f"c{i}", "1 threshold", "control", at) for i, at in enumerate(minutes))
-        study = Study(culture=Source("files", files=("a.nwb",)), conditions=PAIR, comparisons=compared)
+        study = Study(culture=Source("files", files=("a.nwb",)), arms=PAIR, comparisons=compared)
         return [each.at_min for each in study.at_recordings(start_min).comparisons]
 
     start_min = [0.0, 10.02, 60.0]
@@ -864,23 +864,23 @@ def test_comparisons_are_made_at_the_nearest_recording() -> None:
 
 
 def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     moved = Compared("before and after", "1 threshold", "control", at_min=29.0)
     study = Study(
         culture=Source("files", files=("made",)),
-        conditions=PAIR,
+        arms=PAIR,
         comparisons=(moved, replace(moved, name="b", at_min=30.0)),
     )
     Record(study, tmp_path).run(tmp_path / "study", Silent())
     kept, _ = Fit(study).run(tmp_path / "study", Silent())
     (told,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
-    assert told.sentence == "before and after was asked for at 29 min and is made on the recording at 30 min"
+    assert told.message == "before and after was asked for at 29 min and is made on the recording at 30 min"
     with pytest.raises(InvalidArgument, match="at_min"):
         Fit(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
 
 
 def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     one = Study(culture=Source("files", files=("made",)), simulators=Simulators(conditions="all"))
     Record(one, tmp_path).run(tmp_path / "study", Silent())
     with pytest.raises(UnusableData, match=r"simulators\.conditions: expected two or more .* got one \(all\)"):
@@ -890,14 +890,12 @@ def test_recordings_that_leave_nothing_to_choose_are_refused(tmp_path: Path) -> 
     assert len(load_timeline(kept).conditions) == 1
 
 
-def test_no_two_conditions_or_controls_share_a_file(tmp_path: Path) -> None:
+def test_no_two_arms_or_controls_share_a_file(tmp_path: Path) -> None:
     names = ("a", "a paths", "a over-time", "controls", "controls-1-threshold", "over-time")
-    body = Body("navigation")
-    conditions = [StudyCondition(name, percentiles=held) for name in names for held in ("moving", "first")]
-    places = {
-        of(tmp_path, body, condition) for condition in conditions for of in (episodes_file, controls_file, paths_file)
-    }
-    # A condition's name is its own, however its percentiles are held; controls are of a way to hold them.
+    spec = RobotSpec("navigation")
+    arms = [Arm(name, percentiles=held) for name in names for held in ("moving", "first")]
+    places = {of(tmp_path, spec, arm) for arm in arms for of in (episodes_file, controls_file, paths_file)}
+    # An arm's name is its own, whether its percentiles are fixed or not; controls are told apart by that.
     assert len(places) == 2 * len(names) + 2
 
 
@@ -917,14 +915,14 @@ def test_the_specifications_on_the_page_are_read(tmp_path: Path) -> None:
     assert len(blocks) == 2
     for block in blocks:
         (tmp_path / "study.toml").write_text(block)
-        assert read_study(tmp_path / "study.toml").conditions
+        assert read_study(tmp_path / "study.toml").arms
 
 
 # --- jobs -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_need_of_a_plan_is_a_job_of_it() -> None:
-    for study in (paper_study(), read_study(TINY), Study(conditions=(StudyCondition("direct", mapping="none"),))):
+    for study in (paper_study(), read_study(TINY), Study(arms=(Arm("direct", mapping="none"),))):
         jobs = in_order(plan_study(study, Path()))
         names = [job.name for job in jobs]
         assert len(set(names)) == len(names)
@@ -933,7 +931,7 @@ def test_every_need_of_a_plan_is_a_job_of_it() -> None:
 
 
 def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     study = Study(culture=Source("files", files=("made",)), simulators=Simulators(kind="empirical"))
     folder = tmp_path / "study"
     copies = Record(study, tmp_path).run(folder, Silent())
@@ -952,11 +950,11 @@ def test_recordings_at_hand_are_copied_and_fitted(tmp_path: Path) -> None:
 
 @pytest.mark.oracle
 def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path: Path) -> None:
-    write_made_up_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
+    write_synthetic_series(1, tmp_path / "made", sessions=1, patterns=10, channels=16)
     study = replace(
         read_study(TINY),
         culture=Source("files", files=("made",)),
-        conditions=(StudyCondition("held", percentiles="first"),),
+        arms=(Arm("held", percentiles="first"),),
         comparisons=(),
         policies=1,
         paper=False,
@@ -964,25 +962,25 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
     ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
     assert len(ran.done_now) == ran.jobs
     page = ran.report.read_text()
-    assert "The study compares no conditions" in page
+    assert "The study compares no arms" in page
     assert "Differences from the paper" not in page
 
 
 @pytest.mark.parametrize("mapping", ["1-threshold", "9-thresholds"])
-def test_the_rule_made_by_hand_goes_where_it_should(mapping: str) -> None:
-    simulator = made_up_simulator()
+def test_the_heuristic_policy_goes_where_it_should(mapping: str) -> None:
+    simulator = synthetic_simulator()
     for robot, lean_right in (
         (Cartpole(), [0.0, 0.0, 0.05, 0.0]),
         # At the top, looking right: the goal is below, which is clockwise.
         (Navigation(), [0.5, 0.0, 0.0]),
     ):
         environment: Animat[Any] = Animat(robot, mapping_named(mapping), 5)
-        rule = hand_made(environment, simulator)
+        rule = heuristic_policy(environment, simulator)
         seen = np.array([lean_right, lean_right]) / environment.scales
         if isinstance(robot, Cartpole):
             seen[1] *= -1
         else:
             seen[1, 1] = 0.95  # below the goal
         actor = jax.tree.map(lambda leaf: leaf[0], rule)
-        # The made-up means rise with the frequency.
+        # The synthetic means rise with the frequency.
         assert actor.act(environment, seen, np.zeros((2, 1))).tolist() == [4, 0]

@@ -1,4 +1,4 @@
-"""What a study says of its policies beside the rule made by hand, for returns whose order is known."""
+"""What a study says of its policies beside the heuristic policy, for returns whose order is known."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from animat.evaluation.rollouts import Episodes
 from animat.studies.episodes import RANDOM, tabulated
 from animat.studies.heuristic import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, beside_heuristic, not_outperforming
 from animat.studies.results import Results
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Study
 
 
 def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
-    body, condition = Body("cartpole"), StudyCondition("1 threshold")
-    without = StudyCondition("without neurons", mapping="none", trained=False)
-    study = Study(robots=(body,), conditions=(condition, without))
+    spec, arm = RobotSpec("cartpole"), Arm("1 threshold")
+    without = Arm("without neurons", mapping="none", trained=False)
+    study = Study(robots=(spec,), arms=(arm, without))
     rng = np.random.default_rng(1)
     minutes = {0.0: (30, 50.0), 10.0: (30, 0.0), 20.0: (30, -50.0), 30.0: (2, 50.0)}
     parts, ours, theirs = [], {}, {}
     for at_min, (episodes, by) in minutes.items():
         ours[at_min], theirs[at_min] = rng.normal(by, 10, (2, episodes)), rng.normal(0, 10, (1, episodes))
-        parts.append(tabulated(episodes_of(ours[at_min]), robot="cartpole", arm=condition.name, at_min=at_min))
+        parts.append(tabulated(episodes_of(ours[at_min]), robot="cartpole", arm=arm.name, at_min=at_min))
         for agent, returns in ((HEURISTIC, theirs[at_min]), (RANDOM, np.full((1, episodes), -80.0))):
             told = {"robot": "cartpole", "arm": "1-threshold", "agent": agent, "at_min": at_min}
             parts.append(tabulated(episodes_of(returns), **told))
 
-    rows = tuple(beside_heuristic(study, pd.concat(parts), body))
+    rows = tuple(beside_heuristic(study, pd.concat(parts), spec))
     assert [row.outcome for row in rows] == [OUTPERFORM, NOT, NOT, TOO_FEW]
     for row in rows:
         a, b = ours[row.at_min].ravel(), theirs[row.at_min].ravel()
         assert np.isclose(row.p, mannwhitneyu(a, b, method="asymptotic").pvalue)
         assert np.isclose(row.mean_return, np.mean(a)) and np.isclose(row.heuristic, np.mean(b))
 
-    sentences = not_outperforming(Results((), (), (), rows, (), ()))
-    assert [sentence.split(": ")[0] for sentence in sentences] == [
+    messages = not_outperforming(Results((), (), (), rows, (), ()))
+    assert [message.split(": ")[0] for message in messages] == [
         "cartpole, 1 threshold, at 10 min",
         "cartpole, 1 threshold, at 20 min",
     ]

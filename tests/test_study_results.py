@@ -27,14 +27,14 @@ from animat.robots import Navigation
 from animat.studies.draws import draw_seed
 from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, tabulated, write_episodes
 from animat.studies.evaluating import Evaluate
-from animat.studies.limits import FindLimits, read_limits
-from animat.studies.places import controls_file, episodes_file, limits_file, results_file, table_file
+from animat.studies.optima import FindOptima, read_optima
+from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
-from animat.studies.results import ComparedReturns, Limit, Results, Score, read_typed, write_typed
-from animat.studies.shown import limits_shown
+from animat.studies.results import ComparedReturns, Results, Score, StudyOptimum, read_typed, write_typed
+from animat.studies.shown import optima_shown
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
-from animat.studies.specification import Body, Compared, Study, StudyCondition, named_mapping
+from animat.studies.specification import Arm, Compared, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import References, Tabulate, _known
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -42,9 +42,9 @@ from animat.wrappers import ShuffledDelivery
 
 # --- which side is better -------------------------------------------------------------------------------------------
 
-WORSE = StudyCondition("worse", mapping="none", trained=False)
-BETTER = StudyCondition("better", mapping="none", trained=False)
-LIKE = StudyCondition("like", mapping="none", trained=False)
+WORSE = Arm("worse", mapping="none", trained=False)
+BETTER = Arm("better", mapping="none", trained=False)
+LIKE = Arm("like", mapping="none", trained=False)
 RETURNS = {
     "worse": [-80.0, -75.0, -70.0, -72.0, -78.0, -74.0],
     "better": [10.0, 12.0, 8.0, 15.0, 9.0, 11.0],
@@ -53,23 +53,23 @@ RETURNS = {
 
 
 def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedReturns, ...]:
-    """The comparisons of made-up returns of six policies: two episodes each, one below and one above."""
+    """The comparisons of synthetic returns of six policies: two episodes each, one below and one above."""
     study = Study(
-        robots=(Body("cartpole"), Body("navigation")),
-        conditions=(WORSE, BETTER, LIKE),
+        robots=(RobotSpec("cartpole"), RobotSpec("navigation")),
+        arms=(WORSE, BETTER, LIKE),
         comparisons=comparisons,
         policies=6,
         episodes=2,
     )
-    for body in study.robots:
-        for condition in study.conditions:
+    for spec in study.robots:
+        for arm in study.arms:
             # A third episode, that no comparison asks for, would turn every order around.
-            returns = np.array([[mean - 1.0, mean + 1.0, -4.0 * mean] for mean in RETURNS[condition.name]])
-            table = tabulated(episodes_of(returns), robot=body.name, arm=condition.name, at_min=0.0)
-            write_episodes(episodes_file(folder, body, condition), [table])
-        write_random(folder, body, LIKE, 0.0)
-        limit = Limit(body.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
-        write_typed(limits_file(folder, body.name), [limit])
+            returns = np.array([[mean - 1.0, mean + 1.0, -4.0 * mean] for mean in RETURNS[arm.name]])
+            table = tabulated(episodes_of(returns), robot=spec.name, arm=arm.name, at_min=0.0)
+            write_episodes(episodes_file(folder, spec, arm), [table])
+        write_random(folder, spec, LIKE, 0.0)
+        optimum = StudyOptimum(spec.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
+        write_typed(optima_file(folder, spec.name), [optimum])
     Tabulate(study).run(folder, Silent())
     results = read_typed(results_file(folder), Results)
     with table_file(folder, "comparisons").open(newline="") as file:
@@ -77,11 +77,11 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
     return results.comparisons
 
 
-def write_random(folder: Path, body: Body, condition: StudyCondition, *minutes: float) -> None:
+def write_random(folder: Path, spec: RobotSpec, arm: Arm, *minutes: float) -> None:
     """Controls of which only random is there: one episode a minute, with a return of -80."""
-    ran, arm = episodes_of(np.array([[-80.0]])), named_mapping(condition.mapping, condition.percentiles)
-    tables = [tabulated(ran, robot=body.name, arm=arm, agent=RANDOM, at_min=at_min) for at_min in minutes]
-    write_episodes(controls_file(folder, body, condition), tables)
+    ran, through = episodes_of(np.array([[-80.0]])), named_mapping(arm.mapping, arm.percentiles)
+    tables = [tabulated(ran, robot=spec.name, arm=through, agent=RANDOM, at_min=at_min) for at_min in minutes]
+    write_episodes(controls_file(folder, spec, arm), tables)
 
 
 def episodes_of(returns: np.ndarray) -> Episodes:
@@ -105,6 +105,10 @@ def test_the_table_of_episodes_has_a_row_for_each(tmp_path: Path) -> None:
     assert table["agent"].tolist() == ["policy"] * 8 + ["silent"] * 4
     assert table["over_time"].tolist() == [False] * 8 + [True] * 4
     assert mean_returns(rows).tolist() == [1.75, -1.45] and mean_returns(rows, 1).tolist() == [1.0, -3.0]
+    former = tabulated(ran, robot="cartpole", arm="linear, percentiles held", agent="made by hand", at_min=0.0)
+    today = read_episodes([write_episodes(tmp_path / "c.npz", [former])])
+    assert today["agent"].tolist() == ["heuristic"] * 4
+    assert set(today["arm"]) == {named_mapping("linear", "first")}
     written = files[0].read_bytes()
     write_episodes(files[0], parts)
     assert files[0].read_bytes() == written
@@ -152,26 +156,26 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
 
 @pytest.mark.parametrize("delivery", [pytest.param("chosen", marks=pytest.mark.oracle), "shuffled"])
 def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(tmp_path: Path, delivery: Any) -> None:
-    condition = StudyCondition("control", delivery=delivery, trained=False)
+    arm = Arm("control", delivery=delivery, trained=False)
     study = Study(
-        culture=Source("made-up", sessions=2, interval_min=140.0, presentations=20, channels=32),
-        robots=(Body("navigation", parameters={"episode_limit": 60}),),
-        conditions=(condition, StudyCondition("other")),
+        culture=Source("synthetic", sessions=2, interval_min=140.0, trials=20, channels=32),
+        robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
+        arms=(arm, Arm("other")),
         comparisons=(Compared("with another", "control", "other", at_min=0.0, episodes=7),),
         policies=2,
         episodes=7,
         episodes_over_time=3,
         actions="drawn",
     )
-    (body,) = study.robots
+    (spec,) = study.robots
     for task in (
         Record(study, tmp_path),
         Fit(study),
-        TrainGroup(study, body, condition, (0, 1)),
-        Evaluate(study, body, condition),
+        TrainGroup(study, spec, arm, (0, 1)),
+        Evaluate(study, spec, arm),
     ):
         task.run(tmp_path, Silent())
-    got = read_episodes([episodes_file(tmp_path, body, condition)])
+    got = read_episodes([episodes_file(tmp_path, spec, arm)])
     got = got[~got["over_time"]]
 
     timeline = fit_timeline(extract_series(read_recordings(tmp_path / "recordings")))
@@ -197,12 +201,12 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
 # --- the optimal returns --------------------------------------------------------------------------------------
 
 FEW = Study(
-    culture=Source(kind="made-up", sessions=2, interval_min=140, presentations=40, channels=32),
-    robots=(Body("navigation", parameters={"episode_limit": 60}),),
-    conditions=(StudyCondition("1 threshold", trained=False), StudyCondition("without neurons", mapping="none")),
+    culture=Source(kind="synthetic", sessions=2, interval_min=140, trials=40, channels=32),
+    robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
+    arms=(Arm("1 threshold", trained=False), Arm("without neurons", mapping="none")),
     comparisons=(Compared("c", "without neurons", "1 threshold", at_min=0.0, episodes=2),),
-    limit_resolution=0.25,
-    limit_episodes=20,
+    optimum_resolution=0.25,
+    optimum_episodes=20,
 )
 
 
@@ -214,14 +218,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def limits_of(folder: Path, name: str = "limits") -> tuple[Limit, ...]:
-    (file,) = FindLimits(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
-    assert file == limits_file(folder, "navigation", name)
-    return read_limits(folder, "navigation", name)
+def optima_of(folder: Path, name: str = "optima") -> tuple[StudyOptimum, ...]:
+    (file,) = FindOptima(FEW, FEW.robots[0], over_time=name == "over-time").run(folder, Silent())
+    assert file == optima_file(folder, "navigation", name)
+    return read_optima(folder, "navigation", name)
 
 
 @pytest.mark.oracle
-def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
+def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     series = extract_series(read_recordings(recorded / "recordings"))
@@ -231,7 +235,7 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
     assert min(n[1]) >= enough > min(n[0])
     monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", enough)
     few = [i for i in range(5) if n[0][i] < enough]
-    at_first, at_last, without = limits_of(recorded)
+    at_first, at_last, without = optima_of(recorded)
     assert at_first.left_out == "; ".join(f"{series[0].conditions[i].label} ({n[0][i]})" for i in few)
     assert at_last.left_out is None is without.left_out
     for row in (at_first, at_last):
@@ -243,43 +247,43 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_limits_and_told(
     environment = Animat(Navigation(episode_limit=60), Thresholds(1), 5 - len(few))
     assert at_first.best_return == best_return(environment, simulator, resolution=0.25, episodes=0).value
 
-    for condition in FEW.conditions:
-        write_random(recorded, FEW.robots[0], condition, 0.0, 140.0)
-    random = read_episodes(controls_file(recorded, FEW.robots[0], condition) for condition in FEW.conditions)
-    known, condition = References(FEW, recorded, FEW.robots[0], random), FEW.conditions[0]
-    assert known.limit(condition, 0.0) is None is known.score(condition, 0.0, 5.0)
-    assert known.limit(condition, 140.0) is not None is not known.score(condition, 140.0, 5.0)
-    rough = limits_of(recorded, "over-time")
+    for arm in FEW.arms:
+        write_random(recorded, FEW.robots[0], arm, 0.0, 140.0)
+    random = read_episodes(controls_file(recorded, FEW.robots[0], arm) for arm in FEW.arms)
+    known, arm = References(FEW, recorded, FEW.robots[0], random), FEW.arms[0]
+    assert known.optimum(arm, 0.0) is None is known.score(arm, 0.0, 5.0)
+    assert known.optimum(arm, 140.0) is not None is not known.score(arm, 140.0, 5.0)
+    rough = optima_of(recorded, "over-time")
     assert [row.left_out for row in rough] == [at_first.left_out, None]
     assert {row.low_95 for row in rough} == {None}
-    note = limits_shown((at_first, at_last, without))
-    assert "1 of 3 limits leave out conditions with fewer than 30 responses" in note.note
+    note = optima_shown((at_first, at_last, without))
+    assert "1 of 3 optima leave out conditions with fewer than 30 responses" in note.note
     assert note.rows[0][-1] == at_first.left_out
 
 
-def test_where_no_condition_has_enough_responses_a_study_has_no_limit(
+def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.evaluation.resampling.FEW_SAMPLES", 41)
-    at_first, at_last, without = limits_of(recorded)
+    at_first, at_last, without = optima_of(recorded)
     for row in (at_first, at_last):
         assert row.left_out.count(" Hz (") == 5
         assert set(astuple(row)[4:-1]) == {None}
     assert without.best_return > 0
-    shown = limits_shown((at_first, without))
-    assert shown.rows[0][shown.head.index("limit ± grid")] is None and 0 not in shown.marked
+    shown = optima_shown((at_first, without))
+    assert shown.rows[0][shown.head.index("optimum ± grid")] is None and 0 not in shown.marked
 
 
 # --- a real recording -----------------------------------------------------------------------------------------------
 
-TWO_CONDITIONS = """
+TWO_ARMS = """
 title = "An organoid's answers to two intervals"
 policies = 2
 episodes = 20
 episodes_over_time = 2
-limit_resolution = 0.4
-limit_episodes = 400
-algorithm = {{ environments = 8, updates = 1, batch = 16, replay = 1024, hidden = 8 }}
+optimum_resolution = 0.4
+optimum_episodes = 400
+algorithm = {{ environments = 8, gradient_steps = 1, batch = 16, replay = 1024, hidden = 8 }}
 
 [culture]
 kind = "files"
@@ -292,10 +296,10 @@ conditions = "interval:5,10+-25%"
 name = "navigation"
 iterations = 2000
 
-[[conditions]]
+[[arms]]
 name = "1 threshold"
 
-[[conditions]]
+[[arms]]
 name = "9 thresholds"
 mapping = "9-thresholds"
 
@@ -311,7 +315,7 @@ def test_a_study_of_a_real_recording_with_two_conditions(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = real_data / "organoid_cartpole_maxone.npz"
-    (tmp_path / "study.toml").write_text(TWO_CONDITIONS.format(file=file))
+    (tmp_path / "study.toml").write_text(TWO_ARMS.format(file=file))
     folder = tmp_path / "study"
     assert main(["study", str(tmp_path / "study.toml"), "--out", str(folder), "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["comparisons"]
@@ -320,12 +324,12 @@ def test_a_study_of_a_real_recording_with_two_conditions(
     policy = Policy.load(folder / "policies" / "navigation" / "9-thresholds" / "p0.safetensors")
     assert [condition.label for condition in policy.conditions] == ["5 Hz", "10 Hz"]
     results = read_typed(results_file(folder), Results)
-    limits, scores = {limit.mapping: limit for limit in results.limits}, results.scores
-    assert {score.mapping for score in scores} == set(limits) == {"1-threshold", "9-thresholds"}
+    optima, scores = {optimum.mapping: optimum for optimum in results.optima}, results.scores
+    assert {score.mapping for score in scores} == set(optima) == {"1-threshold", "9-thresholds"}
     for score in scores:
-        limit = limits[score.mapping]
-        # That culture could do better than chance, and never well: without neurons the limit is above 20.
-        assert score.random + 20 < limit.best_return < 10
-        assert abs(limit.monte_carlo - limit.best_return) < 4 * limit.standard_error + limit.grid_error + 1
-        assert score.mean_return < limit.best_return + 4 * limit.standard_error + limit.grid_error
+        optimum = optima[score.mapping]
+        # That culture could do better than chance, and never well: without neurons the optimum is above 20.
+        assert score.random + 20 < optimum.best_return < 10
+        assert abs(optimum.monte_carlo - optimum.best_return) < 4 * optimum.standard_error + optimum.grid_error + 1
+        assert score.mean_return < optimum.best_return + 4 * optimum.standard_error + optimum.grid_error
     assert (folder / "report.html").stat().st_size > 100_000

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Order, Protocol
 from test_inspection import answering
@@ -45,7 +45,7 @@ def without_frequencies(source: Recording) -> Recording:
 
 
 def said(source: Recording) -> str | None:
-    return next((f.sentence for f in noticed(source) if f.name == "times-not-in-seconds"), None)
+    return next((f.message for f in noticed(source) if f.name == "times-not-in-seconds"), None)
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -63,10 +63,10 @@ def test_real_recordings_are_in_seconds_and_named_in_other_units(name: str, real
     "order", [None, *(pytest.param(order, marks=pytest.mark.oracle) for order in ("mixed", "blocked"))]
 )
 def test_simulated_cultures_are_in_seconds_and_named_in_other_units(order: Order | None) -> None:
-    source = make_up_recording(1)
+    source = synthetic_recording(1)
     if order is not None:
         with VirtualCulture(seed=3) as culture:
-            source = culture.record(Protocol(order=order, presentations=20))
+            source = culture.record(Protocol(order=order, trials=20))
     assert said(source) is None and said(without_frequencies(source)) is None
     for factor, words in {
         1e3: "factor of 1,000: times are in milliseconds; divide them by 1,000",
@@ -129,7 +129,7 @@ def test_channels_that_fire_faster_than_neurons_can() -> None:
 
 
 def test_training_on_milliseconds_is_refused_unless_allowed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_nwb(in_unit(make_up_recording(1, patterns=20, channels=32), 1e3), tmp_path / "a.nwb")
+    write_nwb(in_unit(synthetic_recording(1, patterns=20, channels=32), 1e3), tmp_path / "a.nwb")
     train = ["train", "cartpole", "--recordings", str(tmp_path / "a.nwb"), "--policies", "1", "--iterations", "64"]
     train += ["--out", str(tmp_path / "policies")]
     assert main(train) == 1
@@ -147,14 +147,14 @@ def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
     swapped = of_spikes([(t, 0) for t in few], many, 1, source.duration_s)
     names = {f.name: f for f in noticed(swapped)}
     assert names["more-stimuli-than-spikes"].severity == "refuse"
-    assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].sentence
+    assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].message
     # One unit, of which 70 % of the stimuli have one spike.
     sparse = of_spikes([(t + 0.005, 0) for t in many[:140]], many, 1, source.duration_s + 1)
     assert {f.severity for f in noticed(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
     twice = np.repeat(source.stimuli.time_s, 2)
     spikes = list(zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True))
     names = {f.name: f for f in noticed(of_spikes(spikes, twice, 40, source.duration_s))}
-    assert names["simultaneous-stimuli"].sentence.startswith("120 of 240 stimuli")
+    assert names["simultaneous-stimuli"].message.startswith("120 of 240 stimuli")
     assert names["simultaneous-stimuli"].severity == "refuse"
     # Rows that belong to one presentation are read once.
     one = of_spikes(spikes, twice, 40, source.duration_s, presentation=np.repeat(np.arange(120), 2).tolist())
@@ -162,14 +162,14 @@ def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
 
 
 def contradicted(stated_hz: np.ndarray) -> str | None:
-    source = make_up_recording(1, start_min=0.0, patterns=25, channels=16)
+    source = synthetic_recording(1, start_min=0.0, patterns=25, channels=16)
     stimuli = dataclasses.replace(source.stimuli, frequency_hz=stated_hz[: len(source.stimuli)])
     found = noticed(dataclasses.replace(source, stimuli=stimuli))
-    return next((f.sentence for f in found if f.name == "other-frequencies"), None)
+    return next((f.message for f in found if f.name == "other-frequencies"), None)
 
 
 def test_frequencies_of_other_stimuli_are_warned_of() -> None:
-    true_hz = make_up_recording(1, start_min=0.0, patterns=25, channels=16).stimuli.frequency_hz
+    true_hz = synthetic_recording(1, start_min=0.0, patterns=25, channels=16).stimuli.frequency_hz
     assert contradicted(true_hz) is None
     swapped = np.select([true_hz == 5, true_hz == 80], [80.0, 5.0], true_hz)
     assert "said to come at 5 Hz are 0.0125 s apart (median), not 0.2 s" in str(contradicted(swapped))

@@ -27,10 +27,10 @@ from animat.training.group import Group, programs, split_groups, train_group
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 from test_simulator import responses_of
 
-SMALL = SAC(environments=8, updates=1, batch=16, replay=1024, hidden=8)
+SMALL = SAC(environments=8, gradient_steps=1, batch=16, replay=1024, hidden=8)
 SHORT = Training(Cartpole(), Thresholds(1), policies=2, iterations=6_000, duration_min=60.0, algorithm=SMALL)
 """Two groups of one policy each, which are one program."""
 
@@ -213,7 +213,7 @@ def test_what_a_training_without_neurons_differs_in_is_told_by_name(tmp_path: Pa
 
 
 def test_a_second_training_in_a_folder_at_work_is_refused(tmp_path: Path) -> None:
-    with alone_in(tmp_path), pytest.raises(Mismatch, match="another run is at work in this folder"):
+    with exclusive_lock(tmp_path), pytest.raises(Mismatch, match="another run is at work in this folder"):
         train(SHORT, timeline_of(), tmp_path)
     assert not any(tmp_path.iterdir())
 

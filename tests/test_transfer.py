@@ -149,7 +149,7 @@ def test_recordings_are_read_as_in_training(tmp_path: Path, capsys: pytest.Captu
         (["--simulator", "histogram"], "kind empirical, here histogram"),
     ):
         (finding,) = (f for f in ran(capsys, *evaluate, *option)["findings"] if f["name"] == "other-simulator")
-        assert finding["sentence"].endswith(says) or says in finding["sentence"]
+        assert finding["message"].endswith(says) or says in finding["message"]
 
 
 @pytest.mark.oracle

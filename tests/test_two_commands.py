@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.closed_loop.contenders import Contender, HandMadeRule, OneCondition, random_control
-from animat.closed_loop.following import Following
+from animat.closed_loop.adaptive import AdaptiveThresholds
+from animat.closed_loop.agents import Agent, HeuristicController, OneCondition, random_control
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -28,14 +28,14 @@ from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.evaluation.hand_made import Heuristic
+from animat.evaluation.heuristic import Heuristic
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.answered import answered
-from animat.recordings.made_up import write_made_up_series
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
@@ -49,7 +49,7 @@ from fake_culture import CHANNELS, FakeCulture
 from test_training import SMALL
 from two_wheels import FILE, Wheels
 
-PROTOCOL = Protocol(order="mixed", patterns=8, presentations=40, setup_s=0.1)
+PROTOCOL = Protocol(order="mixed", patterns=8, trials=40, setup_s=0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -87,20 +87,20 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         Thresholds(9),
         timeline.conditions,
         np.asarray(timeline.at(0.0).percentiles),
-        following=recorded_hz,
+        adaptive_from=recorded_hz,
         burst_threshold=0.95,
-        lead_in=1,
+        warm_up=1,
         readouts=timeline.readouts,
     )
     means = tuple((0.2 * i - 0.4, 0.4 - 0.2 * i) for i in range(5))
-    contenders = [
+    agents = [
         random_control(5),
-        Contender("constant", "", OneCondition(3), calibrates=False),
-        Contender("made by hand", "", HandMadeRule(loop.robot, means)),
-        Contender("silent", "", OneCondition(0), "silent"),
+        Agent("constant", "", OneCondition(3), calibrates=False),
+        Agent("heuristic", "", HeuristicController(loop.robot, means)),
+        Agent("silent", "", OneCondition(0), "silent"),
     ]
     with FakeCulture(3) as culture:
-        ended = run_session(culture, loop, contenders, tmp_path, episodes=2).ending
+        ended = run_session(culture, loop, agents, tmp_path, episodes=2).ending
     assert ended.by == "plan", ended
 
     # The session's own recording, read like any other, says what was read of each half.
@@ -110,7 +110,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     np.testing.assert_array_equal(whole.read_hz, [tick.readout_hz for tick in stimulated])
     np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
 
-    # The thresholds follow each half on its own: percentiles over its newest responses, computed again here.
+    # The thresholds adapt to each half on its own: percentiles over its newest responses, computed again here.
     newest = [list(of) for of in recorded_hz]
     logged = {w["episode"]: w["percentiles_hz"] for w in session.log.records.words() if w["kind"] == "percentiles"}
     # Until something was answered they are the recording's.
@@ -129,7 +129,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
             pooled = np.concatenate(newest)
             expected = [np.percentile(pooled[:, d], range(0, 101, 10)) for d in range(2)]
             np.testing.assert_allclose(told[tick.episode], expected, rtol=1e-6)
-        counts = tick.contender != "constant" or tick.handled == "lead-in"
+        counts = tick.agent != "constant" or tick.handled == "warm-up"
         if counts and tick.patterns and not tick.is_burst:
             newest[tick.delivered] = [*newest[tick.delivered][1:], np.array(tick.readout_hz)]
     assert moved > 10
@@ -144,7 +144,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
 
     # How often each half passed its own median, as the reasons of a gap ask.
     read = answered(session, loop, ["random"])
-    used = [tick for tick in session.ticks if tick.handled == "used" and tick.contender == "random"]
+    used = [tick for tick in session.ticks if tick.handled == "used" and tick.agent == "random"]
     above = [np.array(t.readout_hz) >= told[t.episode][:, 5] for t in used]
     np.testing.assert_array_equal(read.passed, above)
     np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in used])
@@ -162,9 +162,9 @@ def test_policies_run_and_are_predicted(
     calibration = Calibration.of_series(timeline.responses)
     with FakeCulture(3) as culture:
         gap = run_policies(policies, culture, calibration, tmp_path, episodes=4)
-    assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].lived))
-    assert "no-limit" in {finding.name for finding in gap.findings}
-    assert {"silent", "shuffled", "made by hand", "constant 5 Hz"} <= {row.name for row in gap.rows}
+    assert gap.session.ending.by == "plan" and np.all(np.isfinite(gap.rows[0].measured))
+    assert "no-optimum" in {finding.name for finding in gap.findings}
+    assert {"silent", "shuffled", "heuristic", "constant 5 Hz"} <= {row.name for row in gap.rows}
 
 
 def test_a_policy_carries_its_readouts_through_its_file(
@@ -216,10 +216,10 @@ def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy
 
 
 def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
-    table = evaluate(baseline, None, episodes=40, limit_resolution=0.5)
-    assert [row.name for row in table.rows] == ["policies", "random", "made by hand"]
-    assert table.no_limit is not None and "expected one command for an optimal return, got 2" in table.no_limit
-    # The rule by hand is the robot's own, for any commands can be given.
+    table = evaluate(baseline, None, episodes=40, optimum_resolution=0.5)
+    assert [row.name for row in table.rows] == ["policies", "random", "heuristic"]
+    assert table.no_optimum is not None and "expected one command for an optimal return, got 2" in table.no_optimum
+    # The heuristic policy is the robot's own, for any commands can be given.
     wheels = Wheels(episode_limit=8)
     state = wheels.reset(jax.random.key(4))
     seen = wheels.observe(state)
@@ -232,9 +232,9 @@ def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[st
 def test_the_baseline_of_two_commands_learns_to_drive() -> None:
     trained = train(Training(Wheels(), None, policies=1, iterations=60_000), None, None)
     returns = {row.name: float(row.episodes.returns.mean()) for row in evaluate(trained, None, episodes=40).rows}
-    # At random it stays where it is, a field away from the middle; by hand it drives there.
+    # At random it stays where it is, a field away from the middle; the heuristic drives it there.
     assert returns["random"] < -40
-    assert returns["made by hand"] > -12
+    assert returns["heuristic"] > -12
     assert returns["policies"] > -15
 
 
@@ -272,18 +272,18 @@ def test_a_robot_of_two_commands_is_checked(robot: Robot[Any], words: str) -> No
         check_robot(robot)
 
 
-def test_the_rule_made_by_hand_takes_the_nearest_in_the_plane() -> None:
+def test_the_heuristic_policy_takes_the_nearest_in_the_plane() -> None:
     means = ((-1.0, -1.0), (0.9, -0.2), (1.0, 1.0))
     for wanted, nearest in (((0.2, -0.9), 1), ((0.3, 0.9), 2), ((-1.0, -0.1), 0)):
         robot = changed(heuristic=lambda self, seen, wanted=wanted: np.array(wanted))
-        assert HandMadeRule(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
+        assert HeuristicController(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
 
 
-def test_thresholds_follow_every_readout_on_its_own() -> None:
+def test_thresholds_adapt_to_every_readout_on_its_own() -> None:
     rng = np.random.default_rng(0)
-    both = Following([rng.gamma(4, 5, (30, 2)) for _ in range(3)])
+    both = AdaptiveThresholds([rng.gamma(4, 5, (30, 2)) for _ in range(3)])
     rng = np.random.default_rng(0)
-    alone = [Following([x[:, d] for x in [rng.gamma(4, 5, (30, 2)) for _ in range(3)]]) for d in range(1)]
+    alone = [AdaptiveThresholds([x[:, d] for x in [rng.gamma(4, 5, (30, 2)) for _ in range(3)]]) for d in range(1)]
     for _ in range(20):
         x = np.random.default_rng(1).gamma(4, 5, 2)
         both.add(1, x)
@@ -321,7 +321,7 @@ HEADER: dict[str, Any] = {
     "recorded_at": "2026-01-01T00:00:00+00:00",
     "sampling_rate_hz": 20000.0,
     "start_min": 0.0,
-    "contenders": [{"name": "p0"}],
+    "agents": [{"name": "p0"}],
     "provenance": {},
     "observed": ["x_m"],
 }
@@ -333,7 +333,7 @@ def test_the_file_of_the_page_is_short() -> None:
 
 @pytest.mark.oracle
 def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
-    write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    write_synthetic_series(0, tmp_path / "recordings", sessions=1)
     text, n = re.subn(r"iterations=\d[\d_]*", "iterations=1_000", FILE)
     assert n == 1 and "episode_limit: int = 60" in text
     (tmp_path / "two_wheels.py").write_text(text.replace("episode_limit: int = 60", "episode_limit: int = 8"))
@@ -347,7 +347,7 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
 
 @pytest.mark.oracle
 def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    write_made_up_series(0, tmp_path / "recordings", sessions=1)
+    write_synthetic_series(0, tmp_path / "recordings", sessions=1)
     (tmp_path / "my_wheels.py").write_text(FILE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -368,7 +368,7 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
     assert main(["train", "my_wheels:Wheels", *few, "--readouts", "halves"]) == 0
     assert "5 Hz: left 0." in capsys.readouterr().out
     asked = ["--recordings", "recordings", "--episodes", "2"]
-    assert main(["evaluate", *asked, "--limit"]) == 0
+    assert main(["evaluate", *asked, "--optimum"]) == 0
     assert "expected one command for an optimal return" in capsys.readouterr().out
     assert main(["run", *asked, "--culture", "replay"]) == 0
     assert main(["live", "my_wheels:Wheels"]) == 1

@@ -22,8 +22,8 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Actor, Constant, Networks, Seen, Uniform, Uniforms, roll_out
 from animat.evaluation.table import evaluate
 from animat.live.plan import Timetable, check_plan
-from animat.neurons.made_up import made_up_simulator
 from animat.neurons.memory import MemorySimulator
+from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole
 from animat.stimulation.protocol import Protocol
 from animat.training.group import programs
@@ -63,7 +63,7 @@ def test_the_episode_limit_cuts_off_what_has_not_ended_by_itself() -> None:
 def test_shuffled_delivery_draws_every_condition_as_often_and_changes_nothing_else() -> None:
     shuffled, n = ShuffledDelivery(ANIMAT), 20_000
     uniforms = jax.random.uniform(jax.random.key(3), (n, shuffled.noise_size))
-    state, simulator = ANIMAT.reset(jax.random.key(0)), made_up_simulator()
+    state, simulator = ANIMAT.reset(jax.random.key(0)), synthetic_simulator()
     every = jax.jit(jax.vmap(lambda u, a, of: of.advance(u, state, a, simulator), (0, 0, None)), static_argnums=2)
     chosen = jnp.arange(n) % 5
     after = every(uniforms, chosen, shuffled)
@@ -85,7 +85,7 @@ def test_wrappers_go_together_in_any_order() -> None:
         for i in range(2):
             state = environment.step(jax.random.key(i), state, jnp.int32(0), simulator)
             leaves += [environment.observe(state), *jax.tree.leaves(state)]
-        assert [quantity.name for quantity in environment.quantities] == ["step", "past"]
+        assert [quantity.name for quantity in environment.observation_spec] == ["step", "history"]
         assert len(environment.scales) == len(leaves[0]) == 2
         seen.append([np.asarray(leaf).tolist() for leaf in leaves])
     assert all(each == seen[0] for each in seen)
@@ -194,7 +194,7 @@ def test_a_policy_knows_what_it_sees_and_is_evaluated_so(seeing: Policy, tmp_pat
     # Who acts without looking, or looks at the robot alone, does the same whatever the policies see.
     for one, other in zip(*(table.rows for table in tables), strict=True):
         assert one.name == other.name
-        if one.name in ("random", "made by hand") or one.name.startswith("constant"):
+        if one.name in ("random", "heuristic") or one.name.startswith("constant"):
             np.testing.assert_array_equal(one.episodes.returns, other.episodes.returns)
     with pytest.raises(Mismatch, match="the same neural_observation as"):
         evaluate({"p": seeing, "q": blind}, timeline_of(), episodes=20)

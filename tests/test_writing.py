@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from animat.errors import InvalidFile, Mismatch
-from animat.writing import LOCK, alone_in, clear_away, is_unfinished, written_whole
+from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished
 
 
 def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b.txt"
     for content in ("old", "new"):
-        with written_whole(path) as beside:
+        with atomic_write(path) as beside:
             assert beside.parent == path.parent
             assert beside.suffix == ".txt"
             assert is_unfinished(beside) and not is_unfinished(path)
@@ -39,7 +39,7 @@ def test_on_any_error_the_old_file_stays_and_nothing_lies_beside_it(tmp_path: Pa
     path = tmp_path / "b.txt"
     path.write_text("old")
     expected = InvalidFile if isinstance(error, OSError) else type(error)
-    with pytest.raises(expected) as raised, written_whole(path) as beside:
+    with pytest.raises(expected) as raised, atomic_write(path) as beside:
         beside.write_text("half")
         raise error
     if expected is InvalidFile:
@@ -61,7 +61,7 @@ def test_both_the_content_and_the_name_are_on_disk_before_it_returns(
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", watched)
-    with written_whole(tmp_path / "b.txt") as beside:
+    with atomic_write(tmp_path / "b.txt") as beside:
         beside.write_text("new")
     assert [is_renamed for _, is_renamed in synced] == [False, True]
     assert synced[0][0] == beside
@@ -70,8 +70,8 @@ def test_both_the_content_and_the_name_are_on_disk_before_it_returns(
 
 HOLD = """
 import sys
-from animat.writing import alone_in
-with alone_in(sys.argv[1]):
+from animat.writing import exclusive_lock
+with exclusive_lock(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -84,12 +84,12 @@ def test_a_folder_is_for_one_run_at_a_time_until_that_is_killed(tmp_path: Path) 
     ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(Mismatch, match="b: another run is at work in this folder"), alone_in(folder):
+        with pytest.raises(Mismatch, match="b: another run is at work in this folder"), exclusive_lock(folder):
             pass
         other.send_signal(signal.SIGKILL)
-    with alone_in(folder):
+    with exclusive_lock(folder):
         assert not any(folder.iterdir())
-    with alone_in(folder):
+    with exclusive_lock(folder):
         pass
 
 
@@ -110,7 +110,11 @@ def without_locks(patch: pytest.MonkeyPatch, *, of_files: bool) -> None:
 def test_where_folders_cannot_be_locked_a_file_in_them_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     without_locks(monkeypatch, of_files=True)
     for _ in range(2):
-        with alone_in(tmp_path), pytest.raises(Mismatch, match="another run is at work"), alone_in(tmp_path):
+        with (
+            exclusive_lock(tmp_path),
+            pytest.raises(Mismatch, match="another run is at work"),
+            exclusive_lock(tmp_path),
+        ):
             pass
         assert [file.name for file in tmp_path.iterdir()] == [LOCK]
 
@@ -121,7 +125,7 @@ def test_a_folder_that_cannot_be_written_to_can_be_held_without_locks(
 ) -> None:
     without_locks(monkeypatch, of_files=True)
     tmp_path.chmod(0o555)
-    with alone_in(tmp_path):
+    with exclusive_lock(tmp_path):
         assert not any(tmp_path.iterdir())
     tmp_path.chmod(0o755)
 
@@ -135,24 +139,24 @@ def test_without_any_locks_the_block_still_runs(tmp_path: Path, monkeypatch: pyt
             raise OSError(errno.EROFS, "Read-only file system")
         return open_(path, flags, *args)
 
-    with alone_in(tmp_path / "a"):
+    with exclusive_lock(tmp_path / "a"):
         assert [file.name for file in (tmp_path / "a").iterdir()] == [LOCK]
     (tmp_path / "b").mkdir()
     monkeypatch.setattr(os, "open", read_only)
-    with alone_in(tmp_path / "b"):
+    with exclusive_lock(tmp_path / "b"):
         assert not any((tmp_path / "b").iterdir())
 
 
 def test_a_block_that_fails_leaves_no_empty_folder_behind(tmp_path: Path) -> None:
     for name in ("a/b", "mine"):
-        with pytest.raises(ValueError, match="no"), alone_in(tmp_path / name):
+        with pytest.raises(ValueError, match="no"), exclusive_lock(tmp_path / name):
             if name == "mine":
                 (tmp_path / name / "result").write_text("")
             raise ValueError("no")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
     (tmp_path / "mine" / "result").unlink()
     # It was there before.
-    with pytest.raises(ValueError, match="no"), alone_in(tmp_path / "mine"):
+    with pytest.raises(ValueError, match="no"), exclusive_lock(tmp_path / "mine"):
         raise ValueError("no")
     assert (tmp_path / "mine").is_dir()
 
@@ -162,7 +166,7 @@ def test_a_folder_that_is_removed_before_it_is_locked_is_not_held(
 ) -> None:
     flock, folder = fcntl.flock, tmp_path / "a"
     monkeypatch.setattr(fcntl, "flock", lambda *args: (folder.rmdir(), flock(*args)))
-    with pytest.raises(Mismatch, match="start again"), alone_in(folder):
+    with pytest.raises(Mismatch, match="start again"), exclusive_lock(folder):
         pass
 
 
@@ -184,5 +188,5 @@ def test_a_leftover_that_cannot_be_removed_stays(tmp_path: Path, monkeypatch: py
 def test_a_folder_that_is_a_file_or_below_one_cannot_be_held(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("")
     for path in (tmp_path / "a", tmp_path / "a" / "b"):
-        with pytest.raises(InvalidFile, match="cannot be made"), alone_in(path):
+        with pytest.raises(InvalidFile, match="cannot be made"), exclusive_lock(path):
             pass

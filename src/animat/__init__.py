@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from animat.errors import Mismatch as Mismatch
     from animat.errors import UnsafeStimulus as UnsafeStimulus
     from animat.errors import UnusableData as UnusableData
+    from animat.evaluation.optimal_returns import optimal_returns as optimal_returns
     from animat.evaluation.optimum import Optimum as Optimum
     from animat.evaluation.optimum import best_return as best_return
     from animat.evaluation.optimum import best_returns as best_returns
-    from animat.evaluation.prospects import prospects as prospects
     from animat.evaluation.statistics import compare as compare
     from animat.evaluation.table import Evaluation as Evaluation
     from animat.evaluation.table import evaluate as evaluate
@@ -121,7 +121,7 @@ _WHERE = {
     "training.policy": ("Policy", "load_policies"),
     "evaluation.table": ("Evaluation", "evaluate"),
     "evaluation.optimum": ("Optimum", "best_return", "best_returns"),
-    "evaluation.prospects": ("prospects",),
+    "evaluation.optimal_returns": ("optimal_returns",),
     "evaluation.statistics": ("compare",),
     "closed_loop.loop": ("Loop",),
     "reality_gap": ("Calibration", "run_policies"),

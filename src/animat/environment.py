@@ -88,12 +88,12 @@ class Environment(abc.ABC, Generic[RobotState]):
         """How many uniforms in [0, 1) one iteration consumes."""
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         """What the numbers of an observation are, in order; those of the robot come first."""
-        return self.robot.quantities
+        return self.robot.observation_spec
 
     def observe(self, state: State) -> Float[Array, " observations"]:
-        """What a policy sees, in the units of `quantities`."""
+        """What a policy sees, in the units of `observation_spec`."""
         return self.robot.observe(state.robot)
 
     def reset(self, key: PRNGKeyArray) -> State:
@@ -133,7 +133,7 @@ class Environment(abc.ABC, Generic[RobotState]):
     @property
     def scales(self) -> Float[np.ndarray, " observations"]:
         """What a policy divides an observation by, so that its numbers are of order one."""
-        return np.array([quantity.scale for quantity in self.quantities], np.float32)
+        return np.array([quantity.scale for quantity in self.observation_spec], np.float32)
 
     def _moved(
         self, uniforms: Uniforms, state: State, delivered: Array, answer: Answer, command: Float[Array, "*commands"]
@@ -142,7 +142,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
         info = {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
         ended = Ended(terminated, jnp.bool_(False))
-        return State(robot, state.iteration + 1, answer.past, reward, ended, info)
+        return State(robot, state.iteration + 1, answer.history, reward, ended, info)
 
 
 @dataclass(frozen=True)

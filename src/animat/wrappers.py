@@ -40,8 +40,8 @@ class Wrapper(Environment[RobotState]):
         return self.inside.noise_size
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        return self.inside.quantities
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return self.inside.observation_spec
 
     def observe(self, state: State) -> Float[Array, " observations"]:
         return self.inside.observe(state)
@@ -94,7 +94,7 @@ class ShuffledDelivery(Wrapper[RobotState]):
 class NeuralObservation(Wrapper[RobotState]):
     """Lets the policy see, after all else, what the neurons remember (`State.neurons`).
 
-    Of a simulator's past that is all that its next answer depends on; one without memory leaves it at 0.5.
+    Of a simulator's history that is all that its next answer depends on; one without memory leaves it at 0.5.
 
     Raises:
         InvalidArgument: around an environment without neurons.
@@ -104,8 +104,8 @@ class NeuralObservation(Wrapper[RobotState]):
         _expect_neurons(self)
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        return (*self.inside.quantities, Quantity("past", "1", 1.0, 0.0, 1.0))
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return (*self.inside.observation_spec, Quantity("history", "1", 1.0, 0.0, 1.0))
 
     def observe(self, state: State) -> Float[Array, " observations"]:
         return jnp.append(self.inside.observe(state), state.neurons)

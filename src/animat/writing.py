@@ -19,7 +19,7 @@ _UNFINISHED = re.compile(r"\..+\.[a-z0-9_]{8}\.partial(\.[^.]*)?")
 
 
 @contextmanager
-def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success rename it to `path`, on any error remove it.
 
     Whatever stood at `path` stays whole until the new file is complete and on disk, also when the disk fills up or
@@ -72,7 +72,7 @@ def expect_writable(folder: str | os.PathLike[str]) -> None:
 
 
 @contextmanager
-def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
+def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep other runs out of a folder, made where it is missing, until the block ends or the process does.
 
     The folder itself is locked, and nothing is left in it. File systems that lock files only (NFS) get a file to lock,
@@ -143,7 +143,7 @@ def clear_away(leftover: Path) -> None:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Whether a file's name is one that `written_whole` gives to what it is just writing, or was when it was killed."""
+    """Whether a file's name is one that `atomic_write` gives to what it is just writing, or was when it was killed."""
     return _UNFINISHED.fullmatch(path.name) is not None
 
 

@@ -59,7 +59,7 @@ _LESS: dict[type, str] = {
     Evaluate: "ask for fewer episodes (--episodes {episodes})",
     Run: "ask for fewer episodes (--episodes {episodes})",
     Live: "ask for fewer episodes (--episodes {episodes}) or policies (--policies {policies})",
-    Record: "ask for fewer presentations or pulses (--presentations, --pulses, or those of --protocol)",
+    Record: "ask for fewer trials or pulses (--trials, --pulses, or those of --protocol)",
     Train: "ask for fewer bins (--bins), or give fewer recordings (--recordings)",
     Inspect: "inspect fewer recordings at once",
 }

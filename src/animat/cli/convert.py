@@ -97,7 +97,7 @@ class Convert:
         print(f"{self.out}: {n_spikes:,} spikes on {len(recording.channels):,} channels, {n_stimuli:,} stimuli")
         findings = noticed(recording)
         for finding in findings:
-            print(f"  {finding.severity}: {finding.sentence}")
+            print(f"  {finding.severity}: {finding.message}")
         return {
             "recording": str(self.out),
             "spikes": n_spikes,

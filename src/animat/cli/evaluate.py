@@ -29,7 +29,7 @@ class Evaluate(Fitting):
     """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
-    limit: bool = False
+    optimum: bool = False
     """Also compute the best return that any controller could get there, and scores; seconds, with memory minutes"""
     seed: int = 1
     """Decides every random draw"""
@@ -60,7 +60,7 @@ class Evaluate(Fitting):
                 episodes=self.episodes,
                 seed=self.seed,
                 greedy=not self.drawn,
-                limit_resolution=1.0 if self.limit else None,
+                optimum_resolution=1.0 if self.optimum else None,
                 progress=progress,
             )
         say_findings(evaluation.findings)

@@ -33,7 +33,7 @@ class Inspect(Responding):
     """Which of several things in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     part: str | None = None
     """Which of several recordings in a MaxWell file, such as well000/rec0000"""
-    limit: str | None = None
+    optimum: str | None = None
     """Also compute the best return that any controller could get with this robot, such as cartpole, before any
     training"""
     out: Path | None = None
@@ -55,8 +55,8 @@ class Inspect(Responding):
 
         if self.out is not None:
             expect_writable(self.out)
-        if self.limit is not None:
-            robot_named(self.limit)
+        if self.optimum is not None:
+            robot_named(self.optimum)
         by = None if self.conditions is None else conditions_named(self.conditions)
         window_ms = self.window_ms or DEFAULT_WINDOW_MS
         check_window(window_ms)
@@ -99,9 +99,9 @@ class Inspect(Responding):
                 continue
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
-            if self.limit is not None:
+            if self.optimum is not None:
                 progress.update(steps * number, total, f"{file.name}, optimal return")
-                inspected[-1]["limits"] = _limits(self.limit, inspection.responses)
+                inspected[-1]["optima"] = _optima(self.optimum, inspection.responses)
             if self.out is not None:
                 progress.update(steps * number + 1, total, f"{file.name}, figures")
                 figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
@@ -145,20 +145,20 @@ def _inspected(
         raise type(error)(f"{file}: {error}") from error
 
 
-def _limits(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
+def _optima(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
     """What a culture could do with a robot, printed; None where that cannot be told."""
     from animat.compilation import keep_compilations
-    from animat.evaluation.prospects import prospects
+    from animat.evaluation.optimal_returns import optimal_returns
     from animat.robots.registry import robot_named
 
     keep_compilations()
     try:
-        found = prospects(responses, robot_named(robot))
+        found = optimal_returns(responses, robot_named(robot))
     except (InvalidArgument, UnusableData) as error:
         print(f"{robot}: no optimal return: {error}\n")
         return None
-    for prospect in found:
-        print(prospect.to_text())
-        say_findings(prospect.best.findings())
+    for each in found:
+        print(each.to_text())
+        say_findings(each.best.findings())
     print()
-    return [prospect.to_dict() for prospect in found]
+    return [each.to_dict() for each in found]

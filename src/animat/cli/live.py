@@ -14,10 +14,10 @@ from tyro.conf import Positional
 
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
-    from animat.live.shadowing import Lived
+    from animat.live.shadowing import LiveRun
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Live(Stimulating):
     """How recordings are presented; mixed is how a closed loop presents"""
     pulses: int = 1
     """Pulses per trial, the last one read"""
-    presentations: int = 500
+    trials: int = 500
     """Of each frequency in a recording"""
     interval_min: float = 10.0
     """Minutes of the culture's clock from one recording to the next"""
@@ -48,7 +48,7 @@ class Live(Stimulating):
     controls: Literal["all", "random"] = "all"
     """Run between the policies' episodes"""
     percentiles: Literal["moving", "first"] = "moving"
-    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
     """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
     histogram: the paper's; empirical: draw any measured value"""
@@ -96,24 +96,22 @@ class Live(Stimulating):
             percentiles=self.percentiles,
         )
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
-        protocol = Protocol(
-            order=self.order, pulses=self.pulses, presentations=self.presentations, pulse=pulse_for(self.culture)
-        )
-        settings = {**self._of_the_loop(), "follow": self.thresholds == "follow"}
+        protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
+        settings = {**self._of_the_loop(), "adaptive": self.thresholds == "adaptive"}
         check_plan(training, protocol, self.out, timetable, self.episodes, settings)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
             ExitStack() as told,
-            alone_in(self.out),
+            exclusive_lock(self.out),
             polite_kill_as_ctrl_c(),
             Bar("live") as progress,
             culture_of(
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
             ) as culture,
         ):
-            lived = live(
+            ran = live(
                 training,
                 culture,
                 replace(protocol, patterns=min(100, len(culture.patterns))),
@@ -124,26 +122,26 @@ class Live(Stimulating):
                 kind=self.simulator,
                 account=account,
                 progress=progress,
-                tell=partial(print, file=sys.stderr),
+                report=partial(print, file=sys.stderr),
                 **settings,
             )
             # It is told even where the culture cannot be closed then.
-            told.callback(self._tell, lived)
-        return lived.to_dict()
+            told.callback(self._report, ran)
+        return ran.to_dict()
 
-    def _tell(self, lived: Lived) -> None:
+    def _report(self, ran: LiveRun) -> None:
         print(
-            f"{len(lived.recordings)} recordings in {lived.culture_min:.0f} min of the culture's clock "
-            f"({lived.wall_s:.0f} s of ours); {lived.iterations:,} iterations of each policy, never stopped; "
-            f"{len(lived.swaps)} swaps of simulators:"
+            f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
+            f"({ran.wall_s:.0f} s of ours); {ran.iterations:,} iterations of each policy, never stopped; "
+            f"{len(ran.swaps)} swaps of simulators:"
         )
-        for swap in lived.swaps:
+        for swap in ran.swaps:
             print(
                 f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
                 f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
             )
-        print(lived.gap.to_text())
-        expect_no_fault(lived.gap.session, self.out)
+        print(ran.gap.to_text())
+        expect_no_fault(ran.gap.session, self.out)
 
 
 def _range(members: Sequence[int]) -> str:

@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.progress import Progress
     from animat.stimulation.protocol import Protocol
 
 
-_PRESENTED = ("order", "pulses", "presentations", "places")
+_PRESENTED = ("order", "pulses", "trials", "places")
 
 
 @dataclass(frozen=True)
 class Record:
     """Record a culture: one NWB file a recording. Goes on where it stopped."""
 
-    culture: Literal["virtual", "made-up", "replay", "cl1", "maxone"] = "virtual"
-    """virtual: simulated neurons on a simulated array; made-up: responses of known distributions, no neurons; replay:
+    culture: Literal["virtual", "synthetic", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; synthetic: responses of known distributions, no neurons; replay:
     answers from recordings; cl1 and maxone: the devices"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
@@ -32,8 +32,8 @@ class Record:
     seed: int = 1
     """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
     paper: bool = False
-    """The paper's protocol: blocks of one frequency, 100 presentations of each, 15 recordings; default: what a closed
-    loop needs, frequencies mixed, 500 presentations of each, 2 recordings"""
+    """The paper's protocol: blocks of one frequency, 100 trials of each, 15 recordings; default: what a closed
+    loop needs, frequencies mixed, 500 trials of each, 2 recordings"""
     sessions: int | None = None
     """How many recordings; default: 2, with --paper 15"""
     interval_min: float | None = None
@@ -42,7 +42,7 @@ class Record:
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
     """Pulses per trial, the last one read; default: 1"""
-    presentations: int | None = None
+    trials: int | None = None
     """Presentations at each frequency; default: 500, with --paper 100"""
     places: str | None = None
     """halves, quadrants, or a file of JSON with groups of electrodes, [[1, 2], [3, 4]]: each at each frequency is a
@@ -75,12 +75,12 @@ class Record:
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
-        protocol = None if self.culture == "made-up" else self._protocol()
+        protocol = None if self.culture == "synthetic" else self._protocol()
         if protocol is not None and self.protocol is not None:
             _say_too_fast(protocol)
         with Bar("recording") as progress:
-            if self.culture == "made-up":
-                files = self._made_up(progress)
+            if self.culture == "synthetic":
+                files = self._synthetic(progress)
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
@@ -91,17 +91,17 @@ class Record:
             )
         return {"recordings": [str(file) for file in files]}
 
-    def _made_up(self, progress: Progress) -> list[Path]:
-        from animat.recordings.made_up import write_made_up_series
+    def _synthetic(self, progress: Progress) -> list[Path]:
+        from animat.recordings.synthetic import write_synthetic_series
 
-        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.presentations in (None, 100)
+        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.trials in (None, 100)
         if not usual or self.places is not None or self.protocol is not None:
             raise InvalidArgument(
-                "--order, --pulses, --presentations, --places, --protocol: made-up recordings are blocked, with one "
-                "pulse, 100 presentations and no places; --culture virtual takes others"
+                "--order, --pulses, --trials, --places, --protocol: synthetic recordings are blocked, with one "
+                "pulse, 100 trials and no places; --culture virtual takes others"
             )
-        with alone_in(self.out):
-            return write_made_up_series(
+        with exclusive_lock(self.out):
+            return write_synthetic_series(
                 self.seed, self.out, sessions=self._sessions, interval_min=self._interval_min, progress=progress
             )
 
@@ -125,13 +125,13 @@ class Record:
         from animat.cultures.series import check_interval
         from animat.recordings.reading import read_recordings
 
-        assert self.culture != "made-up"
+        assert self.culture != "synthetic"
         # What can be refused is refused before a culture is opened, whose patterns are not known until then.
         check_interval(self._protocol(), self._sessions, self._interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
         with (
             # Held before a device is opened, which stops whatever another run has it do.
-            alone_in(self.out),
+            exclusive_lock(self.out),
             polite_kill_as_ctrl_c(),
             culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
         ):
@@ -146,15 +146,15 @@ class Record:
     def _sessions(self) -> int:
         if self.sessions is not None:
             return self.sessions
-        # Made-up recordings are the paper's.
-        return 15 if self.paper or self.culture == "made-up" else 2
+        # Synthetic recordings are the paper's.
+        return 15 if self.paper or self.culture == "synthetic" else 2
 
     @property
     def _interval_min(self) -> float:
         if self.interval_min is not None:
             return self.interval_min
         # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
-        usual = not self.paper and self.culture != "made-up" and self.protocol is None
+        usual = not self.paper and self.culture != "synthetic" and self.protocol is None
         return 5.0 if usual and all(getattr(self, name) is None for name in _PRESENTED) else 10.0
 
     def _protocol(self, patterns: int = 100) -> Protocol:
@@ -163,13 +163,13 @@ class Record:
         from animat.stimulation.places import read_places
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER, read_protocol
 
-        assert self.culture != "made-up"
+        assert self.culture != "synthetic"
         # What a file leaves out is the paper's: it stands alone.
         paper = self.paper or self.protocol is not None
         usual = replace(PAPER if paper else CLOSED_LOOP, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
-        asked = {name: getattr(self, name) for name in ("order", "pulses", "presentations")}
+        asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
         asked["places"] = None if self.places is None else read_places(self.places)
         return replace(usual, **{name: value for name, value in asked.items() if value is not None})
 

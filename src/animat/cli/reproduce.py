@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from animat.cli.study import run_and_tell
+from animat.cli.study import run_and_report
 
 
 @dataclass(frozen=True)
@@ -30,4 +30,6 @@ class Reproduce:
         """Run it."""
         from animat.studies.paper import paper_study
 
-        return run_and_tell(paper_study(self.culture_seed, self.seed, quick=self.quick), Path(), self.out, self.workers)
+        return run_and_report(
+            paper_study(self.culture_seed, self.seed, quick=self.quick), Path(), self.out, self.workers
+        )

@@ -110,8 +110,8 @@ def say_findings(findings: Sequence[Finding]) -> None:
 
     What is found in several recordings is told once, where it is worst, with how many others there are.
     """
-    for sentence in warnings_once(findings):
-        print(f"warning: {sentence}", file=sys.stderr)
+    for message in warnings_once(findings):
+        print(f"warning: {message}", file=sys.stderr)
 
 
 def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:

@@ -39,8 +39,8 @@ class Robots:
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
                 print(f"  takes {robot['commands']} commands: train it with as many --readouts, or --mapping none")
-            for sentence in (*robot["lacks"].values(), *robot["caveats"]):
-                print(f"  {sentence}")
+            for message in (*robot["lacks"].values(), *robot["caveats"]):
+                print(f"  {message}")
         for name, why in unusable.items():
             print(f"{name} cannot be used: {why}")
         return {"robots": listed, "unusable": unusable}
@@ -62,7 +62,7 @@ def _told(name: str) -> dict[str, Any]:
     lacks = lacking(robot)
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],
-        "observes": [{"name": each.name, "unit": each.unit} for each in robot.quantities],
+        "observes": [{"name": each.name, "unit": each.unit} for each in robot.observation_spec],
         "parameters": robot_to_dict(robot)["parameters"],
         "commands": robot.n_commands,
         "can": [name for name in WITHOUT if name not in lacks],

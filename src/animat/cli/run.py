@@ -15,7 +15,7 @@ from tyro.conf import Positional
 from animat.cli.responses import fit_as, policies_for
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.closed_loop.loop import Loop
@@ -35,7 +35,7 @@ CALIBRATION_FILE = "calibration.nwb"
 
 @dataclass(frozen=True)
 class Run(Stimulating):
-    """Run policies in closed loop on a culture, with controls between them: predicted against lived return."""
+    """Run policies in closed loop on a culture, with controls between them: predicted against measured return."""
 
     policies: Positional[Path] = Path("policies")
     """A policy file or a folder of them"""
@@ -52,7 +52,7 @@ class Run(Stimulating):
     episodes: int = 5
     """Of each policy; of each control as many at most, and together no more than of policies, but 5 each"""
     controls: Literal["all", "random"] = "all"
-    """all: random, constant, silent, shuffled and made by hand; random: only that one"""
+    """all: random, constant, silent, shuffled and heuristic; random: only that one"""
     pulses: int | None = None
     """Pulses per trial; default: as the policies' recordings had"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
@@ -130,21 +130,21 @@ class Run(Stimulating):
                 episodes=self.episodes,
                 with_controls=self.controls == "all",
                 greedy=not self.drawn,
-                follow=self.thresholds == "follow",
+                adaptive=self.thresholds == "adaptive",
                 seed=self.seed,
                 account=account,
                 progress=progress,
-                tell=partial(print, file=sys.stderr),
+                report=partial(print, file=sys.stderr),
                 noticed=noticed,
                 pulse=pulse,
                 patterns=patterns,
                 **settings,
             )
             # It is told even where the culture cannot be closed then.
-            told.callback(self._tell, gap)
+            told.callback(self._report, gap)
         return gap.to_dict()
 
-    def _tell(self, gap: RealityGap) -> None:
+    def _report(self, gap: RealityGap) -> None:
         print(gap.to_text())
         if gap.session.recording_file.is_file():
             print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
@@ -229,7 +229,7 @@ def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
     from animat.closed_loop.session import expect_no_file, expect_no_session
 
     expect_no_file(folder, "the session")
-    with alone_in(folder):
+    with exclusive_lock(folder):
         expect_no_session(folder)
         if is_recording and (there := folder / CALIBRATION_FILE).exists():
             raise InvalidArgument(

@@ -26,22 +26,22 @@ class Stimulating:
     """Most pulses in all, recordings included; default: no end, but the culture's limits"""
     budget_per_electrode: int | None = None
     """Most pulses on any one electrode"""
-    thresholds: Literal["follow", "held"] = "follow"
-    """The mapping's percentiles in closed loop: following the culture's newest responses, or held from the recording"""
+    thresholds: Literal["adaptive", "fixed"] = "adaptive"
+    """The mapping's thresholds in closed loop: adaptive to the culture's newest responses, or fixed by the recording"""
     on_burst: Literal["use", "repeat", "skip"] = "use"
     """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
     on_late: Literal["continue", "stop"] = "continue"
     """A pulse that comes late: continue and log it, or stop"""
     pause_s: float = 2.0
     """Without stimulation before each episode"""
-    lead_in: int | None = None
+    warm_up: int | None = None
     """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
 
     def _of_the_loop(self) -> dict[str, Any]:
         """Settings of the closed loop."""
-        names = ("on_burst", "on_late", "pause_s", "lead_in", "patience_s")
+        names = ("on_burst", "on_late", "pause_s", "warm_up", "patience_s")
         return {name: getattr(self, name) for name in names}
 
 
@@ -51,6 +51,6 @@ def expect_no_fault(session: Session, folder: Path) -> None:
     if ending.by == "person":
         raise KeyboardInterrupt
     if ending.by != "plan":
-        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.sentence}")
+        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.message}")
     if not session.recording_file.is_file():
-        raise InvalidFile(ending.sentence)
+        raise InvalidFile(ending.message)

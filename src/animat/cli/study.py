@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A study of one's own from a TOML file: recordings, robots, conditions. Goes on where it stopped."""
+    """A study of one's own from a TOML file: recordings, robots, arms. Goes on where it stopped."""
 
     specification: Positional[Path]
     """The TOML file; animat reproduce leaves one to start from in its folder"""
@@ -32,10 +32,10 @@ class StudyFile:
         """Run it."""
         from animat.studies.toml import read_study
 
-        return run_and_tell(read_study(self.specification), self.specification.parent, self.out, self.workers)
+        return run_and_report(read_study(self.specification), self.specification.parent, self.out, self.workers)
 
 
-def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
+def run_and_report(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
     """Run a study, whose files are named as seen from `base`, and print its comparisons."""
     from animat.lined_up import lined_up
     from animat.progress import Bar
@@ -44,8 +44,8 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
     from animat.studies.results import Results, read_typed
     from animat.studies.run import run_study
 
-    for body in study.robots:
-        for caveat in body.robot().caveats():
+    for spec in study.robots:
+        for caveat in spec.robot().caveats():
             print(f"warning: {caveat}", file=sys.stderr)
     cores = len(os.sched_getaffinity(0))
     if workers is not None and workers > cores:
@@ -64,8 +64,8 @@ def run_and_tell(study: Study, base: Path, out: Path, workers: int | None) -> di
     if cells:
         print("\n".join(lined_up(["", "first", "second", "U", "p", ""], cells)))
     beside = not_outperforming(results)
-    for sentence in beside:
-        print(sentence)
+    for message in beside:
+        print(message)
     if ran.done_now:
         print(f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s; report: {ran.report}")
     else:

@@ -45,7 +45,7 @@ class Train(Fitting):
     duration_min: float | None = None
     """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
-    """The mapping's percentiles move with the simulator, or are held from the first recording"""
+    """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     delivery: Literal["chosen", "shuffled"] = "chosen"
     """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
     parameters: tuple[str, ...] = ()
@@ -166,7 +166,7 @@ def _control(timeline: SimulatorTimeline) -> str:
     else:
         of_each = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, of, strict=True)) for of in shares)
         told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
-    said = next((f.sentence for f in timeline.findings if f.name == "difference"), None)
+    said = next((f.message for f in timeline.findings if f.name == "difference"), None)
     first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
     return "\n".join([first, *([said] if said else []), *_memories(timeline)])
 

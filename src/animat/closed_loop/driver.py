@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.closed_loop.adaptive import AdaptiveThresholds
+from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.answers import wrong_with
-from animat.closed_loop.body import Body
-from animat.closed_loop.contenders import Contender, Controller
-from animat.closed_loop.following import Following
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.stretch import Asked, Stretch, rows_of
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
@@ -33,7 +33,7 @@ class Stop(Exception):
     """The session is over before its plan is done."""
 
     def __init__(self, ending: Ending) -> None:
-        super().__init__(ending.sentence)
+        super().__init__(ending.message)
         self.ending = ending
 
 
@@ -43,7 +43,7 @@ class Driver:
     Args:
         culture: open.
         loop: the settings.
-        contenders: who acts.
+        agents: who acts.
         turns: whose turn each episode is.
         account: of the stimulation budget.
         clock: the machine's.
@@ -54,7 +54,7 @@ class Driver:
         self,
         culture: Culture,
         loop: Loop,
-        contenders: Sequence[Contender],
+        agents: Sequence[Agent],
         turns: Sequence[int],
         account: Account,
         clock: Clock,
@@ -67,12 +67,12 @@ class Driver:
         """By when, on `time.monotonic()`, who should have answered at the latest; a supervisor watches it."""
         self.under_way: Asked | None = None
         """What was asked of the culture and is not answered yet; a supervisor writes it down."""
-        self._culture, self._loop, self._contenders, self._turns = culture, loop, contenders, turns
+        self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
         self._rng = np.random.default_rng([seed, 21])
-        self._body = Body(loop.robot, np.random.default_rng([seed, 22]))
+        self._runner = RobotRunner(loop.robot, np.random.default_rng([seed, 22]))
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
-        self._following = None if loop.following is None else Following(loop.following)
+        self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
         self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
@@ -100,7 +100,7 @@ class Driver:
             self._zero_s = self._now_s()
             self._data_at_s = self._wall_zero_s = self._clock.now_s()
             for episode, turn in enumerate(self._turns):
-                self._run_episode(episode, self._contenders[turn])
+                self._run_episode(episode, self._agents[turn])
                 self.episodes_done = episode + 1
         except Stop as stop:
             return stop.ending
@@ -108,30 +108,30 @@ class Driver:
             return Ending("crash", f"an error of the loop itself: {in_words(error)}")
         return Ending("plan", f"all {len(self._turns)} episodes were run")
 
-    def _run_episode(self, episode: int, contender: Contender) -> None:
+    def _run_episode(self, episode: int, agent: Agent) -> None:
         loop = self._loop
-        turn = self._begun[contender.name]
-        self._begun[contender.name] += 1
-        controller = contender.acting(turn)
+        turn = self._begun[agent.name]
+        self._begun[agent.name] += 1
+        controller = agent.acting(turn)
         observation = self._start(episode, turn)
         self._last_command = self._at_rest
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
-        self._lead_in(contender, episode)
-        if self._following is not None and self._following.seen:
+        self._warm_up(agent, episode)
+        if self._adaptive is not None and self._adaptive.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
-            self._percentiles = self._following.percentiles()
+            self._percentiles = self._adaptive.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         for iteration in range(loop.robot.episode_limit):
-            chosen = self._choose(contender, controller, observation)
+            chosen = self._choose(agent, controller, observation)
             repeats = 0
             while True:
                 delivered = chosen
-                if contender.delivery == "shuffled":
+                if agent.delivery == "shuffled":
                     delivered = int(self._rng.integers(len(loop.conditions)))
-                tick, again = self._present(contender, episode, iteration, chosen, delivered, repeats)
+                tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if not again:
                     break
                 repeats += 1
@@ -140,10 +140,10 @@ class Driver:
             observation = np.array(tick.observation)
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
-        """Put the robot where it starts: in a round of all contenders each meets the same start."""
+        """Put the robot where it starts: in a round of all agents each meets the same start."""
         self._expect("the robot")
         try:
-            observation = self._body.reset(turn)
+            observation = self._runner.reset(turn)
         except Exception as error:
             raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not np.all(np.isfinite(observation)):
@@ -151,40 +151,38 @@ class Driver:
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
         return observation
 
-    def _lead_in(self, contender: Contender, episode: int) -> None:
+    def _warm_up(self, agent: Agent, episode: int) -> None:
         """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
-        if contender.delivery == "silent":
+        if agent.delivery == "silent":
             return
-        for _ in range(self._loop.lead_in or 0):
+        for _ in range(self._loop.warm_up or 0):
             for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
-                self._present(contender, episode, -1, condition, condition, 0)
+                self._present(agent, episode, -1, condition, condition, 0)
 
-    def _choose(
-        self, contender: Contender, controller: Controller, observation: Float64[np.ndarray, " observations"]
-    ) -> int:
+    def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
         n = len(self._loop.conditions)
-        self._expect(contender.name)
+        self._expect(agent.name)
         try:
             chosen = int(controller.act(observation, self._rng))
         except Exception as error:
-            raise Stop(Ending("controller", f"{contender.name} raised {in_words(error)}")) from error
+            raise Stop(Ending("controller", f"{agent.name} raised {in_words(error)}")) from error
         if not 0 <= chosen < n:
-            raise Stop(Ending("controller", f"{contender.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
+            raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
 
     def _present(
-        self, contender: Contender, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
+        self, agent: Agent, episode: int, iteration: int, chosen: int, delivered: int, repeats: int
     ) -> tuple[Tick, bool]:
         """Present a condition and move the robot by the answer; returns whether to present it once more instead.
 
         Before iteration 0 the robot stands, whatever the answer.
         """
-        loop, is_lead_in = self._loop, iteration < 0
+        loop, is_warm_up = self._loop, iteration < 0
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
         stimuli: list[Stimulus] = []
-        if contender.delivery != "silent":
+        if agent.delivery != "silent":
             stimuli = [
                 Stimulus(float(t), on.electrodes, loop.pulse, frequency_hz, on.pattern, self._presented)
                 for t, on in zip(times_s, self._dealer.targets(delivered), strict=True)
@@ -208,10 +206,10 @@ class Driver:
             readout_hz = tuple(np.atleast_1d(x_hz).tolist())
         self._last_pulse_s = self._zero_s + float(after_s[0])
         is_burst = bool(active_ratio[0] > loop.burst_threshold)
-        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_lead_in
+        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {
             "number": self._presented,
-            "contender": contender.name,
+            "agent": agent.name,
             "episode": episode,
             "iteration": iteration,
             "chosen": chosen,
@@ -224,7 +222,7 @@ class Driver:
             "rate_hz": float(rate_hz[0]),
             "active_ratio": float(active_ratio[0]),
             "is_burst": is_burst,
-            "handled": "lead-in" if is_lead_in else "repeated" if again else "unfinished",
+            "handled": "warm-up" if is_warm_up else "repeated" if again else "unfinished",
             "command": None,
             "reward": None,
             "observation": (),
@@ -235,14 +233,14 @@ class Driver:
             "readout_hz": readout_hz,
         }
         self._presented += 1
-        if self._following is not None and stimuli and (contender.calibrates or is_lead_in) and not is_burst:
-            self._following.add(delivered, x_hz)
+        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
+            self._adaptive.add(delivered, x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
-            if not (again or is_lead_in):
+            if not (again or is_warm_up):
                 tick |= self._move(x_hz, is_burst, iteration)
         finally:
             # Whatever happens to the robot, what the culture did is written down.
@@ -260,7 +258,7 @@ class Driver:
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
         self._expect("the robot")
         try:
-            moved = self._body.step(self._last_command)
+            moved = self._runner.step(self._last_command)
         except Exception as error:
             raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
@@ -275,7 +273,7 @@ class Driver:
         }
 
     def _times(self, due_s: float, frequency_hz: float) -> tuple[float, Float64[np.ndarray, " pulses"]]:
-        """The culture's clock, and when the pulses of a presentation come after that; the first one is due at `due_s`.
+        """The culture's clock, and when the pulses of a trial come after that; the first one is due at `due_s`.
 
         All that it takes to ask for them from here on is counted: they come when they are due, not later by that.
         """
@@ -349,7 +347,7 @@ class Driver:
 
     def _note_fault(self, ending: Ending, asked: Asked, **more: Any) -> None:
         """Have it written down that what was asked came to no answer that can be used."""
-        words = {"kind": "event", "what": ending.by, "sentence": ending.sentence, **asked.to_dict(), **more}
+        words = {"kind": "event", "what": ending.by, "message": ending.message, **asked.to_dict(), **more}
         self.records.append(Record(words))
 
     def _expect(self, who: str, in_s: float = 0.0) -> None:

@@ -18,7 +18,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
@@ -68,7 +68,7 @@ class Gathered:
             "session_description": _described(header),
             "recorded_at": header.recorded_at,
             "closed_loop": header.loop,
-            "closed_loop_ended": f"{ending.by}: {ending.sentence}",
+            "closed_loop_ended": f"{ending.by}: {ending.message}",
             "closed_loop_unanswered_pulses": str(unanswered_pulses(outline)),
         }
         if outline.left_out:
@@ -106,7 +106,7 @@ class SessionFiles:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        beside = self._stack.enter_context(written_whole(self._folder / TICKS_FILE))
+        beside = self._stack.enter_context(atomic_write(self._folder / TICKS_FILE))
         file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
         self._table = TickTable(file, self._header.conditions, self._header.observed, self._header.readouts)
         return self
@@ -176,6 +176,6 @@ def in_words(left_out: Mapping[str, int]) -> str:
 def _described(header: Header) -> str:
     return (
         "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
-        f"from episode to episode ({', '.join(header.contenders)}): {TICKS_FILE} beside this file says whose each "
+        f"from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this file says whose each "
         "stimulus was, and what came of it."
     )

@@ -33,7 +33,7 @@ class Header:
         provenance: of the culture.
         presentation: how the loop presented.
         conditions: their labels.
-        contenders: their names.
+        agents: their names.
         observed: the columns of the robot's observation, with their units.
         loop: all settings, as JSON.
         readouts: names of the groups of channels that were read; none where all channels were read as one.
@@ -46,7 +46,7 @@ class Header:
     provenance: Mapping[str, str]
     presentation: Presentation
     conditions: tuple[str, ...]
-    contenders: tuple[str, ...]
+    agents: tuple[str, ...]
     observed: tuple[str, ...]
     loop: str
     readouts: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ class Header:
 
 def observed_columns(robot: Robot[Any]) -> list[str]:
     """The numbers of a robot's observation, each by its name and unit: `cart_velocity_m_per_s`."""
-    return [f"{q.name}_{q.unit.replace('/', '_per_')}" if q.unit else q.name for q in robot.quantities]
+    return [f"{q.name}_{q.unit.replace('/', '_per_')}" if q.unit else q.name for q in robot.observation_spec]
 
 
 def read_header(file: Path, words: Mapping[str, Any]) -> Header:
@@ -82,7 +82,7 @@ def read_header(file: Path, words: Mapping[str, Any]) -> Header:
         datetime.fromisoformat(recorded_at)
     except ValueError:
         of.refuse("recorded_at", "a date in ISO 8601")
-    contenders = of.listed("contenders", dict, "a list of who acted, each with a name")
+    agents = of.listed("agents", dict, "a list of who acted, each with a name")
     try:
         channels = Channels(np.array(label, np.str_), np.array(electrode, np.int64), np.array(x_um), np.array(y_um))
         presentation = Presentation("mixed", int(pulses))
@@ -102,7 +102,7 @@ def read_header(file: Path, words: Mapping[str, Any]) -> Header:
         of.words("provenance"),
         presentation,
         tuple(of.texts("loop.conditions")),
-        tuple(of.text("name", each, f"contenders[{i}].") for i, each in enumerate(contenders)),
+        tuple(of.text("name", each, f"agents[{i}].") for i, each in enumerate(agents)),
         tuple(observed),
         json.dumps(words["loop"]),
         () if readouts.are_all else readouts.names,

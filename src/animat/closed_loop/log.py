@@ -25,6 +25,7 @@ from typing import Any, BinaryIO, NamedTuple, overload
 import numpy as np
 from jaxtyping import Float64, Int, Int64
 
+from animat.closed_loop.former import in_todays_words
 from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import expect_plain_file
 from animat.writing import keep_name
@@ -256,4 +257,4 @@ def _words(path: Path, data: bytes) -> dict[str, Any]:
         raise InvalidFile(f"{path}: expected JSON in every record, got {error}") from error
     if not isinstance(words, dict):
         raise InvalidFile(f"{path}: expected names and values in every record, got {type(words).__name__}")
-    return words
+    return in_todays_words(words)

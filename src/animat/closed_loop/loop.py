@@ -27,8 +27,8 @@ from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 OnBurst = Literal["use", "repeat", "skip"]
 OnLate = Literal["continue", "stop"]
 
-MOST_LEAD_IN = 100
-"""Times that each condition leads in: as many as a recording holds; more wears a culture out for nothing."""
+MOST_WARM_UP = 100
+"""Presentations of each condition in a warm-up: as many as a recording holds; more wears a culture out for nothing."""
 
 
 class Trained(Protocol):
@@ -67,7 +67,7 @@ class Trained(Protocol):
 class Loop:
     """The settings of a closed loop.
 
-    An action is a presentation of a condition: `pulses` pulses, the first one 1/f after the last pulse of the action
+    An action is a trial of a condition: `pulses` pulses, the first one 1/f after the last pulse of the action
     before it and the others 1/f apart, on the condition's electrodes or, where it names none, each one of the patterns
     in random order; the response to the last one is read.
 
@@ -77,9 +77,9 @@ class Loop:
         conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,); of several readouts
             (readouts, 11).
-        following: non-burst responses of each condition in that recording, Hz, in the order of time; where given, the
-            percentiles follow the culture (see `animat.closed_loop.following`). None: they are held.
-        pulses: of a presentation.
+        adaptive_from: non-burst responses of each condition in that recording, Hz, in the order of time, which adaptive
+            thresholds start from (see `animat.closed_loop.adaptive`). None: thresholds are fixed.
+        pulses: of a trial.
         window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
         pulse: what each electrode delivers.
@@ -89,8 +89,8 @@ class Loop:
         most_repeats: of one action; the response after that is used.
         on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: observed without a stimulus before each episode.
-        lead_in: how often each condition is presented after that, in random order, before the robot moves: a culture
-            that has rested answers otherwise than in a recording. The responses count where percentiles follow. None:
+        warm_up: how often each condition is presented after that, in random order, before the robot moves: a culture
+            that has rested answers otherwise than in a recording. The responses count for adaptive thresholds. None:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
@@ -106,7 +106,7 @@ class Loop:
     mapping: Mapping
     conditions: tuple[Condition, ...]
     percentiles: Float32[np.ndarray, "*readouts percentiles"] = field(repr=False)
-    following: tuple[Float64[np.ndarray, "responses *readouts"], ...] | None = field(default=None, repr=False)
+    adaptive_from: tuple[Float64[np.ndarray, "responses *readouts"], ...] | None = field(default=None, repr=False)
     pulses: int = 1
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
     burst_threshold: float = 1.0
@@ -116,7 +116,7 @@ class Loop:
     most_repeats: int = 3
     on_late: OnLate = "continue"
     pause_s: float = 2.0
-    lead_in: int | None = None
+    warm_up: int | None = None
     patience_s: float = 10.0
     real_time: bool = False
     readouts: Readouts = ALL
@@ -134,20 +134,20 @@ class Loop:
         check_window(self.window_ms)
         _ = self.presentation
         _ = self.encoder
-        if self.following is not None and (
-            len(self.following) != len(self.conditions) or not all(len(x) for x in self.following)
+        if self.adaptive_from is not None and (
+            len(self.adaptive_from) != len(self.conditions) or not all(len(x) for x in self.adaptive_from)
         ):
             raise InvalidArgument(
-                f"following: expected some responses of each of {len(self.conditions)} conditions, got "
-                f"{[len(x) for x in self.following]}"
+                f"adaptive_from: expected some responses of each of {len(self.conditions)} conditions, got "
+                f"{[len(x) for x in self.adaptive_from]}"
             )
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
-        if self.lead_in is None:
-            object.__setattr__(self, "lead_in", 2 if self.pulses == 1 else 0)
-        if not (isinstance(self.lead_in, int) and 0 <= self.lead_in <= MOST_LEAD_IN):
-            raise InvalidArgument(f"lead_in: expected a whole number from 0 to {MOST_LEAD_IN}, got {self.lead_in!r}")
+        if self.warm_up is None:
+            object.__setattr__(self, "warm_up", 2 if self.pulses == 1 else 0)
+        if not (isinstance(self.warm_up, int) and 0 <= self.warm_up <= MOST_WARM_UP):
+            raise InvalidArgument(f"warm_up: expected a whole number from 0 to {MOST_WARM_UP}, got {self.warm_up!r}")
         for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
@@ -181,7 +181,7 @@ class Loop:
             policy: its robot, mapping, readouts, conditions, window and presentation are taken, but for those in
                 `settings`.
             percentiles: of the simulator that it was trained on, in Hz, shape (11,), or (readouts, 11).
-            pulses: of a presentation; None: as many as in its recordings (1 where that is not known).
+            pulses: of a trial; None: as many as in its recordings (1 where that is not known).
             settings: the other attributes.
 
         Raises:
@@ -213,12 +213,12 @@ class Loop:
     def to_dict(self) -> dict[str, Any]:
         """As plain data, for the log of a session."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        plain["adaptive"] = plain.pop("adaptive_from") is not None
         return plain | {
             "robot": robot_to_dict(self.robot),
             "mapping": mapping_to_data(self.mapping),
             "conditions": [condition.label for condition in self.conditions],
             "percentiles": self.percentiles.tolist(),
-            "following": self.following is not None,
             "readouts": self.readouts.to_dict(),
             "pulse": self.pulse.to_list(),
         }
@@ -227,6 +227,6 @@ class Loop:
 def _differences(policy: Trained, loop: Loop) -> tuple[Finding, ...]:
     findings = list(other_presentation(policy.presentation, loop.presentation))
     if policy.window_ms is not None and policy.window_ms != loop.window_ms:
-        sentence = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
-        findings.append(Finding("other-window", "warning", sentence))
+        message = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
+        findings.append(Finding("other-window", "warning", message))
     return tuple(findings)

@@ -11,18 +11,18 @@ from animat.closed_loop.tick import Ending
 
 @dataclass
 class Acted:
-    """What was presented in an episode while its robot moved; what led in is none of it.
+    """What was presented in an episode while its robot moved, without the warm-up.
 
     Attributes:
-        presentations: repeated ones among them.
+        trials: repeated ones among them.
         actions: that the robot was moved by.
         pulses: that the culture was given.
         pulses_s: of each presentation, its pulses over its frequency.
         bursts: responses that were bursts.
-        late: presentations that came late.
+        late: trials that came late.
     """
 
-    presentations: int = 0
+    trials: int = 0
     actions: int = 0
     pulses: int = 0
     pulses_s: float = 0.0
@@ -32,24 +32,24 @@ class Acted:
 
 @dataclass
 class Episode:
-    """One episode of a contender.
+    """One episode of an agent.
 
     Attributes:
         number: in the session, from 0.
-        contender: who acted.
+        agent: who acted.
         start: what was observed before the first step; empty where the log is of before this was written.
         total: the sum of rewards, in the task's own units.
         iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
         is_whole: whether it came to its end; what the session broke off has no return.
-        pulses: that the culture was given, what led in among them.
-        bursts: responses that were bursts, also of what led in.
-        late: pulses that came late, also of what led in.
-        acted: the same without what led in, and more.
+        pulses: that the culture was given, those of the warm-up among them.
+        bursts: responses that were bursts, also in the warm-up.
+        late: pulses that came late, also in the warm-up.
+        acted: the same without the warm-up, and more.
     """
 
     number: int
-    contender: str
+    agent: str
     start: tuple[float, ...] = ()
     total: float = 0.0
     iterations: int = 0
@@ -65,7 +65,7 @@ class Outline:
     """Counts as records are added, in their order.
 
     Args:
-        pulses: of a presentation.
+        pulses: of a trial.
 
     Attributes:
         ending: what was written about it, None where nothing was.
@@ -117,14 +117,14 @@ class Outline:
         elif kind == "start":
             self._starts[words["episode"]] = tuple(words["observation"])
         elif kind == "end":
-            self.ending = Ending(words["by"], words["sentence"])
+            self.ending = Ending(words["by"], words["message"])
             self.left_out = words.get("left_out", {})
 
     def _add_tick(self, tick: Mapping[str, Any]) -> None:
         number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
         episode = self._episodes.get(number)
         if episode is None:
-            episode = Episode(number, tick["contender"], self._starts.pop(number, ()))
+            episode = Episode(number, tick["agent"], self._starts.pop(number, ()))
             self._episodes[number] = episode
         self.ticks += 1
         self.pulses += n_pulses
@@ -139,9 +139,9 @@ class Outline:
         episode.pulses += n_pulses
         episode.bursts += tick["is_burst"]
         episode.late += is_late
-        if tick["handled"] != "lead-in":
+        if tick["handled"] != "warm-up":
             acted = episode.acted
-            acted.presentations += 1
+            acted.trials += 1
             acted.actions += tick["command"] is not None
             acted.pulses += n_pulses
             acted.pulses_s += self._presented / tick["frequency_hz"]

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.contenders import Contender, InTurn, interleaved
+from animat.closed_loop.agents import Agent, InTurn, interleaved
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.gathering import LOG_FILE, SessionFiles
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
@@ -36,7 +36,7 @@ from animat.errors import AnimatError, InvalidArgument, Mismatch, shown
 from animat.progress import Progress, Silent
 
 MOST_EPISODES = 100_000
-"""Of each contender in a session."""
+"""Of each agent in a session."""
 _POLL_S = 0.02
 _BATCH, _PAUSE_S = 4, 1e-4
 """Records written in a row, some 0.2 ms, and the pause after them: the loop's thread may have a deadline."""
@@ -51,7 +51,7 @@ _GRACE_S = 2.0
 def run_session(
     culture: Culture,
     loop: Loop,
-    contenders: Sequence[Contender],
+    agents: Sequence[Agent],
     folder: str | os.PathLike[str],
     *,
     episodes: int | Sequence[int] = 5,
@@ -60,7 +60,7 @@ def run_session(
     clock: Clock | None = None,
     progress: Progress | None = None,
 ) -> Session:
-    """Run contenders in closed loop on a culture, their episodes interleaved in random order.
+    """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
     Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, with what was asked
     of the culture and not answered yet; and once this returns, or `recover_session` did its work, `session.nwb` is a
@@ -72,29 +72,29 @@ def run_session(
     Args:
         culture: open; it stays open.
         loop: the settings.
-        contenders: who acts.
+        agents: who acts.
         folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line a tick.
-        episodes: of each contender, or of each its own number.
+        episodes: of each agent, or of each its own number.
         seed: decides every random draw, but what the culture does.
         account: of a stimulation budget; None: without end.
         clock: the machine's; None: its monotonic one.
         progress: told after each episode.
 
     Raises:
-        InvalidArgument: for a culture that is closed or stopped, no contenders, or a session in the folder already.
+        InvalidArgument: for a culture that is closed or stopped, no agents, or a session in the folder already.
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read.
         InvalidFile: if the log cannot be begun.
     """
-    planned = [episodes] * len(contenders) if isinstance(episodes, int) else list(episodes)
-    _check(culture, loop, contenders, planned, seed)
+    planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
+    _check(culture, loop, agents, planned, seed)
     expect_no_session(folder)
     account, progress = account or Account(), progress or Silent()
     turns = interleaved(planned, np.random.default_rng([seed, 20]))
-    driver = Driver(culture, loop, contenders, turns, account, clock or WallClock(), seed)
+    driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed)
     file = Path(folder) / LOG_FILE
     # As whoever reads the log has it.
-    header = json.loads(json.dumps(_header(culture, loop, contenders, turns, seed)))
+    header = json.loads(json.dumps(_header(culture, loop, agents, turns, seed)))
     with ExitStack() as stack:
         files = stack.enter_context(SessionFiles(file.parent, read_header(file, header)))
         log = LogWriter(file, header)
@@ -109,10 +109,10 @@ def run_session(
             else:
                 files.finish(session.log.records, ending)
         except Exception as error:
-            # What was lived comes back, whatever its files are like.
+            # What was measured comes back, whatever its files are like.
             told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
-            sentence = f"{ending.sentence}; and {told} (animat recover {folder} makes them again)"
-            session = replace(session, ending=replace(ending, sentence=sentence))
+            message = f"{ending.message}; and {told} (animat recover {folder} makes them again)"
+            session = replace(session, ending=replace(ending, message=message))
     return session
 
 
@@ -220,8 +220,8 @@ class _Supervisor:
     def _finish(self, ending: Ending) -> Ending:
         """Write what is left, and how it ended."""
         if self._not_halted is not None:
-            sentence = f"{ending.sentence}; BUT {self._not_halted}: see to it that the device gives no more pulses"
-            ending = replace(ending, sentence=sentence)
+            message = f"{ending.message}; BUT {self._not_halted}: see to it that the device gives no more pulses"
+            ending = replace(ending, message=message)
         try:
             # Looked at first: a robot that comes back just now has its tick among those that are written.
             unfinished = self._driver.unfinished
@@ -229,13 +229,13 @@ class _Supervisor:
             if unfinished is not None and unfinished.words["stretch"] > self._seen:
                 self._append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
-            words = {"kind": "end", "by": ending.by, "sentence": ending.sentence, "left_out": left_out}
+            words = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
             self._append(Record(words))
             self._log.sync()
         except OSError as error:
             left = len(self._driver.records)
-            sentence = f"{ending.sentence}; {left} ticks could not be written: {error.strerror or error}"
-            return Ending("disk" if ending.by in ("plan", "budget") else ending.by, sentence)
+            message = f"{ending.message}; {left} ticks could not be written: {error.strerror or error}"
+            return Ending("disk" if ending.by in ("plan", "budget") else ending.by, message)
         return ending
 
     def _stop_for_a_person(self) -> None:
@@ -245,7 +245,7 @@ class _Supervisor:
     def _halt(self, ending: Ending) -> None:
         """Stop the culture, from a thread of its own: a backend that hangs must not hang the end as well."""
         self._not_halted = f"the culture did not say within {_GRACE_S:g} s that it is stopped"
-        halting = threading.Thread(target=self._halt_now, args=(ending.sentence,), daemon=True)
+        halting = threading.Thread(target=self._halt_now, args=(ending.message,), daemon=True)
         halting.start()
         halting.join(_GRACE_S)
 
@@ -282,9 +282,7 @@ def _switching_every(interval_s: float) -> Iterator[None]:
         sys.setswitchinterval(before_s)
 
 
-def _header(
-    culture: Culture, loop: Loop, contenders: Sequence[Contender], turns: Sequence[int], seed: int
-) -> dict[str, Any]:
+def _header(culture: Culture, loop: Loop, agents: Sequence[Agent], turns: Sequence[int], seed: int) -> dict[str, Any]:
     channels = culture.channels
     return {
         "kind": "header",
@@ -298,17 +296,17 @@ def _header(
         "limits": asdict(culture.limits),
         "loop": loop.to_dict(),
         "observed": observed_columns(loop.robot),
-        "contenders": [_told(contender) for contender in contenders],
-        "turns": [contenders[turn].name for turn in turns],
+        "agents": [_told(agent) for agent in agents],
+        "turns": [agents[turn].name for turn in turns],
         "seed": seed,
     }
 
 
-def _told(contender: Contender) -> dict[str, Any]:
-    told: dict[str, Any] = {"name": contender.name, "meaning": contender.meaning, "delivery": contender.delivery}
-    if isinstance(contender.controller, InTurn):
-        # Episode after episode of this contender, over and over.
-        told["in_turn"] = list(contender.controller.by_name)
+def _told(agent: Agent) -> dict[str, Any]:
+    told: dict[str, Any] = {"name": agent.name, "meaning": agent.meaning, "delivery": agent.delivery}
+    if isinstance(agent.controller, InTurn):
+        # Episode after episode of this agent, over and over.
+        told["in_turn"] = list(agent.controller.by_name)
     return told
 
 
@@ -323,15 +321,15 @@ def check_episodes(name: str, episodes: int) -> None:
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(episodes)}")
 
 
-def _check(culture: Culture, loop: Loop, contenders: Sequence[Contender], episodes: Sequence[int], seed: int) -> None:
+def _check(culture: Culture, loop: Loop, agents: Sequence[Agent], episodes: Sequence[int], seed: int) -> None:
     if not culture.is_open or culture.is_stopped:
         state = "stopped" if culture.is_open else "closed"
         raise InvalidArgument(f"culture: expected an open one that may stimulate, got one that is {state}")
-    if not contenders or len({contender.name for contender in contenders}) < len(contenders):
-        raise InvalidArgument("contenders: expected at least one, each name once")
-    if len(episodes) != len(contenders):
+    if not agents or len({agent.name for agent in agents}) < len(agents):
+        raise InvalidArgument("agents: expected at least one, each name once")
+    if len(episodes) != len(agents):
         raise InvalidArgument(
-            f"episodes: expected one number, or one for each of {len(contenders)} contenders, got {len(episodes)}"
+            f"episodes: expected one number, or one for each of {len(agents)} agents, got {len(episodes)}"
         )
     for each in episodes:
         check_episodes("episodes", each)

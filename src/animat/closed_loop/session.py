@@ -28,7 +28,7 @@ from animat.closed_loop.tick import Ending, Tick
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress
 from animat.recordings.recording import Recording
-from animat.writing import alone_in, clear_away, is_unfinished
+from animat.writing import clear_away, exclusive_lock, is_unfinished
 
 _TOLD_EVERY = 1000
 
@@ -157,7 +157,7 @@ class Session:
         outline = self.outline
         return {
             "ended_by": self.ending.by,
-            "ended": self.ending.sentence,
+            "ended": self.ending.message,
             "episodes": len(outline.episodes),
             "ticks": outline.ticks,
             "pulses": outline.pulses,
@@ -199,7 +199,7 @@ def read_session(path: str | os.PathLike[str]) -> Session:
     last = log.records[-1].words if len(log.records) else {}
     with expecting_a_session(file):
         if last.get("kind") == "end":
-            ending = Ending(last["by"], last["sentence"])
+            ending = Ending(last["by"], last["message"])
     return Session(file.parent, log, ending)
 
 
@@ -245,7 +245,7 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
         Mismatch: if the session still runs.
     """
     # What is no session is told before its folder is held.
-    with alone_in(read_session(path).folder):
+    with exclusive_lock(read_session(path).folder):
         session = read_session(path)
         for leftover in session.folder.glob(".*"):
             # What the killed program was just writing.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self
 
-Handled = Literal["used", "repeated", "skipped", "lead-in", "unfinished"]
+Handled = Literal["used", "repeated", "skipped", "warm-up", "unfinished"]
 EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
 
 
@@ -15,11 +15,11 @@ class Tick:
 
     Attributes:
         number: of the presentation in the session, from 0.
-        contender: whose episode it is.
+        agent: whose episode it is.
         episode: number of the episode in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
-            and what leads in has -1.
-        chosen: the condition that was chosen, by the contender or, where it leads in, by lot.
+            and the warm-up has -1.
+        chosen: the condition that was chosen, by the agent or, in a warm-up, by lot.
         delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
         frequency_hz: that the delivered one was presented at.
         patterns: of each pulse, -1 where its electrodes are none of the culture's; none under the silent control.
@@ -30,7 +30,7 @@ class Tick:
         readout_hz: x of each readout, where these are groups of channels; else empty.
         active_ratio: share of channels that spiked in the window.
         is_burst: whether that is above the threshold.
-        handled: what was done with the response; `"lead-in"` before the robot of an episode moves; `"unfinished"` if
+        handled: what was done with the response; `"warm-up"` before the robot of an episode moves; `"unfinished"` if
             something went wrong before the robot had moved.
         command: the robot was moved by, one for each readout where there are several; None where it was not moved.
         reward: of the step.
@@ -44,7 +44,7 @@ class Tick:
     """
 
     number: int
-    contender: str
+    agent: str
     episode: int
     iteration: int
     chosen: int
@@ -87,8 +87,8 @@ class Ending:
         by: `"plan"`, all episodes were run; else what ended it before: the budget, a person (Ctrl-C), a fault of the
             culture, the silence of whoever should have answered (`"hang"`), a late pulse where that should stop, the
             robot, the controller, the disk; `"crash"` where nothing was written about it.
-        sentence: what happened.
+        message: what happened.
     """
 
     by: EndedBy
-    sentence: str
+    message: str

@@ -9,7 +9,7 @@ from typing import Any, TextIO
 HEAD = (
     "tick",
     "time_s",
-    "contender",
+    "agent",
     "episode",
     "iteration",
     "chosen",
@@ -70,7 +70,7 @@ def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int, read
     row = [
         tick["number"],
         tick["read_after_s"],
-        tick["contender"],
+        tick["agent"],
         tick["episode"],
         tick["iteration"],
         conditions[tick["chosen"]],

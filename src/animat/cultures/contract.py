@@ -49,7 +49,7 @@ class CultureContract(abc.ABC):
     def protocol(self) -> Protocol:
         """A short protocol."""
         return Protocol(
-            frequencies_hz=self.frequencies_hz, patterns=1, presentations=4, setup_s=0.1, pause_s=0.1, pulse=self.pulse
+            frequencies_hz=self.frequencies_hz, patterns=1, trials=4, setup_s=0.1, pause_s=0.1, pulse=self.pulse
         )
 
     def stimulus(self, culture: Culture, time_s: float = 0.0) -> Stimulus:

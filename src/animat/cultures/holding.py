@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from animat.errors import DeviceFailed, InvalidFile, Mismatch
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 MACHINE = Path("/tmp")
 """Where devices that all programs on this machine share are held; not what `TMPDIR` says, which differs by user."""
@@ -43,7 +43,7 @@ def held(device: Path, holder: str) -> Iterator[bool]:
             if device.is_symlink():
                 # In a folder that all can write to, another user could point it at one of ours.
                 raise DeviceFailed(f"{device.name}: expected a folder to hold it by, got the link {device}: remove it")
-            stack.enter_context(alone_in(device))
+            stack.enter_context(exclusive_lock(device))
             _share(device)
         except (InvalidFile, OSError) as error:
             raise DeviceFailed(

@@ -15,7 +15,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 _MAY_DIFFER = ("stimulation_units",)
 """What a device tells of itself that can be otherwise when it is opened anew, and makes no other culture of it."""
@@ -69,7 +69,7 @@ def record_living_series(
     folder, progress = Path(folder), progress or Silent()
     # Seen before it is touched: somebody else's folder stays as it is.
     _beginning_s(culture, protocol, series_files(folder, sessions, interval_min), 60 * interval_min)
-    with alone_in(folder):
+    with exclusive_lock(folder):
         return record_in_held_folder(culture, protocol, folder, sessions, interval_min, seed, progress)
 
 
@@ -82,7 +82,7 @@ def record_in_held_folder(
     seed: int,
     progress: Progress,
 ) -> LivingSeries:
-    """Do as `record_living_series` does, in a folder that the caller holds (`animat.writing.alone_in`).
+    """Do as `record_living_series` does, in a folder that the caller holds (`animat.writing.exclusive_lock`).
 
     To open a device is to do something to it: whoever opens one for a folder holds that before. Arguments and errors
     are those of `record_living_series`.

@@ -26,12 +26,12 @@ def other_culture(recording: Recording, start_min: float, culture: Culture) -> F
     """
     now_min, told = culture.now_s / 60, recording.provenance
     if culture.name == "cl1" and now_min < start_min + recording.duration_s / 60:
-        sentence = (
+        message = (
             f"the CL1's clock is at {now_min:.1f} min, before the end of the recording at {start_min:.1f} min that "
             "percentiles are of: the device was started anew, as the SDK's simulator is whenever it is opened, and a "
             "simulated culture then is anew too: another time has other percentiles"
         )
-        return Finding("other-culture", "warning", sentence, start_min - now_min)
+        return Finding("other-culture", "warning", message, start_min - now_min)
     if not isinstance(culture, VirtualCulture):
         return None
     differ = [name for name, words in culture.settings.items() if told.get(name) != words]
@@ -41,18 +41,18 @@ def other_culture(recording: Recording, start_min: float, culture: Culture) -> F
             of = "no virtual culture"
         elif "seed" not in differ:
             of += f" with another {' and '.join(differ)}"
-        sentence = (
+        message = (
             f"the recordings are of {of}, and this is virtual culture {culture.seed}: another culture has other "
             "percentiles"
         )
     elif now_min < start_min:
-        sentence = (
+        message = (
             f"the culture begins{' anew' if now_min == 0 else ''} at {now_min:.0f} min, and its percentiles are of the "
             f"recording at {start_min:.0f} min: another time has other percentiles; give its state after that (--state)"
         )
     else:
         return None
-    return Finding("other-culture", "warning", sentence, start_min - now_min)
+    return Finding("other-culture", "warning", message, start_min - now_min)
 
 
 def other_patterns(recording: Recording, culture: Culture) -> Finding | None:

@@ -20,7 +20,7 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
-from animat.writing import alone_in, clear_away
+from animat.writing import clear_away, exclusive_lock
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
@@ -70,7 +70,7 @@ def record_virtual_series(
     files = series_files(folder, sessions, interval_min)
     # Seen before it is touched: somebody else's folder stays as it is.
     _expect_series(files, fresh, protocol, interval_min)
-    with alone_in(folder):
+    with exclusive_lock(folder):
         # And again now that nobody writes: another run may have ended in between.
         _expect_series(files, fresh, protocol, interval_min)
         _remove_leftovers(folder)

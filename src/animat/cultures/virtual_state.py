@@ -27,7 +27,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import expect_plain_file
 from animat.stimulation.array import MAXONE
 from animat.stimulation.selection import Selection
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 FORMAT = "animat virtual culture state 1"
 _HELD = ("held_ns", "held_neuron")
@@ -73,7 +73,7 @@ def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state
     }
     arrays = {f"state_{name}": values for name, values in snapshot.state._asdict().items()}
     arrays |= {f"kicks_{name}": values for name, values in snapshot.kicks._asdict().items()}
-    with written_whole(path) as beside, beside.open("wb") as file:
+    with atomic_write(path) as beside, beside.open("wb") as file:
         np.savez_compressed(
             file,
             head=np.array(json.dumps(head)),

@@ -29,10 +29,10 @@ _QUANTILES = 2048
 _MOST_LEVELS = 12
 
 CLASSES = 6
-"""In how many classes a past is remembered."""
+"""In how many classes a history is remembered."""
 
 _PASTS = 8
-"""How many pasts stand for each of their classes."""
+"""How many histories stand for each of their classes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,10 +144,10 @@ def mean_commands(
 
 
 def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
-    """How many classes of the past make a difference: one where nothing is remembered.
+    """How many classes of the history make a difference: one where nothing is remembered.
 
     Raises:
-        InvalidArgument: for a simulator of one's own that remembers: its pasts are not known.
+        InvalidArgument: for a simulator of one's own that remembers: its histories are not known.
     """
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return 1
@@ -159,31 +159,31 @@ def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) 
     return CLASSES
 
 
-def class_of(simulator: MemorySimulator, past: Float[Stored, "*pasts"]) -> Int[Array, "*pasts"]:
-    """Which class of pasts each is remembered in: of the recording's own, equally many are in each."""
+def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories"]) -> Int[Array, "*histories"]:
+    """Which class of histories each is remembered in: of the recording's own, equally many are in each."""
     ends = np.arange(1, CLASSES) / CLASSES
-    return jnp.sum(jnp.asarray(past)[..., None] >= jnp.quantile(_recorded(simulator), ends), axis=-1)
+    return jnp.sum(jnp.asarray(history)[..., None] >= jnp.quantile(_recorded(simulator), ends), axis=-1)
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
-    """What each action leads to after a past of each class, and of which class the past is then.
+    """What each action leads to after a history of each class, and of which class the history is then.
 
-    A memory in six steps (`class_of`): 8 pasts stand for all of a class, and 2048 draws after each of them for what is
-    answered.
+    A memory in six steps (`class_of`): 8 histories stand for all of a class, and 2048 draws after each of them for
+    what is answered.
 
     Args:
         environment, simulator: as in `commands_of`.
 
     Returns:
-        For each class of the past, for each class of the past to come: the commands, with the probabilities that they
-        come with it; over all of these they add up to 1. Where nothing is remembered, one class and the commands of
-        `commands_of`.
+        For each class of the history, for each class of the history to come: the commands, with the probabilities
+        that they come with it; over all of these they add up to 1. Where nothing is remembered, one class and the
+        commands of `commands_of`.
     """
     is_one, animat = layers_of(environment, simulator) == 1, unwrapped(environment)
     if is_one or not (isinstance(animat, Animat) and isinstance(simulator, MemorySimulator)):
         return [[commands_of(environment, simulator)]]
-    levels, pasts = _answers(animat, simulator, _pasts(simulator))
-    levels, classes = np.asarray(levels), np.asarray(class_of(simulator, pasts))
+    levels, histories = _answers(animat, simulator, _histories(simulator))
+    levels, classes = np.asarray(levels), np.asarray(class_of(simulator, histories))
     if _is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: one action stands for all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
@@ -202,13 +202,13 @@ def _is_shuffled(environment: Environment[Any]) -> bool:
 
 
 def _recorded(simulator: MemorySimulator) -> Float[Array, " responses"]:
-    """The pasts of all recorded responses, rising."""
-    pasts = jnp.sort(jnp.asarray(simulator.before).ravel())
-    return pasts[: int(jnp.sum(jnp.isfinite(pasts)))]
+    """The histories of all recorded responses, rising."""
+    histories = jnp.sort(jnp.asarray(simulator.before).ravel())
+    return histories[: int(jnp.sum(jnp.isfinite(histories)))]
 
 
-def _pasts(simulator: MemorySimulator) -> Float[Array, "classes pasts"]:
-    """A few pasts of each class, evenly spaced in rank among those that were recorded."""
+def _histories(simulator: MemorySimulator) -> Float[Array, "classes histories"]:
+    """A few histories of each class, evenly spaced in rank among those that were recorded."""
     recorded = _recorded(simulator)
     ends = np.searchsorted(np.asarray(class_of(simulator, recorded)), np.arange(CLASSES + 1))
     within = (np.arange(_PASTS) + 0.5) / _PASTS
@@ -226,15 +226,15 @@ def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses
 
 @partial(jax.jit, static_argnums=0)
 def _answers(
-    environment: Animat[Any], simulator: MemorySimulator, past: Float[Array, "classes pasts"]
+    environment: Animat[Any], simulator: MemorySimulator, history: Float[Array, "classes histories"]
 ) -> tuple[Float[Array, "classes conditions draws"], Float[Array, "classes conditions draws"]]:
-    """The commands, and what is remembered then, at evenly spaced quantiles of each condition after each past."""
+    """The commands, and what is remembered then, at evenly spaced quantiles of each condition after each history."""
     uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
 
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
     conditions = jnp.arange(simulator.n_conditions)
-    x, then = (each.reshape(len(past), len(conditions), -1) for each in answers(conditions, uniforms, past))
+    x, then = (each.reshape(len(history), len(conditions), -1) for each in answers(conditions, uniforms, history))
     return environment.mapping.command(x, simulator.percentiles), then
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from animat.environment import Animat, Environment
-from animat.evaluation.hand_made import Heuristic, hand_made
+from animat.evaluation.heuristic import Heuristic, heuristic_policy
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, silenced
 from animat.wrappers import ShuffledDelivery, unwrapped
@@ -20,7 +20,7 @@ class Control:
     """Somebody who acts in place of the policies, or the policies in a changed environment.
 
     Attributes:
-        name: `random`, `constant 5 Hz`, `made by hand`, `silent` or `shuffled`.
+        name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`.
         meaning: what it does, in a few words.
         environment, simulator: that it is run in.
         actor: who acts.
@@ -44,7 +44,7 @@ def controls_of(
 ) -> list[Control]:
     """The controls of an environment, each with what it is run in.
 
-    *random*, an action drawn at random; *constant*, one action always, for each of them; *made by hand*, the robot's
+    *random*, an action drawn at random; *constant*, one action always, for each of them; *heuristic*, the robot's
     `heuristic`, where it has one; and through neurons, with policies: *silent*, on a culture that always answers 0;
     *shuffled*, with the delivered condition drawn anew at each iteration, whatever they chose.
 
@@ -62,9 +62,9 @@ def controls_of(
         rule: Actor = Heuristic()
         meaning = "no learning: the command of the robot's heuristic"
         if environment.n_actions is not None:
-            rule = hand_made(environment, simulator)
+            rule = heuristic_policy(environment, simulator)
             meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
-        controls.append(Control("made by hand", meaning, environment, simulator, rule))
+        controls.append(Control("heuristic", meaning, environment, simulator, rule))
     if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
         silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
         controls += [

@@ -19,7 +19,7 @@ from animat.evaluation.commands import CLASSES, class_of, commands_after, layers
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.statistics import Interval
-from animat.evaluation.sweeping import cubic, fill_row_weights, look_ahead, step_back
+from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import AT_FIRST, NeuronSimulator
 from animat.progress import Progress, Silent
@@ -27,7 +27,7 @@ from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
-"""What a limit is asked for: an environment, and the simulator in it (None without neurons)."""
+"""What an optimum is asked for: an environment, and the simulator in it (None without neurons)."""
 
 COARSER = 0.75
 """Steps along each axis of the grid that the value is compared with, as a part of those of the grid in use."""
@@ -45,8 +45,8 @@ class Optimum:
 
     Attributes:
         value: by dynamic programming, of a controller that knows the time left, and where neurons remember it the class
-            of the past (one of six: `animat.evaluation.commands.class_of`). What the grid cannot resolve raises it more
-            often than it lowers it, as the best of several values is taken: the upper end of a bracket.
+            of the history (one of six: `animat.evaluation.commands.class_of`). What the grid cannot resolve raises it
+            more often than it lowers it, as the best of several values is taken: the upper end of a bracket.
         grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
         monte_carlo: mean return of that controller, run on the environment itself: a return that can be had, the lower
             end of the bracket; NaN where it was not run, as the three that follow.
@@ -116,7 +116,7 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
             f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution (or the "
             f"{CLASSES} classes of what a memory simulator remembers are)"
         )
-    return (Finding("limit", "warning", told, apart),)
+    return (Finding("optimum", "warning", told, apart),)
 
 
 def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
@@ -138,10 +138,10 @@ def best_returns(
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 
     with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. Where the
-    neurons remember, s holds the class of the past too (`commands_after`). V is kept
+    neurons remember, s holds the class of the history too (`commands_after`). V is kept
     at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
     `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
-    a return that can be had and cannot lie above the true limit by more than chance.
+    a return that can be had and cannot lie above the true optimum by more than chance.
 
     Args:
         cases: environments, all of the same robot, each with its simulator (None without neurons).
@@ -200,7 +200,7 @@ def best_returns(
                     nodes=fine.size,
                 )
             )
-            progress.update(len(optima), len(cases), f"limit {values[case]:.1f}")
+            progress.update(len(optima), len(cases), f"optimum {values[case]:.1f}")
     return tuple(optima)
 
 
@@ -292,7 +292,7 @@ class _Programme:
             self.bounds = lowest, highest
             if tables is not None:
                 tables.keep(remaining, values.reshape(shape))
-            step_back(
+            bellman_backup(
                 values,
                 landings.rows,
                 landings.row_places,
@@ -352,12 +352,12 @@ class _Programme:
                 break
         return returns
 
-    def _layer(self, case: int, past: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
-        """In which of a case's layers episodes are, by their past."""
+    def _layer(self, case: int, history: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
+        """In which of a case's layers episodes are, by their history."""
         simulator = self._cases[case][1]
         if layers_of(*self._cases[case]) == 1 or not isinstance(simulator, MemorySimulator):
-            return np.zeros(len(past), np.int32)
-        return np.asarray(class_of(simulator, past), np.int32)
+            return np.zeros(len(history), np.int32)
+        return np.asarray(class_of(simulator, history), np.int32)
 
     def _interpolate(
         self, values: Float32[np.ndarray, "rows cases nodes"], states: Any

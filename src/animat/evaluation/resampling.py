@@ -1,4 +1,4 @@
-"""How well responses tell the optimal return: which conditions have enough, and what redrawing them changes."""
+"""How well responses tell the optimal return: which conditions have enough, and what bootstrapping them changes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from animat.wrappers import ShuffledDelivery
 RESAMPLES = 39
 """The fewest whose smallest and largest are their 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
 ROUGH, ROUGH_SMOOTH = 0.5, 0.2
-"""Steps along each axis of the grid that redrawn responses are solved on, as a part of the usual ones: the latter where
-a command acts smoothly and never decides whether an episode ends, where the quantiles are those of 0.5 within 0.1."""
+"""Steps along each axis of the grid that bootstrapped responses are solved on, as a part of the usual ones: the latter
+where a command acts smoothly and never decides whether an episode ends: the quantiles are those of 0.5 within 0.1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Counted:
         simulator: of these responses.
         responses: to these conditions.
         left_out: the other conditions, with the number of their responses.
-        fit: makes a simulator of redrawn responses.
+        fit: makes a simulator of bootstrapped responses.
     """
 
     environment: Animat[Any]
@@ -48,27 +48,27 @@ class Counted:
     fit: Callable[[Responses], NeuronSimulator]
 
     @classmethod
-    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_held: bool) -> Self:
+    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_fixed: bool) -> Self:
         """Of a recording of a timeline.
 
         Args:
             environment: with all of its conditions.
             timeline: with its responses.
             minute: of the recording.
-            are_held: whether the mapping's percentiles are those of the first recording.
+            are_fixed: whether the mapping's percentiles are those of the first recording.
 
         Raises:
             UnusableData: where no condition has enough.
         """
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
-        simulator = (timeline.with_first_percentiles() if are_held else timeline).at(minute)
+        simulator = (timeline.with_first_percentiles() if are_fixed else timeline).at(minute)
         # The mapping's thresholds are those of all responses, also where some of them are left out.
         percentiles, kind = simulator.percentiles, timeline.fitted["kind"]
         fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
 
         def fit(these: Responses, kind: str) -> NeuronSimulator:
             made = fit_simulator(these, kind=kind, **(fitted if kind == "histogram" else {}))
-            return replace(made, percentiles=percentiles) if are_held or left_out else made  # type: ignore[type-var]
+            return replace(made, percentiles=percentiles) if are_fixed or left_out else made  # type: ignore[type-var]
 
         if left_out:
             environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)
@@ -132,7 +132,7 @@ def with_intervals(
 
         low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
 
-    with v the optimum, v_0 the same on a rough grid and v_b that of responses redrawn, condition by condition, 39
+    with v the optimum, v_0 the same on a rough grid and v_b that of responses bootstrapped, condition by condition, 39
     times. The lower end is the lower one of the percentile and the reversed interval, as an optimum is the best of
     several values and few responses raise it. Where the responses do not tell that conditions differ at all
     (Kruskal-Wallis, p > 0.05), it reaches down to the return of stimuli drawn at random. e is the grid's error. Nothing
@@ -144,7 +144,7 @@ def with_intervals(
         responses: that the simulator in them was made of.
         fit: makes a simulator of responses.
         resolution: of the optima's grid, which the rough one is not finer than.
-        resamples: how often responses are redrawn; 0: there are no intervals.
+        resamples: how often responses are bootstrapped; 0: there are no intervals.
         seed: decides what is drawn.
         progress: told after each optimum.
     """
@@ -153,7 +153,7 @@ def with_intervals(
     if not resamples:
         return tuple(optima)
     rng = np.random.default_rng(seed)
-    simulators = [fit(each) for each in (responses, *(responses.redrawn(rng) for _ in range(resamples)))]
+    simulators = [fit(each) for each in (responses, *(responses.bootstrapped(rng) for _ in range(resamples)))]
     grid = _rough(grid_for(environments[0].robot), resolution)
     rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
     differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE

@@ -1,4 +1,4 @@
-"""Comparisons of policies by rank, their sizes and their intervals; and the score between random and the limit."""
+"""Comparisons of policies by rank, their sizes and their intervals; and the score between random and the optimum."""
 
 from __future__ import annotations
 
@@ -199,19 +199,19 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
     return {name: corrected[name] for name in p}
 
 
-def normalised_score(policy: float, random: float, limit: float) -> float:
-    """How far a policy has come from a random one to the optimal return: (policy - random) / (limit - random).
+def normalised_score(policy: float, random: float, optimum: float) -> float:
+    """How far a policy has come from a random one to the optimal return: (policy - random) / (optimum - random).
 
-    0 is as good as random and 1 the limit (`animat.evaluation.optimum`), which a measured mean can pass by chance.
+    0 is as good as random and 1 the optimum (`animat.evaluation.optimum`), which a measured mean can pass by chance.
 
     Raises:
-        InvalidArgument: if the limit is not above the random policy: nothing can be learned there.
+        InvalidArgument: if the optimum is not above the random policy: nothing can be learned there.
     """
-    if not limit > random:
+    if not optimum > random:
         raise InvalidArgument(
-            f"limit: expected more than the random policy's {random:g}, got {limit:g}; every controller is as good here"
+            f"optimum: expected more than the random policy's {random:g}, got {optimum:g}: every controller is as good"
         )
-    return (policy - random) / (limit - random)
+    return (policy - random) / (optimum - random)
 
 
 def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:

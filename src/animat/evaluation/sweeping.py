@@ -43,7 +43,7 @@ def fill_row_weights(places: Float32[np.ndarray, " axes"], weights: Float32[np.n
 
 
 @compiled
-def step_back(
+def bellman_backup(
     values: Float32[np.ndarray, " nodes_of_all_rows_and_layers"],
     rows: Int32[np.ndarray, "landings rows"],
     row_places: Float32[np.ndarray, "landings rows axes"],
@@ -63,7 +63,7 @@ def step_back(
         best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))),    (k, m) = outcomes_l(o)
 
     There is one layer of values for each case; for one whose neurons remember, a layer for each class of the
-    past. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
+    history. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
     once, node by node, which is fast, and what is left to do for each node is to interpolate along the row.
 
     Args:
@@ -164,14 +164,14 @@ def look_ahead(
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
-    """The best action of each of some states, by what the states that follow are worth (see `step_back`).
+    """The best action of each of some states, by what the states that follow are worth (see `bellman_backup`).
 
     Args:
         values: of the states that follow, of one case.
         rows, row_places, nodes, places, rewards: the landings of the states.
         row_offsets: of the rows around a landing.
         layers: of the states.
-        outcomes, weights: as in `step_back`, of the case's layers.
+        outcomes, weights: as in `bellman_backup`, of the case's layers.
         remaining: iterations left after this one.
         chosen: filled.
     """

@@ -80,10 +80,10 @@ class Evaluation:
         recorded_at_min: the recording the simulator was made of; None without neurons.
         names: the policies, in the order of the first row's actors.
         rows: the policies first, then the controls.
-        findings: where the policies' training and this simulator differ, and where the limit is not well known.
-        limit: the optimal return of any controller; None where it was not asked for, or is not known.
-        no_limit: why it is not known, though it was asked for.
-        held_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move along.
+        findings: where the policies' training and this simulator differ, and where the optimum is not well known.
+        optimum: the optimal return of any controller; None where it was not asked for, or is not known.
+        no_optimum: why it is not known, though it was asked for.
+        fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
     """
 
     __repr__ = briefly
@@ -94,9 +94,9 @@ class Evaluation:
     names: tuple[str, ...]
     rows: tuple[Row, ...]
     findings: tuple[Finding, ...]
-    limit: Optimum | None = None
-    no_limit: str | None = None
-    held_from_min: float | None = None
+    optimum: Optimum | None = None
+    no_optimum: str | None = None
+    fixed_from_min: float | None = None
 
     @property
     def verdict(self) -> Verdict | None:
@@ -110,17 +110,19 @@ class Evaluation:
         return tuple(dict.fromkeys(f.name for f in self.findings if f.name in transfer.NAMES))
 
     def score(self, row: Row) -> float | None:
-        """The normalised score of a row's mean return, (mean - random) / (limit - random).
+        """The normalised score of a row's mean return, (mean - random) / (optimum - random).
 
-        None where no limit is known or it is not above random actions, where conditions are left out of it, which the
-        rows act on too, and for controls that act in something else than what the limit is of: under shuffled delivery
-        nothing can be chosen, and a silent culture is another one.
+        None where no optimum is known or it is not above random actions, where conditions are left out of it, which the
+        rows act on too, and for controls that act in something else than what the optimum is of: under shuffled
+        delivery nothing can be chosen, and a silent culture is another one.
         """
-        if self.limit is None or self.limit.left_out or row.changed:
+        if self.optimum is None or self.optimum.left_out or row.changed:
             return None
         random = next(each for each in self.rows if each.name == "random")
         try:
-            return normalised_score(float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.limit.value)
+            return normalised_score(
+                float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
+            )
         except InvalidArgument:
             return None
 
@@ -130,11 +132,11 @@ class Evaluation:
             "robot": self.robot,
             "mapping": self.mapping,
             "recorded_at_min": self.recorded_at_min,
-            "percentiles_held_from_min": self.held_from_min,
+            "percentiles_fixed_from_min": self.fixed_from_min,
             "policies": dict(zip(self.names, self.rows[0].mean_returns.tolist(), strict=True)),
             "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
-            "limit": None if self.limit is None else self.limit.to_dict(),
-            "no_limit": self.no_limit,
+            "optimum": None if self.optimum is None else self.optimum.to_dict(),
+            "no_optimum": self.no_optimum,
             "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
@@ -145,8 +147,8 @@ class Evaluation:
         """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
         first = self.rows[0].episodes.returns
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
-        if self.held_from_min is not None:
-            on += f", percentiles held from {self.held_from_min:g} min"
+        if self.fixed_from_min is not None:
+            on += f", percentiles fixed from {self.fixed_from_min:g} min"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         head = ["", "mean return", "s.e.", "iterations", "ended early", "score", ""]
         cells = []
@@ -156,7 +158,7 @@ class Evaluation:
             numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
             ended = f"{100 * told['terminated_share']:.0f} %"
             cells.append([row.name, *numbers, ended, "" if score is None else f"{score:.2f}", row.meaning])
-        if self.limit is None:
+        if self.optimum is None:
             for line in (head, *cells):
                 del line[-2]
         lines = [f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each", *lined_up(head, cells)]
@@ -169,15 +171,15 @@ class Evaluation:
             if self.not_met != (transfer.UNKNOWN,):
                 known = "a closed loop on the culture would not meet these returns"
             lines.append(f"  {known}: see the warnings ({', '.join(self.not_met)})")
-        lines += [f"  {finding.sentence}" for finding in self.findings if finding.name == "no-heuristic"]
-        return "\n".join([*lines, *self._limit_lines()])
+        lines += [f"  {finding.message}" for finding in self.findings if finding.name == "no-heuristic"]
+        return "\n".join([*lines, *self._optimum_lines()])
 
-    def _limit_lines(self) -> list[str]:
-        if self.no_limit is not None:
-            return [f"  no optimal return: {self.no_limit}"]
-        if self.limit is None:
+    def _optimum_lines(self) -> list[str]:
+        if self.no_optimum is not None:
+            return [f"  no optimal return: {self.no_optimum}"]
+        if self.optimum is None:
             return []
-        if self.limit.left_out:
+        if self.optimum.left_out:
             meaning = "no score, as the optimal return is without conditions that the rows act on too"
         elif not self.rows[0].changed and self.score(self.rows[0]) is None:
             meaning = "no score, as the optimal return is not above that of random actions"
@@ -185,8 +187,8 @@ class Evaluation:
             meaning = "score: (mean return - random) / (optimal return - random)"
             changed = [row.name for row in self.rows if row.changed]
             if changed:
-                meaning += f"; none for {' and '.join(changed)}, whose limit is another"
-        return [f"  {self.limit.to_text()}", f"  {meaning}"]
+                meaning += f"; none for {' and '.join(changed)}, whose optimum is another"
+        return [f"  {self.optimum.to_text()}", f"  {meaning}"]
 
 
 def evaluate(
@@ -199,7 +201,7 @@ def evaluate(
     greedy: bool = True,
     robot: Robot[Any] | None = None,
     controls: Collection[str] | None = None,
-    limit_resolution: float | None = None,
+    optimum_resolution: float | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Run policies and the controls beside them on the simulator of one minute.
@@ -215,9 +217,9 @@ def evaluate(
         greedy: whether the most probable action is taken, or one drawn from the policy as in training.
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
         controls: names of those that are run beside the policies (`animat.evaluation.controls`); None: all.
-        limit_resolution: of the grid for the optimal return in the same environment (`best_returns`; a study's is
+        optimum_resolution: of the grid for the optimal return in the same environment (`best_returns`; a study's is
             1), which takes seconds; None: it is not computed.
-        progress: told after the policies and each control, and before the limit.
+        progress: told after the policies and each control, and before the optimum.
 
     Raises:
         InvalidArgument: for no policies, fewer episodes than one, or an `at_min`, a seed or a resolution that is none.
@@ -232,7 +234,7 @@ def evaluate(
     findings: tuple[Finding, ...] = ()
     simulator: NeuronSimulator | None = None
     environment: Environment[Any]
-    minute, held_from_min = None, None
+    minute, fixed_from_min = None, None
     if first.mapping is None:
         environment = WithoutNeurons(body, first.commands)
     else:
@@ -241,8 +243,8 @@ def evaluate(
         row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
         findings = (*_check(first, timeline), *_not_of_a_loop(first, timeline, minute))
-        held_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
-        simulator = (timeline if held_from_min is None else timeline.with_first_percentiles()).at(minute)
+        fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
+        simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))
         if first.neural_observation:
             environment = NeuralObservation(environment)
@@ -259,43 +261,45 @@ def evaluate(
     acting += [control for control in every if controls is None or control.name in controls]
     if controls is None and (without := lacking(body).get("heuristic")):
         findings += (Finding("no-heuristic", "note", without),)
-    if limit_resolution is not None and not 0 < limit_resolution < float("inf"):
-        raise InvalidArgument(f"limit_resolution: expected a positive number, got {limit_resolution!r}")
+    if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):
+        raise InvalidArgument(f"optimum_resolution: expected a positive number, got {optimum_resolution!r}")
     rows = []
-    steps = len(acting) + (limit_resolution is not None)
+    steps = len(acting) + (optimum_resolution is not None)
     for each in acting:
         ran = roll_out(each.environment, each.simulator, each.actor, each.n_actors, episodes=episodes, seed=seed)
         changed = each.environment is not environment or each.simulator is not simulator
         rows.append(Row(each.name, each.meaning, ran, changed))
         if progress is not None:
             progress.update(len(rows), steps, each.name)
-    limit, no_limit = None, None
-    if limit_resolution is not None:
+    optimum, no_optimum = None, None
+    if optimum_resolution is not None:
         if progress is not None:
             progress.update(len(rows), steps, "optimal return")
         try:
-            limit = _limit(environment, simulator, timeline, minute, held_from_min is not None, limit_resolution, seed)
+            optimum = _optimum(
+                environment, simulator, timeline, minute, fixed_from_min is not None, optimum_resolution, seed
+            )
         except (InvalidArgument, UnusableData) as error:
-            no_limit = str(error)
+            no_optimum = str(error)
     return Evaluation(
         body.name,
         None if first.mapping is None else first.mapping.name,
         minute,
         tuple(policies),
         tuple(rows),
-        (*findings, *(() if limit is None else limit.findings())),
-        limit,
-        no_limit,
-        held_from_min,
+        (*findings, *(() if optimum is None else optimum.findings())),
+        optimum,
+        no_optimum,
+        fixed_from_min,
     )
 
 
-def _limit(
+def _optimum(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
     timeline: SimulatorTimeline | None,
     minute: float | None,
-    are_held: bool,
+    are_fixed: bool,
     resolution: float,
     seed: int,
 ) -> Optimum:
@@ -305,7 +309,7 @@ def _limit(
         return best_return(environment, simulator, resolution=resolution, seed=seed)
     if not timeline.responses:
         return best_return(environment, simulator, resolution=resolution, seed=seed)
-    case = Counted.of(environment, timeline, minute, are_held=are_held)
+    case = Counted.of(environment, timeline, minute, are_fixed=are_fixed)
     best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed)
     return case.known(best, resolution=resolution, seed=seed)
 
@@ -339,8 +343,8 @@ def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
             Finding(
                 "other-percentiles",
                 "warning",
-                f"the policies' percentiles were held from the recording at {first_min:g} min, which is not the first "
-                f"of these: here they are held from {timeline.start_min[0]:g} min",
+                f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
+                f"of these: here they are fixed from {timeline.start_min[0]:g} min",
             )
         )
     return tuple(found)

@@ -20,35 +20,35 @@ OLD_MIN = 30.0
 def other_presentation(recorded: Presentation | None, presented: Presentation) -> Iterator[Finding]:
     """Where a loop presents stimuli otherwise than the recordings that its policies were trained on."""
     if recorded is None:
-        sentence = (
+        message = (
             f"how the policy's recordings were presented is not known; a closed loop presents {presented}, and a "
             "culture answers otherwise to another presentation"
         )
-        yield Finding(UNKNOWN, "warning", sentence)
+        yield Finding(UNKNOWN, "warning", message)
         return
     if recorded.order != presented.order:
-        sentence = (
+        message = (
             f"the policy's recordings were {recorded.order}: all stimuli of a frequency together; a closed loop "
             "presents them mixed, and a culture answers otherwise then: expect less than predicted (record with "
             "--order mixed, the default, for a closed loop)"
         )
-        yield Finding("other-presentation", "warning", sentence)
+        yield Finding("other-presentation", "warning", message)
     if recorded.pulses != presented.pulses:
-        sentence = (
+        message = (
             f"the policy's recordings had {recorded.pulses} pulse(s) per trial, the loop has {presented.pulses}; "
             "the response after another number of pulses is another"
         )
-        yield Finding("other-presentation", "warning", sentence)
+        yield Finding("other-presentation", "warning", message)
 
 
 def other_calibration(trained: Presentation | None, predicting: Presentation | None) -> Iterator[Finding]:
     """Where the recording that predicts was presented otherwise than those that policies were trained on."""
     if predicting is not None and predicting != trained:
-        sentence = (
+        message = (
             f"the prediction is from a recording presented {predicting}, the policies' recordings were "
             f"{trained or 'unknown'}"
         )
-        yield Finding("other-calibration", "warning", sentence)
+        yield Finding("other-calibration", "warning", message)
 
 
 def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Iterator[Finding]:
@@ -61,8 +61,8 @@ def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Ite
     differing = [name for name in trained if rule(name, trained[name]) != rule(name, given.get(name))]
     if differing:
         reported = ", ".join(f"{_WORDS.get(name, name)} {trained[name]}, here {given.get(name)}" for name in differing)
-        sentence = f"the policies were trained on simulators made otherwise: {reported}"
-        yield Finding("other-simulator", "warning", sentence)
+        message = f"the policies were trained on simulators made otherwise: {reported}"
+        yield Finding("other-simulator", "warning", message)
 
 
 _WORDS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}
@@ -77,11 +77,11 @@ def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Find
     """
     age_min = culture_min - recorded_at_min
     if age_min > OLD_MIN:
-        sentence = (
+        message = (
             f"percentiles and prediction are of {recorded_at_min:.0f} min, and the culture is at {culture_min:.0f} "
             "min: cultures drift; take a later recording (--at-min), or train on later ones"
         )
-        yield Finding("old-calibration", "warning", sentence, age_min)
+        yield Finding("old-calibration", "warning", message, age_min)
 
 
 def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, has_memory: bool) -> Iterator[Finding]:
@@ -97,18 +97,18 @@ def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, 
         return
     blocked = presentation is not None and presentation.order == "blocked"
     remedy = "record with --order mixed" if blocked else "--simulator memory"
-    sentence = f"{remembers.sentence}: a closed loop measures another return than is predicted ({remedy})"
-    yield Finding("no-memory", "warning", sentence, remembers.value)
+    message = f"{remembers.message}: a closed loop measures another return than is predicted ({remedy})"
+    yield Finding("no-memory", "warning", message, remembers.value)
 
 
 def other_recording(trained_until_min: float, evaluated_at_min: float) -> Iterator[Finding]:
     """Where policies are evaluated on another recording than the one that would calibrate their closed loop."""
     if trained_until_min != evaluated_at_min:
-        sentence = (
+        message = (
             f"this is the culture at {evaluated_at_min:g} min; the policies were last trained on the recording at "
             f"{trained_until_min:g} min, which is the one that calibrates their closed loop"
         )
-        yield Finding("other-recording", "warning", sentence, evaluated_at_min - trained_until_min)
+        yield Finding("other-recording", "warning", message, evaluated_at_min - trained_until_min)
 
 
 NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", "no-memory", "other-recording")

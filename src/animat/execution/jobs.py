@@ -14,7 +14,7 @@ from pathlib import Path
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, receipt_path
-from animat.execution.task import UNFINISHED, Done, Task, carry_out, memory_of, told
+from animat.execution.task import UNFINISHED, Done, Task, carry_out, memory_of, reported
 from animat.progress import Progress
 
 _LOOK_EVERY_S = 0.2
@@ -96,10 +96,10 @@ class Jobs:
         running: dict[Future[Done], Job] = {}
         cpu_s: dict[str, float] = {}
 
-        def tell() -> None:
+        def report() -> None:
             done_s, parts = total_s - sum(job.cost_s for job in self.waiting), []
             for job in running.values():
-                share, words = told(receipt_path(notices, job.name)) or (0.0, None)
+                share, words = reported(receipt_path(notices, job.name)) or (0.0, None)
                 done_s -= job.cost_s * (1 - share)
                 if words is not None:
                     parts.append(f"{job.name} {100 * share:.0f} % {words}".strip())
@@ -115,7 +115,7 @@ class Jobs:
                     if not self._is_done(job):
                         notice = receipt_path(notices, job.name)
                         running[at.submit(carry_out, job.task, self._folder, notice)] = job
-                tell()
+                report()
                 # Those that succeeded first: their receipts are kept, whatever the others raise.
                 for future in sorted(wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done, key=_has_failed):
                     done = _done(future, running[future])
@@ -124,7 +124,7 @@ class Jobs:
                     receipt.save(self._receipts)
                     self._done[job.name] = receipt
                     cpu_s[job.name] = done.cpu_s
-        tell()
+        report()
         return cpu_s
 
     def _is_done(self, job: Job) -> bool:

@@ -17,7 +17,7 @@ from animat.execution.receipts import digest_of
 from animat.progress import Progress
 
 UNFINISHED = ".unfinished"
-"""Of a folder: checkpoints, and what tasks tell while they run; gone when everything is done."""
+"""Of a folder: checkpoints, and what tasks report while they run; gone when everything is done."""
 
 
 class Task(abc.ABC):
@@ -77,11 +77,11 @@ class _Notice:
     def update(self, done: float, total: float, note: str = "") -> None:
         # Where it cannot be written, no work is lost.
         with suppress(OSError):
-            tell(self._path, (done / total, note))
+            report(self._path, (done / total, note))
 
 
-def tell(path: Path, words: Any) -> None:
-    """Put something into a file for other processes to see (`told`).
+def report(path: Path, words: Any) -> None:
+    """Put something into a file for other processes to see (`reported`).
 
     Raises:
         OSError: where that cannot be written.
@@ -92,8 +92,8 @@ def tell(path: Path, words: Any) -> None:
     beside.replace(path)
 
 
-def told(path: Path) -> Any:
-    """What was told last (`tell`); None if nothing was."""
+def reported(path: Path) -> Any:
+    """What was reported last (`report`); None if nothing was."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):

@@ -20,7 +20,7 @@ from animat.training.folder import MANIFEST, describe, expect_trainable, groups_
 from animat.training.group import CHECKPOINT_S, Group, save_policies, train_group
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
-from animat.writing import alone_in, clear_away
+from animat.writing import clear_away, exclusive_lock
 
 
 def train(
@@ -81,7 +81,7 @@ def train(
     folder = Path(folder).absolute()
     # Seen before it is touched: somebody else's folder stays as it is.
     is_ours(folder, manifest)
-    with alone_in(folder):
+    with exclusive_lock(folder):
         if not is_ours(folder, manifest):
             write_description(folder, manifest)
         left = [

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 def main() -> int:
     """Answer calls until standard input ends."""
-    answers = settle_on(int(sys.argv[1]))
+    answers = pin_worker(int(sys.argv[1]))
 
     from animat.compilation import keep_compilations
 
@@ -41,7 +41,7 @@ def answer(work: bytes) -> bytes:
             return pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
-def settle_on(core: int) -> BinaryIO:
+def pin_worker(core: int) -> BinaryIO:
     """Make this process a worker: on one core, without an accelerator, and gone when the one that started it is.
 
     To be called before JAX or BLAS are loaded.

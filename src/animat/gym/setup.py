@@ -17,8 +17,8 @@ from animat.coding.mapping import Mapping, mapping_named
 from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.neurons.kinds import Kind
-from animat.neurons.made_up import LABELS, made_up_simulator
 from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.synthetic import LABELS, synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
@@ -50,8 +50,8 @@ class Setup:
     @property
     def observation_space(self) -> spaces.Box:
         """What is observed, in its own units, within the bounds that no episode passes."""
-        quantities = self.environment.quantities
-        low, high = (np.array([getattr(q, end) for q in quantities], np.float32) for end in ("low", "high"))
+        spec = self.environment.observation_spec
+        low, high = (np.array([getattr(q, end) for q in spec], np.float32) for end in ("low", "high"))
         return spaces.Box(low, high, dtype=np.float32)
 
     @property
@@ -82,7 +82,7 @@ def set_up(
             one of your own, also by where to import it from.
         recordings: files or folders of recordings of one culture to make the neurons' simulator of.
         simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions
-            of `animat.neurons.made_up` answer.
+            of `animat.neurons.synthetic` answer.
         at_min: which recording's simulator, in minutes on the culture's clock: the newest at that time; None: the
             first.
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
@@ -113,7 +113,7 @@ def set_up(
     elif simulator is not None:
         labels = tuple(f"condition {i}" for i in range(simulator.n_conditions))
     else:
-        simulator, labels = made_up_simulator(), LABELS
+        simulator, labels = synthetic_simulator(), LABELS
     if delivery not in ("chosen", "shuffled"):
         raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
     expect_fit(body.name, body.n_commands, simulator.n_readouts)
@@ -134,7 +134,7 @@ def _simulator_of(
 ) -> tuple[NeuronSimulator, tuple[str, ...]]:
     by = None if conditions is None else conditions_named(conditions)
     timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=readouts), kind=kind)
-    for sentence in warnings_once(timeline.findings):
-        warnings.warn(sentence, stacklevel=3)
+    for message in warnings_once(timeline.findings):
+        warnings.warn(message, stacklevel=3)
     row = 0 if at_min is None else timeline.row_asked_for(at_min)
     return timeline.at(timeline.start_min[row]), tuple(condition.label for condition in timeline.conditions)

@@ -51,7 +51,7 @@ class TrainAlongside(Task):
                 swaps.append({"chunk": index, "iterations": told["iterations"], "recorded_at_min": start_min})
                 told["using"] = number
                 told["swaps"].append({"swap": number, **swaps[-1]})
-                self.exchange.tell(group.members[0], told)
+                self.exchange.report(group.members[0], told)
             if simulator is None:
                 raise AnimatError("live: expected a simulator in the exchange before training began, got none")
             told["mean_return"] = together.train(index, simulator)
@@ -60,5 +60,5 @@ class TrainAlongside(Task):
                 kept_s = time.monotonic()
             index += 1
             told["iterations"] = training.chunk(index)[0] * training.algorithm.environments
-            self.exchange.tell(group.members[0], told)
+            self.exchange.report(group.members[0], told)
         return save_policies(group, together.policies(), folder)

@@ -6,9 +6,9 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-from animat.execution.task import tell, told
+from animat.execution.task import report, reported
 from animat.neurons.simulator import NeuronSimulator
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 _FINISH = "finish"
 
@@ -30,7 +30,7 @@ class Exchange:
         Raises:
             InvalidFile: if it cannot be written.
         """
-        with written_whole(self.folder / f"{number:06}.simulator") as beside:
+        with atomic_write(self.folder / f"{number:06}.simulator") as beside:
             beside.write_bytes(pickle.dumps((number, start_min, simulator)))
 
     def newest(self, known: int) -> tuple[int, float, NeuronSimulator] | None:
@@ -41,13 +41,13 @@ class Exchange:
         read: tuple[int, float, NeuronSimulator] = pickle.loads((self.folder / f"{newest:06}.simulator").read_bytes())
         return read
 
-    def tell(self, first: int, words: dict[str, Any]) -> None:
+    def report(self, first: int, words: dict[str, Any]) -> None:
         """Say how the group whose first policy is this one does, as plain data."""
-        tell(self.folder / f"p{first}.json", words)
+        report(self.folder / f"p{first}.json", words)
 
-    def told(self, first: int) -> dict[str, Any] | None:
+    def reported(self, first: int) -> dict[str, Any] | None:
         """What a group said last; None if it has not begun."""
-        words: dict[str, Any] | None = told(self.folder / f"p{first}.json")
+        words: dict[str, Any] | None = reported(self.folder / f"p{first}.json")
         return words
 
     def finish(self) -> None:

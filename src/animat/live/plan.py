@@ -27,7 +27,7 @@ from animat.writing import LOCK
 
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
-_NOT_OF_THE_LOOP = ("follow", "greedy")
+_NOT_OF_THE_LOOP = ("adaptive", "greedy")
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,8 @@ def _ended(log: Path) -> str:
         return "was killed, or still goes on"
     for line in reversed(told[:-1]):
         if line["what"] in ("interrupted", "fault"):
-            return f"ended before its time ({line.get('sentence', line['what'])})"
+            # Logs of before have a sentence.
+            return f"ended before its time ({line.get('message', line.get('sentence', line['what']))})"
         if line["what"] == "closed loop" and line.get("ended_by") != "plan":
             return f"ended before its time ({line.get('ended', 'in the closed loop')})"
     return "is done"

@@ -37,13 +37,13 @@ from animat.stimulation.protocol import Protocol
 from animat.training.folder import describe, groups_of
 from animat.training.policy import Policy
 from animat.training.specification import Training
-from animat.writing import alone_in
+from animat.writing import exclusive_lock
 
 _POLL_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Lived:
+class LiveRun:
     """What came of a live run.
 
     Attributes:
@@ -52,7 +52,7 @@ class Lived:
         swaps: every time that a group of policies went over to newer simulators, dated.
         iterations: that each policy was trained for at least.
         culture_min, wall_s: how long it took from the first recording to the end of training.
-        gap: predicted against lived return.
+        gap: predicted against measured return.
     """
 
     recordings: tuple[Path, ...]
@@ -88,9 +88,9 @@ def live(
     kind: Kind | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
     **settings: Any,
-) -> Lived:
+) -> LiveRun:
     """Record a culture again and again while policies train on its newest simulators, then run them on it.
 
     The culture is recorded; training starts at once, in processes of its own, and never stops; every `interval_min` the
@@ -113,7 +113,7 @@ def live(
         kind: of simulator; None: what suits the protocol (`fit_timeline`).
         account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
         progress: told as the culture's time goes by, and in the closed loop.
-        tell: as for `run_policies`.
+        report: as for `run_policies`.
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
@@ -129,9 +129,9 @@ def live(
         policies = run.shadow()
         calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
         if training.percentiles == "first":
-            calibration = calibration.holding(pooled_percentiles(run.used[0]))
+            calibration = calibration.with_percentiles(pooled_percentiles(run.used[0]))
         # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
-        with alone_in(run.folder / SESSION):
+        with exclusive_lock(run.folder / SESSION):
             gap = run_policies(
                 policies,
                 culture,
@@ -142,7 +142,7 @@ def live(
                 seed=training.seed,
                 account=run.account,
                 progress=progress,
-                tell=tell,
+                report=report,
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
                 **settings,
@@ -157,7 +157,7 @@ def live(
             run.write("end", budget=run.account.to_dict())
         raise
     run.write("end", budget=run.account.to_dict())
-    return Lived(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
+    return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 
 class _Run:
@@ -225,7 +225,7 @@ class _Run:
         with suppress(Exception):
             self._culture.stop(told)
         with suppress(InvalidFile):
-            self.write("interrupted" if is_person else "fault", sentence=told)
+            self.write("interrupted" if is_person else "fault", message=told)
 
     def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
         published, in_budget = 0, True
@@ -236,7 +236,7 @@ class _Run:
             try:
                 timeline = self._record(number)
             except BudgetSpent as spent:
-                self.write("budget", sentence=str(spent))
+                self.write("budget", message=str(spent))
                 in_budget = False
                 continue
             if timeline is not None:
@@ -269,7 +269,7 @@ class _Run:
             series = [*self.used, *extract_series([recording])]
             timeline = self._fit(series)
         except (UnusableData, Mismatch) as error:
-            self.write("unusable", file=file.name, sentence=str(error))
+            self.write("unusable", file=file.name, message=str(error))
             return None
         self.used = series
         self.write(

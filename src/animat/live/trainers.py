@@ -74,7 +74,7 @@ class Trainers:
                 ) from error
         swaps: list[dict[str, Any]] = []
         for first, group in self._groups.items():
-            words = self._exchange.told(first)
+            words = self._exchange.reported(first)
             if words is not None:
                 before = self._told.get(first, {"swaps": []})
                 swaps += [{"members": list(group.members), **swap} for swap in words["swaps"][len(before["swaps"]) :]]

@@ -58,8 +58,8 @@ class Fidelity:
             changed = f"changes P(x >= P50) of {of} from {self.in_data[worst]:.2f} to {self.in_simulator[worst]:.2f}"
             value = float(loss[worst])
             if of_memory:
-                sentence = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
-                found.append(Finding("few-neighbours", "warning", sentence, value))
+                message = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
+                found.append(Finding("few-neighbours", "warning", message, value))
             else:
                 remedy = (
                     "leave the range out (edges are then percentiles), or take more bins or the empirical simulator"
@@ -81,7 +81,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     """Compare a simulator with the responses it was fitted to, at the pooled median P50.
 
     The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; of a
-    simulator with memory, of 200 after each past that it knows.
+    simulator with memory, of 200 after each history that it knows.
     """
     median_hz = np.asarray(simulator.percentiles, np.float32)[..., 5]
     kept, read_hz = ~responses.is_burst, responses.read_hz.astype(np.float32)
@@ -112,7 +112,7 @@ def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws 
 
 @jax.jit
 def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions draws *readouts"]:
-    """Evenly spaced answers to every condition after each past that one of its own responses had."""
+    """Evenly spaced answers to every condition after each history that one of its own responses had."""
     uniforms = (jnp.arange(200) + 0.5) / 200
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     rows = jnp.arange(simulator.before.shape[1])

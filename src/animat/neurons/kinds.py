@@ -11,7 +11,7 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogr
 from animat.responses.responses import Responses
 
 Kind = Literal["histogram", "empirical", "memory"]
-"""A distribution in bins (the paper); a measured value; one that was measured after a past like the present one."""
+"""A distribution in bins (the paper); a measured value; one that was measured after a similar history."""
 
 
 def fit_simulator(

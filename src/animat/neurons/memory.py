@@ -19,30 +19,31 @@ from animat.responses.responses import Presented, Responses
 
 
 class Memory(NamedTuple):
-    """How a past is made of what was presented and answered, and how much of it an answer hangs on.
+    """How the history state is made of what was presented and answered, and how much of it an answer hangs on.
 
         p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
 
-    with p the past before a response, p' after it, r the response's rank (the share of all responses below it) and m
-    the mean rank of its condition. All are in [0, 1]; 0 after silence. Ranks are of the response of all channels, also
-    where several readouts are read.
+    with p the history state before a response, p' after it, r the response's rank (the share of all responses below it)
+    and m the mean rank of its condition. All are in [0, 1]; 0 after silence. Ranks are of the response of all channels,
+    also where several readouts are read.
 
     Attributes:
-        decay: of the past before; 0: only the last presentation is remembered.
+        decay: of the history before; 0: only the last presentation is remembered.
         weight: of what was presented beside what was answered; 0: only the answer is remembered.
-        reach: of n responses the n^reach with the nearest pasts may be drawn; 1: all of them, whatever the past.
+        neighbour_exponent: of n responses the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
+            them, whatever the history.
     """
 
     decay: float
     weight: float
-    reach: float
+    neighbour_exponent: float
 
 
 NO_MEMORY = Memory(0.0, 0.0, 1.0)
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0)
-_REACHES = (0.5, 0.6, 0.7, 0.8, 0.9)
+_EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
 _CERTAIN = 2.0
 """Standard errors by which a memory must tell responses better than none: the best of many does by chance, a little."""
 
@@ -50,22 +51,23 @@ _CERTAIN = 2.0
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MemorySimulator(EmpiricalSimulator):
-    """Draws one of the measured responses to the condition that had a past like the present one.
+    """Draws one of the measured responses to the condition that had a similar history.
 
-    Of a condition's responses, ordered by their pasts (see `Memory`), one of the k nearest in that order is drawn, all
-    equally likely; where more than k had the very same past, one of these. No distribution is assumed, and no form in
-    which an answer depends on the past. With all of them nearest it is the empirical simulator, which its `quantile`
-    always is: what is answered when nothing is known of the past.
+    Of a condition's responses, ordered by their histories (see `Memory`), one of the k nearest in that order is drawn,
+    all equally likely; where more than k had the very same history, one of these. No distribution is assumed, and no
+    form in which an answer depends on the history. With all of them nearest it is the empirical simulator,
+    which its `quantile` always is: what is answered when nothing is known of the history.
 
     Attributes:
-        before: the past of each of a condition's responses, rising, padded with infinity, shape (conditions, most
+        before: the history of each of a condition's responses, rising, padded with infinity, shape (conditions, most
             responses).
         after_hz: the response itself, in that order, shape (conditions, most responses); of several readouts of one
             trial each, shape (conditions, most responses, readouts).
-        left: what it leaves in the past, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most responses).
+        left: what it adds to the history, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most
+            responses).
         followers: how many of them there are, shape (conditions,): those before which no burst came.
         nearest: k of each condition, shape (conditions,).
-        decay, weight, reach: as in `Memory`.
+        decay, weight, neighbour_exponent: as in `Memory`.
 
     Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with one number as its
     memory and without its weights.
@@ -80,34 +82,35 @@ class MemorySimulator(EmpiricalSimulator):
     nearest: Int[Stored, "*recordings conditions"]
     decay: Float[Stored, "*recordings"]
     weight: Float[Stored, "*recordings"]
-    reach: Float[Stored, "*recordings"]
+    neighbour_exponent: Float[Stored, "*recordings"]
 
     has_memory: ClassVar[bool] = True
 
     @property
     def memory(self) -> Memory:
         """Of a single recording's simulator, as `fit_memory` takes it."""
-        return Memory(float(self.decay), float(self.weight), float(self.reach))
+        return Memory(float(self.decay), float(self.weight), float(self.neighbour_exponent))
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], past: Float[Array, ""]) -> Answer:
+    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, ""]) -> Answer:
         before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
-        smaller, no_larger = jnp.sum(before < past), jnp.sum(before <= past)
+        smaller, no_larger = jnp.sum(before < history), jnp.sum(before <= history)
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
-        # Small arrays count few spikes, and many responses may have the same past.
+        # Small arrays count few spikes, and many responses may have the same history.
         first, end = jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
         # float32 rounds a uniform just under 1 times a count up to the count.
         row = jnp.minimum(first + (uniform * (end - first)).astype(jnp.int32), end - 1)
         left = jnp.asarray(self.left)[condition, row]
-        return Answer(jnp.asarray(self.after_hz)[condition, row], jnp.asarray(self.decay) * past + left)
+        return Answer(jnp.asarray(self.after_hz)[condition, row], jnp.asarray(self.decay) * history + left)
 
 
 def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory | None = None) -> MemorySimulator:
     """Keep every condition's non-burst responses, and what was before them, to draw from.
 
-    What is remembered, and how far the nearest reach, is found by leaving out each response in turn and telling it, in
-    rank, by the mean of its neighbours. Of twelve ways to make a past the one with the smallest error is taken, and of
-    its reaches the largest that is as good as the best, up to one standard error of the difference. Where nothing tells
-    responses better than no past at all does, by two standard errors, there is no memory in the simulator either.
+    What is remembered, and the neighbour exponent, are found by leaving out each response in turn and telling it, in
+    rank, by the mean of its neighbours. Of twelve ways to make a history the one with the smallest error is taken, and
+    of its exponents the largest that is as good as the best, up to one standard error of the difference. Where nothing
+    tells responses better than no history at all does, by two standard errors, there is no memory in the simulator
+    either.
 
     Args:
         responses: of one recording, every condition with at least one non-burst response. Those that came after a
@@ -125,12 +128,12 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     values = fit_empirical(responses, room=room)
     ranked = _Ranked(responses)
     memory = memory or _found(ranked)
-    past = ranked.pasts(memory)
+    history = ranked.histories(memory)
     shape = values.values_hz.shape[:2]
     before, after, left = np.full(shape, np.inf), np.zeros(values.values_hz.shape), np.zeros(shape)
     for condition, rows in enumerate(ranked.rows):
-        in_order = rows[np.argsort(past[rows], kind="stable")]
-        before[condition, : len(rows)] = past[in_order]
+        in_order = rows[np.argsort(history[rows], kind="stable")]
+        before[condition, : len(rows)] = history[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
         left[condition, : len(rows)] = _left(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
@@ -142,7 +145,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         jnp.asarray(after, jnp.float32),
         jnp.asarray(left, jnp.float32),
         jnp.asarray(followers, jnp.int32),
-        jnp.asarray(np.rint(followers**memory.reach), jnp.int32),
+        jnp.asarray(np.rint(followers**memory.neighbour_exponent), jnp.int32),
         *(jnp.float32(each) for each in memory),
     )
 
@@ -170,27 +173,27 @@ class _Ranked:
         below, no_larger = (np.searchsorted(self._sorted_hz, rate_hz, side=side) for side in ("left", "right"))
         return np.asarray((below + no_larger) / (2 * len(self._sorted_hz)))
 
-    def pasts(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
+    def histories(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
         """What was before each response."""
         presented: Presented = self._presented
         # Of what has no condition of its own the middle one's is as good as any.
         means = np.where(presented.condition == NO_CONDITION, AT_FIRST, self.means[presented.condition])
         left = _left(self._ranks(presented.rate_hz), means, memory)
-        past, pasts = 0.0, []
+        history, histories = 0.0, []
         for is_rested, is_burst, more in zip(
             presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
         ):
-            past = 0.0 if is_rested else past
-            pasts.append(past)
+            history = 0.0 if is_rested else history
+            histories.append(history)
             # What a burst leaves is not known: what comes right after one is not drawn, and begins anew.
-            past = AT_FIRST if is_burst else memory.decay * past + more
-        return np.asarray(np.array(pasts, np.float64)[self._place])
+            history = AT_FIRST if is_burst else memory.decay * history + more
+        return np.asarray(np.array(histories, np.float64)[self._place])
 
 
 def _left(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
-    """What responses leave in the past."""
+    """What responses add to the history."""
     return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
 
 
@@ -199,13 +202,13 @@ def _found(ranked: _Ranked) -> Memory:
     rows = [rows for rows in ranked.rows if len(rows) > 1]
     if not rows:
         return NO_MEMORY
-    # With all of them nearest, every past is as good as any.
+    # With all of them nearest, every history is as good as any.
     errors = {NO_MEMORY: _errors(ranked.rank, rows, 1.0)}
     for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
-        past = ranked.pasts(Memory(decay, weight, 1.0))
-        in_order = [each[np.argsort(past[each], kind="stable")] for each in rows]
-        for reach in _REACHES:
-            errors[Memory(decay, weight, reach)] = _errors(ranked.rank, in_order, reach)
+        history = ranked.histories(Memory(decay, weight, 1.0))
+        in_order = [each[np.argsort(history[each], kind="stable")] for each in rows]
+        for neighbour_exponent in _EXPONENTS:
+            errors[Memory(decay, weight, neighbour_exponent)] = _errors(ranked.rank, in_order, neighbour_exponent)
     best = min(errors, key=lambda memory: float(errors[memory].mean()))
 
     def is_as_good(memory: Memory, standard_errors: float) -> bool:
@@ -215,25 +218,29 @@ def _found(ranked: _Ranked) -> Memory:
     if is_as_good(NO_MEMORY, _CERTAIN):
         return NO_MEMORY
     return max(
-        (memory for memory in errors if memory[:2] == best[:2] and memory.reach < 1 and is_as_good(memory, 1.0)),
-        key=lambda memory: memory.reach,
+        (
+            memory
+            for memory in errors
+            if memory[:2] == best[:2] and memory.neighbour_exponent < 1 and is_as_good(memory, 1.0)
+        ),
+        key=lambda memory: memory.neighbour_exponent,
     )
 
 
 def _errors(
-    rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], reach: float
+    rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], neighbour_exponent: float
 ) -> Float64[np.ndarray, " rows"]:
     """Squared differences between each response's rank and the mean of the nearest others', in a fixed order.
 
     Args:
         rank: of all responses.
-        in_order: the responses to each condition in the order of their pasts.
-        reach: of n, n^reach are nearest.
+        in_order: the responses to each condition in the order of their histories.
+        neighbour_exponent: of n, n^neighbour_exponent are nearest.
     """
     errors = np.full(len(rank), np.nan)
     for rows in in_order:
         n = len(rows)
-        k = int(min(np.rint(n**reach), n - 1))
+        k = int(min(np.rint(n**neighbour_exponent), n - 1))
         first = np.clip(np.arange(n) - k // 2, 0, n - k - 1)
         below = np.concatenate([[0.0], np.cumsum(rank[rows])])
         others = below[first + k + 1] - below[first] - rank[rows]

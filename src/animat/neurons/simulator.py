@@ -26,7 +26,7 @@ PERCENTILES = tuple(range(0, 101, 10))
 
 
 AT_FIRST = 0.5
-"""The past that an episode begins with: what has led in to it was presented in random order, as in a recording."""
+"""The history state that an episode begins with: its warm-up was presented in random order, as in a recording."""
 
 
 class Answer(NamedTuple):
@@ -34,12 +34,12 @@ class Answer(NamedTuple):
 
     Attributes:
         rate_hz: x, Hz per channel; of several readouts one each, shape (readouts,).
-        past: in [0, 1]: 0 after silence, larger the more the culture was driven and has answered of late (see
+        history: state in [0, 1]: 0 after silence, larger the more the culture was driven and has answered of late (see
             `animat.neurons.memory`).
     """
 
     rate_hz: Float[Array, "*readouts"]
-    past: Float[Array, ""]
+    history: Float[Array, ""]
 
 
 class NeuronSimulator(abc.ABC):
@@ -73,19 +73,19 @@ class NeuronSimulator(abc.ABC):
         Of several readouts, which have no order, any function of a uniform that has their joint law.
         """
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], past: Float[Array, ""]) -> Answer:
-        """What is answered to a condition, by a uniform in [0, 1), after a past in [0, 1] (0: silence).
+    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, ""]) -> Answer:
+        """What is answered to a condition, by a uniform in [0, 1), after a history state in [0, 1] (0: silence).
 
-        A simulator without memory answers the same whatever was before, and leaves the past as it is.
+        A simulator without memory answers the same whatever was before, and leaves the history as it is.
         """
-        return Answer(self.quantile(condition, uniform), past)
+        return Answer(self.quantile(condition, uniform), history)
 
     @final
     def sample(
-        self, key: PRNGKeyArray, condition: Int[Array, ""], past: float | Array = AT_FIRST
+        self, key: PRNGKeyArray, condition: Int[Array, ""], history: float | Array = AT_FIRST
     ) -> Float[Array, "*readouts"]:
-        """Draw one response x to a condition, in Hz per channel, after a past in [0, 1]."""
-        return self.answer(condition, jax.random.uniform(key), jnp.asarray(past, jnp.float32)).rate_hz
+        """Draw one response x to a condition, in Hz per channel, after a history state in [0, 1]."""
+        return self.answer(condition, jax.random.uniform(key), jnp.asarray(history, jnp.float32)).rate_hz
 
 
 @jax.tree_util.register_dataclass

@@ -102,7 +102,7 @@ class SimulatorTimeline:
         return jax.tree.map(lambda stacked: stacked[row], self.simulators)  # type: ignore[no-any-return]
 
     def with_first_percentiles(self) -> SimulatorTimeline:
-        """The same simulators with the first recording's percentiles held, for mappings that do not move along."""
+        """The same simulators with the first recording's percentiles fixed, for mappings that do not move along."""
         percentiles = self.simulators.percentiles
         held = jnp.broadcast_to(percentiles[:1], percentiles.shape)
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
@@ -124,7 +124,7 @@ def fit_timeline(
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
         kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one that was measured
-            after a past like the present one); None: `"memory"`, but `"histogram"` where stimuli were presented in
+            after a similar history); None: `"memory"`, but `"histogram"` where stimuli were presented in
             blocks, which hold nothing of what a culture answers after another condition.
         bins: of a histogram.
         range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
@@ -160,7 +160,7 @@ def fit_timeline(
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(
-        replace(finding, sentence=f"at {responses.start_min:g} min: {finding.sentence}", at_min=responses.start_min)
+        replace(finding, message=f"at {responses.start_min:g} min: {finding.message}", at_min=responses.start_min)
         for responses, kept in zip(ordered, fidelities, strict=True)
         for finding in (*responses.findings, *kept.findings(of_memory=kind == "memory"))
     )

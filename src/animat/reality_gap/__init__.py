@@ -1,4 +1,4 @@
-"""Predicted return against lived return: policies and controls on a simulator, then in closed loop on the culture."""
+"""Predicted against measured return: policies and controls on a simulator, then in closed loop on the culture."""
 
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.running import check_conditions, check_policies, run_policies

@@ -18,7 +18,7 @@ from animat.responses.responses import Presented, Responses
 
 @dataclass(frozen=True, eq=False)
 class Answered:
-    """Responses in the episodes of policies that came to their end, without what led in.
+    """Responses in the episodes of policies that came to their end, without the warm-up.
 
     Attributes:
         responses: in the order of time, on the session's clock, with all that the culture was presented between them.
@@ -59,9 +59,9 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     Args:
         session: that ended.
         loop: its settings.
-        policies: their names among the contenders.
+        policies: their names among the agents.
     """
-    whole = [each for each in session.episodes if each.contender in policies and each.is_whole]
+    whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
     place = {each.number: row for row, each in enumerate(whole)}
     p50_hz = np.asarray(loop.percentiles, np.float64)[..., N_PERCENTILES // 2]
     presented: list[tuple[int, float, bool, float, float]] = []

@@ -21,7 +21,7 @@ from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import FITTED, Policy
 
-REDRAWN = 100
+BOOTSTRAPS = 100
 """Bootstrap samples of the recording's responses."""
 
 
@@ -31,7 +31,7 @@ class Calibration:
 
     Attributes:
         simulator: of the recording.
-        redrawn: simulators of bootstrap samples of its responses: what so many could as well have been.
+        bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
         responses_hz: non-burst responses of each condition, in the order of time, shape (responses,); of several
             readouts (responses, readouts).
         burst_threshold: ratio of active channels above which its responses were bursts.
@@ -45,7 +45,7 @@ class Calibration:
     """
 
     simulator: NeuronSimulator
-    redrawn: tuple[NeuronSimulator, ...]
+    bootstraps: tuple[NeuronSimulator, ...]
     responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
     burst_threshold: float
     burst_share: float
@@ -78,7 +78,7 @@ class Calibration:
 
         Args:
             series: in any order.
-            policy: its last simulator in training is the one that is taken, its percentiles held if they were then.
+            policy: its last simulator in training is the one that is taken, its thresholds fixed if they were then.
             at_min: the minute whose newest recording is taken instead; None without a policy: the last.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
@@ -102,7 +102,7 @@ class Calibration:
         fit |= {"memory": memory, "room": room_for(series)}
         calibration = cls(
             simulator=simulator,
-            redrawn=tuple(fit_simulator(responses.redrawn(rng), **fit) for _ in range(REDRAWN)),
+            bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
@@ -115,13 +115,14 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
         )
-        held = policy is not None and policy.percentiles == "first"
-        return calibration.holding(timeline.with_first_percentiles().at(start_min).percentiles) if held else calibration
+        if policy is None or policy.percentiles != "first":
+            return calibration
+        return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
 
-    def holding(self, percentiles: Any) -> Self:
+    def with_percentiles(self, percentiles: Any) -> Self:
         """The same with one set of percentiles in all simulators: they do not move with the responses."""
 
-        def held(simulator: NeuronSimulator) -> NeuronSimulator:
+        def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
-        return replace(self, simulator=held(self.simulator), redrawn=tuple(map(held, self.redrawn)))
+        return replace(self, simulator=fixed(self.simulator), bootstraps=tuple(map(fixed, self.bootstraps)))

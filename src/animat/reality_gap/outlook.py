@@ -42,7 +42,7 @@ class Outlook:
             likely, least = (max(0.0, each) for each in self.drifted_min)
             drift = (
                 f"by the recordings' drift the median response has changed by {100 * LARGE:.0f} % in "
-                f"{_words(likely)} ({_words(least)} at least), beyond which following thresholds may not help"
+                f"{_words(likely)} ({_words(least)} at least), beyond which adaptive thresholds may not help"
             )
         said = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
         if np.isfinite(self.budget_min):
@@ -66,7 +66,7 @@ def outlook(
     Args:
         loop: its settings.
         calibration: whose recordings' drift is gone on with.
-        episodes: of each contender how many, how often each condition is presented in one of them, and whether the
+        episodes: of each agent how many, how often each condition is presented in one of them, and whether the
             culture gets pulses then.
         account: of the budget.
         now_min: on the culture's clock.
@@ -74,7 +74,7 @@ def outlook(
     interval_s = loop.pulses * np.array([condition.interval_s for condition in loop.conditions])
     total_s = pulses = 0.0
     for n, acted, is_stimulated in episodes:
-        presented = acted + (loop.lead_in or 0) * is_stimulated
+        presented = acted + (loop.warm_up or 0) * is_stimulated
         total_s += n * (loop.pause_s + float(presented @ interval_s))
         pulses += n * is_stimulated * loop.pulses * float(presented.sum())
     of, drift, since_min = account.budget.pulses, calibration.drift, calibration.start_min - now_min

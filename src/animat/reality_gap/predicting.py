@@ -1,4 +1,4 @@
-"""What the recording's simulator says that policies and controls will live, and how well it can know."""
+"""What the recording's simulator says that policies and controls will return, and how well it can know."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.contenders import AnyCondition, Contender, Greedy, HandMadeRule, OneCondition
+from animat.closed_loop.agents import Agent, AnyCondition, Greedy, HeuristicController, OneCondition
 from animat.environment import Animat
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import silenced
@@ -23,22 +23,22 @@ from animat.reality_gap.passes import Passes
 EPISODES = 200
 """Of each policy and control in one roll-out."""
 ROLL_OUTS = 5
-"""On the recording's simulator; one on each simulator of redrawn responses."""
+"""On the recording's simulator; one on each simulator of bootstrapped responses."""
 
 
 class Predicted(NamedTuple):
-    """What simulators say of one contender.
+    """What simulators say of one agent.
 
     Attributes:
         returns: of its episodes on the simulator of the recording, shape (episodes,).
-        anew: its mean return on each simulator of the recording's responses drawn anew, shape (redrawn,): it spreads
+        anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
             as the recording's responses and, a little, as 200 episodes do.
         passes: in all its episodes on the simulator of the recording, shape (conditions,).
-        passes_anew: on each simulator of redrawn responses, shape (redrawn, conditions).
+        passes_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
     """
 
     returns: Float64[np.ndarray, " episodes"]
-    anew: Float64[np.ndarray, " redrawn"]
+    anew: Float64[np.ndarray, " bootstraps"]
     passes: Passes
     passes_anew: Passes
 
@@ -49,7 +49,7 @@ class Predicted(NamedTuple):
 
 
 def together(predicted: Sequence[Predicted]) -> Predicted:
-    """Several policies as one contender."""
+    """Several policies as one agent."""
     return Predicted(
         np.concatenate([each.returns for each in predicted]),
         np.mean([each.anew for each in predicted], axis=0),
@@ -63,7 +63,7 @@ def _stacked(passes: Sequence[Passes]) -> Passes:
 
 
 def predict(
-    groups: Sequence[Sequence[Contender]],
+    groups: Sequence[Sequence[Agent]],
     environment: Animat[Any],
     calibration: Calibration,
     rule: Actor | None,
@@ -72,22 +72,22 @@ def predict(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, Predicted]:
-    """Run contenders on the simulator of a recording, and on those of its responses drawn anew.
+    """Run agents on the simulator of a recording, and on those of its responses drawn anew.
 
     Args:
-        groups: contenders as they will act on the culture; those of a group are policies that are run together.
+        groups: agents as they will act on the culture; those of a group are policies that are run together.
         environment: robot and mapping.
         calibration: the simulators.
-        rule: the hand-made one, where there is one among the contenders.
+        rule: the heuristic policy, where it is among the agents.
         greedy: whether policies take the most probable action.
         seed: decides every random draw.
         progress: told after each group.
 
     Returns:
-        By the contender's name.
+        By the agent's name.
     """
     progress = progress or Silent()
-    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.redrawn)
+    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps)
     acting = [_actor(group, rule, greedy=greedy) for group in groups]
 
     def rolled(group: int, on: int) -> Episodes:
@@ -105,10 +105,10 @@ def predict(
             episodes = list(side_by_side.map(rolled, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
             passes = _stacked([Passes(each.presented, each.passed) for each in episodes])
-            for row, contender in enumerate(group):
+            for row, agent in enumerate(group):
                 of = [row] if len(group) > 1 else list(range(acting[number][1]))
                 each = Passes(*(counts[:, of] for counts in passes)).summed(1)
-                found[contender.name] = Predicted(
+                found[agent.name] = Predicted(
                     returns[:ROLL_OUTS, of].ravel(),
                     returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
                     Passes(*(counts[:ROLL_OUTS] for counts in each)).summed(0),
@@ -122,7 +122,7 @@ def roll_out_seed(seed: int, group: int, on: int) -> int:
     return int(np.random.SeedSequence((seed, group, on)).generate_state(1)[0])
 
 
-def _actor(group: Sequence[Contender], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
+def _actor(group: Sequence[Agent], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
     """Who acts on the simulator as a group does on the culture, and how many they are."""
     first = group[0].controller
     # Without stimuli it makes no difference what is chosen, nor where each condition is delivered as often whatever is.
@@ -130,9 +130,9 @@ def _actor(group: Sequence[Contender], rule: Actor | None, *, greedy: bool) -> t
         return Uniform(), 1
     if isinstance(first, OneCondition):
         return Constant(jnp.array([first.condition])), 1
-    if isinstance(first, HandMadeRule) and rule is not None:
+    if isinstance(first, HeuristicController) and rule is not None:
         return rule, 1
     policies: list[Any] = [
-        each.policy if isinstance(each, Greedy) else each for each in (contender.controller for contender in group)
+        each.policy if isinstance(each, Greedy) else each for each in (agent.controller for agent in group)
     ]
     return networks_of(policies, greedy=greedy), len(policies)

@@ -22,7 +22,7 @@ FEWEST_EPISODES = 8
 """Of the policies, that a trend or a share is told from; of a condition in a trend's episode, `_FEWEST`."""
 _FEWEST = 3
 LEAST_LATE = 0.05
-"""Of the interval between pulses, on average over a condition's presentations."""
+"""Of the interval between pulses, on average over a condition's trials."""
 LEAST_BURSTS, _FEWEST_BURSTS = 0.05, 5
 LEAST_TREND = 0.1
 """Change over the session, of a condition's mean response."""
@@ -32,13 +32,13 @@ LEAST_SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is known of policies that lived another return than was predicted.
+    """What is known of policies whose measured return differs from the predicted one.
 
     Attributes:
         answered: what the culture answered them.
         calibration: the recording that predicted.
         predicted: of all policies together.
-        gap: the sign of their gap: -1 where they lived less.
+        gap: the sign of their gap: -1 where less was measured.
     """
 
     answered: Answered
@@ -61,7 +61,7 @@ def presentation(evidence: Evidence) -> Finding | None:
 
 
 def few_samples(evidence: Evidence) -> Finding | None:
-    """A condition has fewer responses in the recording than redrawing them tells the truth of."""
+    """A condition has fewer responses in the recording than bootstrapping them tells the truth of."""
     n = [len(each) for each in evidence.calibration.responses_hz]
     if min(n) >= FEW_SAMPLES:
         return None
@@ -79,7 +79,7 @@ def lateness(evidence: Evidence) -> Finding | None:
         most = max(most, part)
         share, late_ms = float(np.mean(late_s > 0)), 1000 * float(late_s[late_s > 0].mean())
         told.append(
-            f"{condition.label} in {100 * share:.0f} % of its presentations, by {late_ms:.2g} ms of its "
+            f"{condition.label} in {100 * share:.0f} % of its trials, by {late_ms:.2g} ms of its "
             f"{1000 * condition.interval_s:.3g} on average"
         )
     return _reason("lateness", f"pulses came late: {', '.join(told)}", most) if told else None
@@ -91,11 +91,11 @@ def bursts(evidence: Evidence) -> Finding | None:
     count, n = int(is_burst.sum()), len(is_burst)
     if count < max(_FEWEST_BURSTS, LEAST_BURSTS * n):
         return None
-    sentence = (
+    message = (
         f"{100 * count / n:.0f} % of {n} responses were bursts ({100 * evidence.calibration.burst_share:.0f} % in the "
         "recording), which the prediction leaves out"
     )
-    return _reason("bursts", sentence, count / n)
+    return _reason("bursts", message, count / n)
 
 
 def trend(evidence: Evidence) -> Finding | None:
@@ -134,11 +134,11 @@ def trend(evidence: Evidence) -> Finding | None:
             )
     if not told:
         return None
-    sentence = (
+    message = (
         f"the culture changed over the session's {answers.span_min:.0f} min: responses {', '.join(told)} (of their "
         f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
-    return _reason("trend", sentence, most)
+    return _reason("trend", message, most)
 
 
 def memory(evidence: Evidence) -> Finding | None:
@@ -146,7 +146,7 @@ def memory(evidence: Evidence) -> Finding | None:
     if evidence.calibration.simulator.has_memory:
         return None
     found = next(memory_findings(evidence.answered.responses), None)
-    return None if found is None else _reason("memory", found.sentence, found.value)
+    return None if found is None else _reason("memory", found.message, found.value)
 
 
 def answers(evidence: Evidence) -> Finding | None:
@@ -158,11 +158,11 @@ def answers(evidence: Evidence) -> Finding | None:
     """
     from scipy.stats import t as student
 
-    lived, predicted = evidence.answered.passes, evidence.predicted
-    episodes, recorded_hz = len(lived.passed), evidence.calibration.responses_hz
+    measured, predicted = evidence.answered.passes, evidence.predicted
+    episodes, recorded_hz = len(measured.passed), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
         return None
-    conditions = np.flatnonzero((lived.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
+    conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
     names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
     # Of one readout there is no axis.
     of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
@@ -170,7 +170,7 @@ def answers(evidence: Evidence) -> Finding | None:
     told, most = [], 0.0
     for i, of in tested:
         at: Any = (i, *of)
-        n, passed = lived.presented[:, i], lived.passed[:, *at]
+        n, passed = measured.presented[:, i], measured.passed[:, *at]
         share, expected = float(passed.sum() / n.sum()), float(predicted.passes.share[at])
         between = episodes / (episodes - 1) * float(np.sum((passed - share * n) ** 2)) / float(n.sum()) ** 2
         error = max(between, _variance(share, int(n.sum()))) ** 0.5
@@ -180,11 +180,11 @@ def answers(evidence: Evidence) -> Finding | None:
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < LEVEL / len(tested) and abs(difference) >= LEAST_SHARE:
             most = max(most, difference, key=abs)
-            lived_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
+            measured_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
             on = f" on {names[of[0]]}" if of else ""
             told.append(
                 f"{_conditions(evidence)[i].label}{on} in {share:.2f} +- {error:.2f} ({expected:.2f} +- "
-                f"{expected_error:.2f}; mean {lived_hz:.3g} Hz, "
+                f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, "
                 f"{recorded_hz[i][:, *of].mean():.3g} in the recording)"
             )
     if not told:
@@ -213,5 +213,5 @@ def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
     return evidence.answered.responses.conditions
 
 
-def _reason(name: str, sentence: str, value: float | None = None) -> Finding:
-    return Finding(name, "note", sentence, value)
+def _reason(name: str, message: str, value: float | None = None) -> Finding:
+    return Finding(name, "note", message, value)

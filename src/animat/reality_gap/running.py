@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.contenders import Contender, Greedy, controls, random_control
+from animat.closed_loop.agents import Agent, Greedy, controls, random_control
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
@@ -22,7 +22,7 @@ from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat
 from animat.errors import Mismatch
-from animat.evaluation.hand_made import hand_made
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
@@ -43,7 +43,7 @@ from animat.training.policy import Policy, first_of_alike
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
-LIMIT_RESOLUTION = 0.5
+OPTIMUM_RESOLUTION = 0.5
 """Of the grid of the optimal return: fast and rough, 0.8 of the cartpole's 200."""
 
 
@@ -56,12 +56,12 @@ def run_policies(
     episodes: int = 5,
     with_controls: bool = True,
     greedy: bool = True,
-    follow: bool = True,
+    adaptive: bool = True,
     seed: int = 1,
     pulses: int | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
     noticed: Sequence[Finding] = (),
     **settings: Any,
 ) -> RealityGap:
@@ -80,14 +80,14 @@ def run_policies(
         episodes: of each policy, and at most of each control.
         with_controls: all of them; if not, only the random one.
         greedy: whether policies take the most probable action, or draw as in training.
-        follow: whether the mapping's percentiles follow the culture (`animat.closed_loop.following`) from where the
-            calibration left them, or are held.
+        adaptive: whether the mapping's thresholds adapt to the culture (`animat.closed_loop.adaptive`) from where the
+            calibration left them, or are fixed.
         seed: decides every random draw, but what the culture does.
-        pulses: of a presentation; None: as in the policies' recordings.
+        pulses: of a trial; None: as in the policies' recordings.
         account: of a stimulation budget.
         progress: told after each episode.
-        tell: is given lines before the session: the warnings, and how long it will and can be.
-        noticed: findings to be told beside those made here.
+        report: is given lines before the session: the warnings, and how long it will and can be.
+        noticed: findings to be reported beside those made here.
         settings: other attributes of `Loop`.
 
     Raises:
@@ -98,30 +98,30 @@ def run_policies(
     first = check_policies(policies)
     check_conditions(first, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if follow:
-        settings["following"] = calibration.responses_hz
+    if adaptive:
+        settings["adaptive_from"] = calibration.responses_hz
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":
-        sentence = (
+        message = (
             "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
             "what they choose is delivered"
         )
-        findings += (Finding("trained-as-control", "warning", sentence),)
-    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.lead_in:
-        sentence = (
-            "episodes begin after a rest (--lead-in 0), and those of the simulator as after stimuli of all conditions: "
+        findings += (Finding("trained-as-control", "warning", message),)
+    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
+        message = (
+            "episodes begin after a rest (--warm-up 0), and those of the simulator as after stimuli of all conditions: "
             "the measured return will be less than predicted"
         )
-        findings += (Finding("no-lead-in", "warning", sentence),)
-    if follow and first.percentiles == "first":
-        sentence = (
-            "the policies were trained on held percentiles, and in this loop they follow the culture: with "
-            "--thresholds held they are as in training"
+        findings += (Finding("no-warm-up", "warning", message),)
+    if adaptive and first.percentiles == "first":
+        message = (
+            "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
+            "--thresholds fixed they are as in training"
         )
-        findings += (Finding("moving-percentiles", "warning", sentence),)
+        findings += (Finding("moving-percentiles", "warning", message),)
     findings += (
         *other_simulator(first.fitted, calibration.fitted),
         *old_calibration(calibration.start_min, culture.now_s / 60),
@@ -132,65 +132,64 @@ def run_policies(
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
     simulator = calibration.simulator
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
-    contenders = [Contender(name, "as trained", controller) for name, controller in acting.items()]
+    agents = [Agent(name, "as trained", controller) for name, controller in acting.items()]
     rule, lacks = None, lacking(loop.robot)
     if with_controls:
         if "heuristic" in lacks:
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
         else:
-            rule = hand_made(environment, simulator)
-        contenders += controls(
+            rule = heuristic_policy(environment, simulator)
+        agents += controls(
             loop.robot,
             [condition.label for condition in loop.conditions],
             means=None if rule is None else np.asarray(rule.means)[0].tolist(),
             policies=acting,
         )
     else:
-        contenders.append(random_control(len(loop.conditions)))
+        agents.append(random_control(len(loop.conditions)))
 
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
-        findings += (Finding("no-limit", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
+        findings += (Finding("no-optimum", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
     predicted = predict(
-        [contenders[: len(policies)], *([control] for control in contenders[len(policies) :])],
+        [agents[: len(policies)], *([control] for control in agents[len(policies) :])],
         environment,
-        # Held percentiles are what they are; those that follow the culture would follow other responses too.
-        calibration if follow else calibration.holding(calibration.simulator.percentiles),
+        # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
+        calibration if adaptive else calibration.with_percentiles(calibration.simulator.percentiles),
         rule,
         greedy=greedy,
         seed=seed,
         progress=progress,
     )
     # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
-    limit = _meanwhile(lambda: _best_return(environment, simulator)) if why_not is None else None
+    optimum = _meanwhile(lambda: _best_return(environment, simulator)) if why_not is None else None
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
-    if in_real_time and limit is not None:
-        _wait_for(limit, progress)
-    of_each = planned_episodes(len(policies), len(contenders) - len(policies), episodes)
+    if in_real_time and optimum is not None:
+        _wait_for(optimum, progress)
+    of_each = planned_episodes(len(policies), len(agents) - len(policies), episodes)
     plan = [
-        (n, predicted[each.name].presented, each.delivery != "silent")
-        for n, each in zip(of_each, contenders, strict=True)
+        (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
     ahead = outlook(loop, calibration, plan, account, culture.now_s / 60)
     findings = (*noticed, *findings, *calibration.findings)
-    if tell is not None:
+    if report is not None:
         # Before the first pulse: whoever stands at the rig may think better of it.
-        for sentence in warnings_once(findings):
-            tell(f"warning: {sentence}")
-        tell(str(ahead))
+        for message in warnings_once(findings):
+            report(f"warning: {message}")
+        report(str(ahead))
     session = run_session(
-        culture, loop, contenders, folder, episodes=of_each, seed=seed, account=account, progress=progress
+        culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=progress
     )
     best = None
     # Whoever stopped the session does not wait for it.
-    if limit is not None and (limit.done() or session.ending.by == "plan"):
+    if optimum is not None and (optimum.done() or session.ending.by == "plan"):
         try:
-            best = _wait_for(limit, progress)
+            best = _wait_for(optimum, progress)
         except Exception as error:
-            findings += (Finding("no-limit", "note", f"no optimal return: {in_words(error)}"),)
-    rows = _rows(contenders, tuple(policies), predicted, session)
+            findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
+    rows = _rows(agents, tuple(policies), predicted, session)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
@@ -226,7 +225,7 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
 
 def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
     """The value alone, which is told as "about": how well it is known would take a third as long again."""
-    grid = grid_for(environment.robot).scaled(LIMIT_RESOLUTION)
+    grid = grid_for(environment.robot).scaled(OPTIMUM_RESOLUTION)
     (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
     return float(value)
 
@@ -246,10 +245,10 @@ def _meanwhile(compute: Callable[[], float]) -> Future[float]:
     return found
 
 
-def _wait_for(limit: Future[float], progress: Progress | None) -> float:
+def _wait_for(optimum: Future[float], progress: Progress | None) -> float:
     if progress is not None:
         progress.update(0, 1, "optimal return")
-    return limit.result()
+    return optimum.result()
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
@@ -287,35 +286,35 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
 
 
 def _rows(
-    contenders: Sequence[Contender], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
+    agents: Sequence[Agent], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
 ) -> tuple[Row, ...]:
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
-        episodes = [episode for episode in session.episodes if episode.contender in of]
+        episodes = [episode for episode in session.episodes if episode.agent in of]
         acted = [episode.acted for episode in episodes]
         actions = max(1, sum(each.actions for each in acted))
-        presentations = max(1, sum(each.presentations for each in acted))
+        trials = max(1, sum(each.trials for each in acted))
         of_them = together([predicted[each] for each in of])
         return Row(
             name=name,
             meaning=meaning,
             predicted=of_them.returns,
             predicted_anew=of_them.anew,
-            lived=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
+            measured=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
             pulses_per_action=sum(each.pulses for each in acted) / actions,
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,
-            bursts=sum(each.bursts for each in acted) / presentations,
-            late=sum(each.late for each in acted) / presentations,
+            bursts=sum(each.bursts for each in acted) / trials,
+            late=sum(each.late for each in acted) / trials,
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
     rows = [policies]
-    for contender in contenders:
-        if contender.name in names:
+    for agent in agents:
+        if agent.name in names:
             if len(names) > 1:
-                rows.append(row(contender.name, contender.meaning, [contender.name]))
+                rows.append(row(agent.name, agent.meaning, [agent.name]))
             continue
-        control = row(contender.name, contender.meaning, [contender.name])
-        if len(control.lived) and len(policies.lived):
-            control = replace(control, beside=beside(policies.lived, control.lived))
+        control = row(agent.name, agent.meaning, [agent.name])
+        if len(control.measured) and len(policies.measured):
+            control = replace(control, beside=beside(policies.measured, control.measured))
         rows.append(control)
     return tuple(rows)

@@ -1,4 +1,4 @@
-"""The table of predicted and lived returns."""
+"""The table of predicted and measured returns."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ class Row:
     Attributes:
         name, meaning: who acted.
         predicted: returns on the simulator, shape (episodes,).
-        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (redrawn,).
-        lived: returns of whole episodes on the culture, shape (episodes,).
-        pulses_per_action: that the culture was given, without what led in; so are the next three.
+        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
+        measured: returns of whole episodes on the culture, shape (episodes,).
+        pulses_per_action: that the culture was given, without the warm-up; so are the next three.
         seconds_per_action: of the culture's time.
         bursts: share of responses that were.
-        late: share of presentations that came late.
-        beside: the policies' lived returns beside these; None for the policies, and where either has none.
+        late: share of trials that came late.
+        beside: the policies' measured returns beside these; None for the policies, and where either has none.
     """
 
     name: str
     meaning: str
     predicted: Float64[np.ndarray, " predicted"]
-    predicted_anew: Float64[np.ndarray, " redrawn"]
-    lived: Float64[np.ndarray, " lived"]
+    predicted_anew: Float64[np.ndarray, " bootstraps"]
+    measured: Float64[np.ndarray, " measured"]
     pulses_per_action: float
     seconds_per_action: float
     bursts: float
@@ -59,38 +59,38 @@ class Row:
 
     @property
     def gap(self) -> Interval:
-        """Mean lived less mean predicted return; in its interval the recording and the lived episodes are drawn anew.
+        """Mean measured less mean predicted return; its interval is over recordings and measured episodes drawn anew.
 
-        Its ends are infinite where fewer than two episodes were lived. Responses are drawn as if they were independent:
+        Its ends are infinite with fewer than two measured episodes. Responses are drawn as if they were independent:
         a drift between the recording and the loop is not in the interval, and shows as a gap.
         """
-        value = self.lived.mean() - self.predicted.mean()
-        if len(self.lived) < 2:
+        value = self.measured.mean() - self.predicted.mean()
+        if len(self.measured) < 2:
             return Interval(float(value), -np.inf, np.inf, CONFIDENCE)
         rng = np.random.default_rng(0)
-        lived = _resampled_means(self.lived, rng)
-        return _between(value, lived - rng.choice(self.predicted_anew, len(lived)))
+        measured = _resampled_means(self.measured, rng)
+        return _between(value, measured - rng.choice(self.predicted_anew, len(measured)))
 
     @property
     def gap_sign(self) -> Literal[-1, 0, 1]:
-        """-1 where less was lived than predicted, 1 where more, 0 where that cannot be told."""
-        if not len(self.lived):
+        """-1 where less was measured than predicted, 1 where more, 0 where that cannot be told."""
+        if not len(self.measured):
             return 0
         gap = self.gap
         return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
 
     def to_dict(self) -> dict[str, Any]:
         """The line as plain data."""
-        lived = bool(len(self.lived))
+        measured = bool(len(self.measured))
         return {
             "name": self.name,
             "meaning": self.meaning,
             "predicted": float(self.predicted.mean()),
             "prediction": as_json(self.prediction.to_dict()),
-            "lived": float(self.lived.mean()) if lived else None,
-            "gap": as_json(self.gap.to_dict()) if lived else None,
-            "episodes": len(self.lived),
-            "lived_returns": self.lived.tolist(),
+            "measured": float(self.measured.mean()) if measured else None,
+            "gap": as_json(self.gap.to_dict()) if measured else None,
+            "episodes": len(self.measured),
+            "measured_returns": self.measured.tolist(),
             "pulses_per_action": self.pulses_per_action,
             "seconds_per_action": self.seconds_per_action,
             "bursts": self.bursts,
@@ -102,28 +102,28 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class RealityGap:
-    """Policies and controls, predicted and lived.
+    """Policies and controls, predicted and measured.
 
     Attributes:
         robot, mapping: names.
         loop: the settings of the closed loop.
         calibrated_at_min: of the recording that predicted.
-        limit: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
+        optimum: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
-        session: as it was lived.
+        session: as it ran.
         account: of the stimulation.
         findings: where loop, recording and policy differ, and what was noticed.
         responses: that the recording has, without bursts.
         outlook: how long the session would be and could be, as it was known beforehand.
-        reasons: why the policies lived another return than predicted, as far as the session's data show it.
+        reasons: why the policies' measured return differs from the predicted one, as far as the session's data show it.
     """
 
     robot: str
     mapping: str
     loop: Loop
     calibrated_at_min: float
-    limit: float | None
+    optimum: float | None
     rows: tuple[Row, ...]
     session: Session
     account: Account
@@ -140,17 +140,17 @@ class RealityGap:
 
     @property
     def gap_share(self) -> float | None:
-        """The policies' gap as a share of what there is to win: of the range from predicted random to the limit."""
-        if self.limit is None:
+        """The policies' gap as a share of what there is to win: of the range from predicted random to the optimum."""
+        if self.optimum is None:
             return None
-        range_ = self.limit - next(row for row in self.rows if row.name == "random").predicted.mean()
-        return float(self.rows[0].gap.value / range_) if len(self.rows[0].lived) and range_ > 0 else None
+        range_ = self.optimum - next(row for row in self.rows if row.name == "random").predicted.mean()
+        return float(self.rows[0].gap.value / range_) if len(self.rows[0].measured) and range_ > 0 else None
 
     def verdict(self) -> str:
         """Whether the policies outperform the controls, and what the gap may come from."""
         beside, policies = self.beside_controls, self.rows[0]
         if beside is None:
-            who = "no control" if len(policies.lived) else "no episode of a policy"
+            who = "no control" if len(policies.measured) else "no episode of a policy"
             return f"{who} ran to its end: nothing can be said of the policies beside the controls"
         return str(beside) + self._on_the_gap()
 
@@ -158,15 +158,15 @@ class RealityGap:
         """What may have made the policies' gap."""
         row, share = self.rows[0], self.gap_share
         if not row.gap_sign:
-            if share is None or abs(share) < LARGE_SHARE or len(row.lived) < 2:
+            if share is None or abs(share) < LARGE_SHARE or len(row.measured) < 2:
                 return ""
             return (
                 f"; their measured return is {_more_or_less(row.gap.value)} than predicted, within what the "
-                f"recording's {self.responses} responses and {len(row.lived)} episodes can tell"
+                f"recording's {self.responses} responses and {len(row.measured)} episodes can tell"
             )
         said = f"; their measured return is {_more_or_less(row.gap.value)} than predicted"
         if self.reasons:
-            return f"{said}: {'; '.join(reason.sentence for reason in self.reasons)}"
+            return f"{said}: {'; '.join(reason.message for reason in self.reasons)}"
         return f"{said}, and nothing in the session's data explains it (looked for: {', '.join(CHECKS)})"
 
     def to_dict(self) -> dict[str, Any]:
@@ -176,7 +176,7 @@ class RealityGap:
             "mapping": self.mapping,
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
-            "limit": self.limit,
+            "optimum": self.optimum,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
@@ -196,13 +196,13 @@ class RealityGap:
         for row in self.rows:
             told, prediction = row.to_dict(), row.prediction
             anew = f"{prediction.low:.1f} to {prediction.high:.1f}"
-            lived = ["-", "-", ""]
+            measured = ["-", "-", ""]
             if (gap := told["gap"]) is not None:
                 between = "unknown" if gap["low"] is None else f"{gap['low']:+.1f} to {gap['high']:+.1f}"
-                lived = [f"{told['lived']:.1f}", f"{gap['value']:+.1f}", between]
+                measured = [f"{told['measured']:.1f}", f"{gap['value']:+.1f}", between]
             p = "" if row.beside is None else f"{row.beside.p:.2g}"
-            counts = [str(len(row.lived)), f"{row.pulses_per_action:.1f}"]
-            cells.append([row.name, f"{told['predicted']:.1f}", anew, *lived, *counts, p, row.meaning])
+            counts = [str(len(row.measured)), f"{row.pulses_per_action:.1f}"]
+            cells.append([row.name, f"{told['predicted']:.1f}", anew, *measured, *counts, p, row.meaning])
         interval = "95 % interval"
         head = ["", "predicted", interval, "measured", "gap", interval, "episodes", "pulses/action", "p", ""]
         lines = [
@@ -210,12 +210,12 @@ class RealityGap:
             f"{self.calibrated_at_min:g} min",
             *lined_up(head, cells),
         ]
-        if self.limit is not None:
+        if self.optimum is not None:
             share = ""
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
-            lines.append(f"  the optimal return on this simulator is about {self.limit:.1f}{share}")
-        lines += [f"  {finding.sentence}" for finding in self.findings if finding.name in ("no-limit", "no-heuristic")]
+            lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
+        lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(f"  p: that the policies' returns are no other than this control's; stimulation: {self.account}")

@@ -45,7 +45,7 @@ class PlainColumns:
         start_s: start on the recording's clock; by default 0, or the first event if that is earlier.
         duration_s: by default up to the last event.
         presentation_order: `"blocked"` or `"mixed"`; by default not known.
-        presentation_pulses: pulses a presentation.
+        presentation_pulses: pulses a trial.
     """
 
     spike_time_s: Column

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 Severity = Literal["note", "warning", "refuse"]
 
@@ -17,35 +17,41 @@ class Finding:
         name: a short fixed name, by which tests and programs know it (`"dead-window"`).
         severity: `"note"`, worth knowing; `"warning"`, results may mislead; `"refuse"`, training on it makes no sense
             unless the user says otherwise.
-        sentence: what was found, what it means and what to do, for people.
+        message: what was found, what it means and what to do, for people.
         value: the number behind it, if there is one.
         at_min: start of the recording that it is of, among those of several; None elsewhere.
     """
 
     name: str
     severity: Severity
-    sentence: str
+    message: str
     value: float | None = None
     at_min: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """What it says, as plain data."""
-        return {"name": self.name, "severity": self.severity, "sentence": self.sentence}
+        return {"name": self.name, "severity": self.severity, "message": self.message}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """From all its attributes by their names, as a file has them."""
+        # Files of before have a sentence.
+        return cls(**{"message" if name == "sentence" else name: value for name, value in data.items()})
 
 
 def left_out_of(what: str, names: Sequence[str], file: str = "") -> Finding:
     """The finding on keys or columns of a file that nobody knows."""
-    sentence = f"{what}{f' of {file}' if file else ''} that are not known were left out: {', '.join(names)}"
-    return Finding(f"{what}-left-out", "note", sentence, float(len(names)))
+    message = f"{what}{f' of {file}' if file else ''} that are not known were left out: {', '.join(names)}"
+    return Finding(f"{what}-left-out", "note", message, float(len(names)))
 
 
 def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Those of one name and severity as one, with the sentences of all: as they are kept with a recording."""
-    sentences: dict[tuple[str, Severity], str] = {}
+    messages: dict[tuple[str, Severity], str] = {}
     for finding in findings:
         key = finding.name, finding.severity
-        sentences[key] = f"{sentences[key]}; {finding.sentence}" if key in sentences else finding.sentence
-    return tuple(Finding(*key, sentence) for key, sentence in sentences.items())
+        messages[key] = f"{messages[key]}; {finding.message}" if key in messages else finding.message
+    return tuple(Finding(*key, message) for key, message in messages.items())
 
 
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
@@ -56,7 +62,7 @@ def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
             warnings.setdefault(finding.name, []).append(finding)
     for alike in warnings.values():
         worst = max(alike, key=_gravity)
-        yield worst.sentence + (f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else "")
+        yield worst.message + (f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else "")
 
 
 def _gravity(finding: Finding) -> float:

@@ -51,8 +51,8 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     yield from _stimulus_rows(recording)
     unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1)))
     if unknown:
-        sentence = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
-        yield Finding("stimulus-electrodes-unknown", "note", sentence, float(unknown))
+        message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
+        yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
         yield Finding(
             "presentation-unknown",

@@ -15,7 +15,7 @@ def in_words(recording: Recording) -> dict[str, str]:
     words = dict(recording.provenance)
     if recording.protocol is not None:
         words["protocol"] = recording.protocol.to_json()
-    return words | {f"{finding.severity}: {finding.name}": finding.sentence for finding in recording.findings}
+    return words | {f"{finding.severity}: {finding.name}": finding.message for finding in recording.findings}
 
 
 def from_words(words: Mapping[str, str]) -> dict[str, Any]:
@@ -25,14 +25,14 @@ def from_words(words: Mapping[str, str]) -> dict[str, Any]:
         InvalidArgument: for a protocol that is none.
     """
     provenance, findings, protocol = dict[str, str](), list[Finding](), None
-    for key, sentence in words.items():
+    for key, message in words.items():
         severity, colon, name = key.partition(": ")
         if key == "protocol":
-            protocol = Protocol.from_json(sentence)
+            protocol = Protocol.from_json(message)
         elif colon and severity in get_args(Severity):
-            findings.append(Finding(name, severity, sentence))  # type: ignore[arg-type]
+            findings.append(Finding(name, severity, message))  # type: ignore[arg-type]
         else:
-            provenance[key] = sentence
+            provenance[key] = message
     culture = None
     for kind, begins, seed in (("virtual", "virtual culture", "seed"), ("cl1", "CL1", "pattern_seed")):
         if words.get("source", "").startswith(begins) and words.get(seed, "").isdecimal() and len(words[seed]) <= 20:

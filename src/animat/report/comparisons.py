@@ -1,4 +1,4 @@
-"""Box plots of comparisons: every policy a point, with random, the limit and the significance."""
+"""Box plots of comparisons: every policy a point, with random, the optimum and the significance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BLUE, GREY, LIMIT, ORANGE, add_common_legend, new_figure, style_axes
+from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, new_figure, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,16 +21,16 @@ class Group:
     """One side of a comparison.
 
     Attributes:
-        name: the condition.
+        name: the arm.
         returns: each policy's mean return, shape (policies,).
-        random, limit: of random actions, and the optimal return; None where not known.
+        random, optimum: of random actions, and the optimal return; None where not known.
         score: the normalised score of the policies' mean; None where not known.
     """
 
     name: str
     returns: Float64[np.ndarray, " policies"]
     random: float | None = None
-    limit: float | None = None
+    optimum: float | None = None
     score: float | None = None
 
 
@@ -89,7 +89,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
 
 
 def _name(group: Group) -> str:
-    """The condition in two lines, and its score in a third."""
+    """The arm in two lines, and its score in a third."""
     name = group.name if " " in group.name else f"{group.name} "
     return name.replace(" ", "\n", 1) + ("" if group.score is None else f"\nscore {group.score:.2f}")
 
@@ -114,5 +114,5 @@ def _draw_references(axes: Axes, group: Group, place: int) -> None:
     ends = [place - 0.42, place + 0.42]
     if group.random is not None:
         axes.plot(ends, [group.random] * 2, color=GREY, linewidth=1.3, linestyle=":", label="random actions")
-    if group.limit is not None:
-        axes.plot(ends, [group.limit] * 2, color=LIMIT, linewidth=1.3, linestyle="--", label="optimal return")
+    if group.optimum is not None:
+        axes.plot(ends, [group.optimum] * 2, color=OPTIMUM, linewidth=1.3, linestyle="--", label="optimal return")

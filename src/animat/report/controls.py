@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from animat.report.style import BLUE, GREY, LIMIT, ORANGE, add_common_legend, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,18 +20,18 @@ class Controls:
         title: the mapping and the minute.
         returns: name, mean return and its standard error (None: not known), the trained policies first.
         n_trained: how many of them are trained policies.
-        random, limit: of random actions, and the optimal return; None where not known.
+        random, optimum: of random actions, and the optimal return; None where not known.
     """
 
     title: str
     returns: tuple[tuple[str, float, float | None], ...]
     n_trained: int = 1
     random: float | None = None
-    limit: float | None = None
+    optimum: float | None = None
 
 
 def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
-    """A panel a mapping and recording: mean returns with their standard errors, random actions and the limit.
+    """A panel a mapping and recording: mean returns with their standard errors, random actions and the optimum.
 
     Args:
         panels_of: on one robot.
@@ -46,8 +46,8 @@ def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
             axes.errorbar([mean], [-place], xerr=bar, fmt="o", markersize=4, color=colour, capsize=2, label=name)
         axes.set_yticks([-i for i in range(len(controls.returns))], [name for name, _, _ in controls.returns])
         axes.set_ylim(-len(controls.returns) + 0.4, 0.6)
-        if controls.limit is not None:
-            axes.axvline(controls.limit, color=LIMIT, linewidth=1.2, linestyle="--", label="optimal return")
+        if controls.optimum is not None:
+            axes.axvline(controls.optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
         if controls.random is not None:
             axes.axvline(controls.random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
         style_axes(axes, controls.title, "mean return and its standard error", "")

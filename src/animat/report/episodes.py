@@ -1,4 +1,4 @@
-"""Episodes as paths and as frames, a condition beside the other."""
+"""Episodes as paths and as frames, one arm beside the other."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _FRAMES = 7
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
-    """A panel a condition with one episode of each policy, as the robot draws them.
+    """A panel for each arm with one episode of each policy, as the robot draws them.
 
     Args:
         robot: one with a method `draw_paths`.
-        paths: by condition, the observations of each episode, in the robot's own units.
+        paths: by arm, the observations of each episode, in the robot's own units.
         title: of the whole figure.
     """
     draw = capability(robot, "draw_paths")
@@ -37,11 +37,11 @@ def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: st
 
 
 def draw_frames(robot: Robot[Any], episodes: Mapping[str, tuple[Path, Sequence[float]]], title: str) -> Figure:
-    """A row a condition: pictures of the robot from the start of an episode to its end, evenly spread.
+    """A row for each arm: pictures of the robot from the start of an episode to its end, evenly spread.
 
     Args:
         robot: one that can be drawn.
-        episodes: by condition, the observations of an episode and its commands.
+        episodes: by arm, the observations of an episode and its commands.
         title: of the whole figure.
     """
     first = draw_robot(robot, next(iter(episodes.values()))[0][0])

@@ -13,7 +13,7 @@ from typing import Any
 
 from animat.errors import InvalidFile
 from animat.report.style import PNG_DPI
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 TEMPLATE = "report.html.j2"
 
@@ -119,7 +119,7 @@ def write_page(
     environment.filters["cell"] = cell
     text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
     path = Path(path)
-    with written_whole(path) as beside:
+    with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
     return path
 

@@ -30,11 +30,7 @@ def inspection_text(inspection: Inspection) -> str:
         f"{inspection.name}: {inspection.verdict}",
         f"  {_held(inspection)}, from {inspection.start_min:g} min on the culture's clock",
         f"  {inspection.n_stimuli:,} stimuli"
-        + (
-            f" in {inspection.n_presentations:,} presentations"
-            if inspection.n_presentations != inspection.n_stimuli
-            else ""
-        )
+        + (f" in {inspection.n_trials:,} trials" if inspection.n_trials != inspection.n_stimuli else "")
         + (f", {inspection.presentation}" if inspection.presentation else ""),
     ]
     if inspection.network_bursts is not None:
@@ -57,7 +53,7 @@ def inspection_text(inspection: Inspection) -> str:
         )
         lines += ["", *_table(inspection)]
     if inspection.findings:
-        lines += ["", *(f"  {_MARK[finding.severity]} {finding.sentence}" for finding in inspection.findings)]
+        lines += ["", *(f"  {_MARK[finding.severity]} {finding.message}" for finding in inspection.findings)]
     return "\n".join(lines)
 
 
@@ -113,7 +109,7 @@ def draw_inspection(
             if inspection.network_bursts is None
             else draw_spontaneous(recording, inspection.network_bursts)
         )
-    if isinstance(recording, Recording) and inspection.n_presentations:
+    if isinstance(recording, Recording) and inspection.n_trials:
         figures["psth"] = draw_psth(
             _histogram(recording, inspection), responses.window_ms, inspection.spontaneous_rate_hz
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, LIMIT, add_common_legend, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, OPTIMUM, add_common_legend, grid_of_panels, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,13 +19,13 @@ _RESAMPLES = 2000
 
 @dataclass(frozen=True, eq=False)
 class LearningCurve:
-    """One condition's.
+    """One arm's.
 
     Attributes:
-        name: the condition.
+        name: the arm.
         iterations: done at the end of each part of training, shape (parts,).
         returns: mean return of the episodes that ended in it, NaN where none did, shape (policies, parts).
-        random, limit: of random actions and optimal with the simulator in use in each part, NaN where not
+        random, optimum: of random actions and optimal with the simulator in use in each part, NaN where not
             known, shape (parts,); None where known of none.
     """
 
@@ -33,11 +33,11 @@ class LearningCurve:
     iterations: Float64[np.ndarray, " parts"]
     returns: Float64[np.ndarray, "policies parts"]
     random: Float64[np.ndarray, " parts"] | None = None
-    limit: Float64[np.ndarray, " parts"] | None = None
+    optimum: Float64[np.ndarray, " parts"] | None = None
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
-    """A panel a condition: every policy thin, their mean with its 95 % bootstrap interval, random and the limit.
+    """A panel for each arm: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum.
 
     Args:
         curves: of one robot.
@@ -56,7 +56,7 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         axes.fill_between(x[some], low[some], high[some], color=BLUE, alpha=0.3, linewidth=0, label=label)
         axes.plot(x[some], mean[some], color=BLUE, linewidth=1.5, label="mean of the policies")
         for name, levels, colour, line in (
-            ("optimal return", curve.limit, LIMIT, "--"),
+            ("optimal return", curve.optimum, OPTIMUM, "--"),
             ("random actions", curve.random, GREY, ":"),
         ):
             if levels is not None:

@@ -13,7 +13,7 @@ from animat.report.style import (
     BLUE,
     GREEN,
     GREY,
-    LIMIT,
+    OPTIMUM,
     ORANGE,
     PURPLE,
     RED,
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
 
 MOST = len(_COLOURS)
-"""Conditions that a panel has colours for."""
+"""Arms that a panel has colours for."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """One condition's returns.
+    """One arm's returns.
 
     Attributes:
-        name: the condition.
+        name: the arm.
         minutes: of the recordings, shape (recordings,).
         returns: mean return of each policy at each, shape (policies, recordings).
     """
@@ -54,27 +54,27 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The conditions of one mapping, which share random actions and the optimal return.
+    """The arms of one mapping, which share random actions and the optimal return.
 
     Attributes:
         title: the mapping.
         courses: with the same minutes, at most `MOST` to be drawn.
         random: of random actions at the same minutes; None where not known.
-        limit: the optimal return on a rough grid at the same minutes; None where not known.
-        fine_limit: minutes and the optimal return on a fine grid at some of them.
-        left_out: conditions that there is no room for.
+        optimum: the optimal return on a rough grid at the same minutes; None where not known.
+        fine_optimum: minutes and the optimal return on a fine grid at some of them.
+        left_out: arms that there is no room for.
     """
 
     title: str
     courses: tuple[Course, ...]
     random: Float64[np.ndarray, " recordings"] | None = None
-    limit: Float64[np.ndarray, " recordings"] | None = None
-    fine_limit: tuple[tuple[float, float], ...] = ()
+    optimum: Float64[np.ndarray, " recordings"] | None = None
+    fine_optimum: tuple[tuple[float, float], ...] = ()
     left_out: int = 0
 
 
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
-    """A panel a mapping: median over policies of each condition with its quartiles, against the recording's minute.
+    """A panel a mapping: median over policies of each arm with its quartiles, against the recording's minute.
 
     Args:
         panels_of: of one robot.
@@ -90,13 +90,13 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
             axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
         minutes = of.courses[0].minutes
-        if of.limit is not None:
+        if of.optimum is not None:
             name = "optimal return, rough grid"
-            axes.plot(minutes, of.limit, color=LIMIT, linestyle="--", linewidth=1.3, label=name)
-        if of.fine_limit:
+            axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=name)
+        if of.fine_optimum:
             name = "optimal return, fine grid"
             axes.plot(
-                *zip(*of.fine_limit, strict=True), color=LIMIT, linestyle="", marker="D", markersize=4, label=name
+                *zip(*of.fine_optimum, strict=True), color=OPTIMUM, linestyle="", marker="D", markersize=4, label=name
             )
         if of.random is not None:
             axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
@@ -111,7 +111,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
                 fontsize=8,
                 color=GREY,
             )
-        more = f" ({of.left_out} more conditions in the tables)" if of.left_out else ""
+        more = f" ({of.left_out} more arms in the tables)" if of.left_out else ""
         style_axes(axes, f"{of.title}{more}", "recording that answers (min)", "return")
     add_common_legend(figure, panels, columns=3)
     return figure

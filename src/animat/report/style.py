@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from animat.errors import InvalidArgument
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,7 @@ WINDOW = ORANGE
 NON_BURST = BLUE
 BURST = RED
 MEDIAN = RED
-LIMIT = BLACK
+OPTIMUM = BLACK
 
 # Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
@@ -100,7 +100,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
         raise InvalidArgument(f"{path}: expected a figure's name to end in .png, .svg or .pdf, got {path.suffix!r}")
     # A date in the file would make the same figure another file each time; PNG holds none.
     metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower())
-    with written_whole(path) as beside, matplotlib.rc_context(_SAVING):
+    with atomic_write(path) as beside, matplotlib.rc_context(_SAVING):
         figure.savefig(beside, format=path.suffix[1:].lower(), dpi=PNG_DPI, metadata=metadata)
     return path
 

@@ -51,7 +51,7 @@ class Inspection:
         name: of the recording, such as its file.
         n_spikes, n_channels, n_stimuli: what the recording holds; stimuli are pulses. Of a table of rates the number of
             spikes is not known, and None.
-        n_presentations: presentations; a response is read after the last pulse of each.
+        n_trials: how many trials; a response is read after the last pulse of each.
         presentation: how stimuli were presented, in words; None where it is not known.
         start_min: start on the culture's clock.
         duration_s: length of the recording; NaN where it is not known.
@@ -73,7 +73,7 @@ class Inspection:
     n_spikes: int | None
     n_channels: int
     n_stimuli: int
-    n_presentations: int
+    n_trials: int
     presentation: str | None
     start_min: float
     duration_s: float
@@ -120,7 +120,7 @@ class Inspection:
             "spikes": self.n_spikes,
             "channels": self.n_channels,
             "stimuli": self.n_stimuli,
-            "presentations": self.n_presentations,
+            "trials": self.n_trials,
             "presentation": self.presentation,
             "start_min": self.start_min,
             "duration_s": self.duration_s,
@@ -197,7 +197,7 @@ def inspect_recording(
         n_spikes=len(recording.spike_times_s),
         n_channels=len(recording.channels),
         n_stimuli=len(recording.stimuli),
-        n_presentations=int(np.count_nonzero(read)),
+        n_trials=int(np.count_nonzero(read)),
         presentation=None if recording.presentation is None else str(recording.presentation),
         start_min=recording.start_min,
         duration_s=recording.duration_s,
@@ -231,7 +231,7 @@ def _of_table(
         n_spikes=int(table.values.sum()) if table.kind == "count" else None,
         n_channels=len(table.channels),
         n_stimuli=len(table.stimuli),
-        n_presentations=int(np.count_nonzero(read)),
+        n_trials=int(np.count_nonzero(read)),
         presentation=None if table.presentation is None else str(table.presentation),
         start_min=table.start_min,
         duration_s=float(np.ptp(times_s)) if table.has_times and len(times_s) else math.nan,
@@ -252,7 +252,7 @@ def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> t
     """
     in_responses = [f for f in responses.findings if f.name != "no-stimuli"]
     names = {finding.name for finding in in_responses}
-    findings = {f.name + f.sentence: f for f in in_responses}
-    findings |= {f.name + f.sentence: f for f in noticed(source) if f.name not in names}
+    findings = {f.name + f.message: f for f in in_responses}
+    findings |= {f.name + f.message: f for f in noticed(source) if f.name not in names}
     gravity = {"refuse": 0, "warning": 1, "note": 2}
     return tuple(sorted(findings.values(), key=lambda finding: gravity[finding.severity]))

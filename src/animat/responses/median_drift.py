@@ -12,7 +12,7 @@ from animat.responses.responses import Responses
 
 NEWEST = 3
 """Recordings that a drift is taken from: it slows down over hours."""
-_REDRAWN = 100
+_BOOTSTRAPS = 100
 
 
 class MedianDrift(NamedTuple):
@@ -55,7 +55,7 @@ def median_drift(series: Sequence[Responses]) -> MedianDrift | None:
     t -= t.mean()
     logs = np.log([each.median_rate_hz for each in newest])
     # By condition, as they were presented.
-    drawn = np.array([[each.redrawn(rng).median_rate_hz for _ in range(_REDRAWN)] for each in newest])
+    drawn = np.array([[each.bootstrapped(rng).median_rate_hz for _ in range(_BOOTSTRAPS)] for each in newest])
     errors = np.std(np.log(np.maximum(drawn, 1e-9)), axis=1)
     spread = float(t @ t)
     return MedianDrift(float(t @ logs) / spread, float(np.sqrt(np.sum((t * errors) ** 2))) / spread)

@@ -20,7 +20,7 @@ from animat.stimulation.protocol import Presentation
 
 @dataclass(frozen=True, eq=False)
 class Presented:
-    """All presentations of a recording, in the order of time: what a culture may remember when it answers.
+    """All trials of a recording, in the order of time: what a culture may remember when it answers.
 
     Attributes:
         condition: index of each, `NO_CONDITION` where it has none, shape (presentations,).
@@ -66,7 +66,7 @@ class Responses:
         findings: what was noticed about them.
         time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
             responses that come from elsewhere.
-        presented: all presentations of the recording, also those without a condition; None: these responses are all,
+        presented: all trials of the recording, also those without a condition; None: these responses are all,
             one soon after the other (see `presentations`).
         place: where among them each response is, shape (responses,).
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None where it is not known.
@@ -147,7 +147,7 @@ class Responses:
 
     @property
     def presentations(self) -> tuple[Presented, Int64[np.ndarray, " responses"]]:
-        """All presentations of the recording in the order of time, and where among them each response is."""
+        """All trials of the recording in the order of time, and where among them each response is."""
         if self.presented is not None and self.place is not None:
             return self.presented, self.place
         every = Presented(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
@@ -190,7 +190,7 @@ class Responses:
         """x of the non-burst responses of one condition, in Hz."""
         return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
 
-    def redrawn(self, rng: np.random.Generator) -> Responses:
+    def bootstrapped(self, rng: np.random.Generator) -> Responses:
         """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
 
         Each keeps what was presented before it. Bursts are left out, and a condition without other responses stays

@@ -64,7 +64,7 @@ def extract_series(
         for finding in (*noticed(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
                 raise UnusableData(
-                    f"the recording at {recording.start_min:g} min: {finding.sentence} (to allow it: "
+                    f"the recording at {recording.start_min:g} min: {finding.message} (to allow it: "
                     f"--allow {finding.name}, or in a study simulators.allow)"
                 )
         series.append(responses)

@@ -95,7 +95,7 @@ class Robot(abc.ABC, Generic[State]):
 
     @property
     @abc.abstractmethod
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         """What the numbers of an observation are, in order."""
 
     @property
@@ -124,7 +124,7 @@ class Robot(abc.ABC, Generic[State]):
 
     @abc.abstractmethod
     def observe(self, state: State) -> Float[Array, " observations"]:
-        """What a controller sees of `state`, in the units of `quantities`, float32, shape (observations,)."""
+        """What a controller sees of `state`, in the units of `observation_spec`, float32, shape (observations,)."""
 
     @final
     def step(

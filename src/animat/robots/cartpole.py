@@ -95,7 +95,7 @@ class Cartpole(Robot[CartpoleState]):
         return cls(pole_mass_kg=0.55, angle_limit_rad=12.0)
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         """Cart position and velocity, pole angle and angular velocity."""
         (x_m, v_m_per_s), (a_rad, w_rad_per_s) = self._bounds()
         return (

@@ -29,14 +29,14 @@ def check_robot(robot: Robot[Any]) -> None:
     import jax.numpy as jnp
 
     name = _named(robot)
-    observations, noise = len(robot.quantities), robot.noise_size
+    observations, noise = len(robot.observation_spec), robot.noise_size
     one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)
 
     def episode(key: Any) -> Any:
         state = _tried(f"{name}.reset", robot.reset, key)
         seen = _tried(f"{name}.observe", robot.observe, state)
-        _expect_shape(f"{name}.observe", seen, (observations,), "one number for each of `quantities`")
+        _expect_shape(f"{name}.observe", seen, (observations,), "one number for each of `observation_spec`")
         told, wanted = [(state, seen, jnp.float32(0.0))], []
         # Commands at both ends and in the middle.
         for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
@@ -86,14 +86,14 @@ def _named(robot: Any) -> str:
             raise InvalidArgument(f"{kind}.{name}: expected a whole number from {least} to {most}, got {shown(value)}")
     if not isinstance(getattr(robot, "name", None), str):
         raise InvalidArgument(f"{kind}.name: expected a text, got {shown(getattr(robot, 'name', None))}")
-    quantities = robot.quantities
-    if not isinstance(quantities, tuple) or not quantities or not all(isinstance(q, Quantity) for q in quantities):
-        raise InvalidArgument(f"{kind}.quantities: expected a tuple of Quantity, got {shown(quantities)}")
-    for quantity in quantities:
+    spec = robot.observation_spec
+    if not isinstance(spec, tuple) or not spec or not all(isinstance(q, Quantity) for q in spec):
+        raise InvalidArgument(f"{kind}.observation_spec: expected a tuple of Quantity, got {shown(spec)}")
+    for quantity in spec:
         if not LEAST_SCALE <= quantity.scale <= LARGEST_SCALE:
             raise InvalidArgument(
-                f"{kind}.quantities: {quantity.name}: expected a scale from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got "
-                f"{quantity.scale:g}; give it in another unit"
+                f"{kind}.observation_spec: {quantity.name}: expected a scale from {LEAST_SCALE:g} to "
+                f"{LARGEST_SCALE:g}, got {quantity.scale:g}; give it in another unit"
             )
     try:
         hash(robot)

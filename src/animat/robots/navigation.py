@@ -109,7 +109,7 @@ class Navigation(Robot[NavigationState]):
         return cls(episode_limit=20)
 
     @property
-    def quantities(self) -> tuple[Quantity, ...]:
+    def observation_spec(self) -> tuple[Quantity, ...]:
         """Position from the top-left corner, and heading."""
         # The scales are one metre and one radian for an arena of a metre; the heading is an angle and jumps at pi.
         return (

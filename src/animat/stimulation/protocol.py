@@ -21,6 +21,8 @@ _MOST_PULSES = 10_000_000
 _LONGEST_S = 86_400
 _LONGEST_RECORDING_S = 7 * 86_400
 _MOST_BYTES = 2**20
+_FORMER = {"presentations": "trials"}
+"""What files of before call attributes of a protocol."""
 
 Count = Annotated[Whole, Field(ge=1, le=1_000_000)]
 Pulses = Annotated[Whole, Field(ge=1, le=_MOST_PULSES)]
@@ -30,15 +32,15 @@ Frequency = Annotated[Number, Field(gt=0, le=10_000)]
 
 @record
 class Presentation:
-    """The order of the stimulus frequencies and the pulses of one presentation; it travels with the data.
+    """The order of the stimulus frequencies and the pulses of one trial; it travels with the data.
 
     A culture has a memory: at 80 Hz it answers otherwise in a block of 80 Hz than between other frequencies. So a
     simulator, and a policy trained on it, holds for the presentation that it was recorded with.
 
     Attributes:
         order: `"blocked"`, all stimuli of a frequency together (the paper), or `"mixed"`, a frequency drawn at random
-            for each presentation (as a closed loop presents them).
-        pulses: pulses 1/f apart in one presentation; the response is read after the last one (the paper: 1).
+            for each trial (as a closed loop presents them).
+        pulses: pulses 1/f apart in one trial; the response is read after the last one (the paper: 1).
 
     Raises:
         InvalidArgument: for another order, or fewer pulses than one.
@@ -48,25 +50,25 @@ class Presentation:
     pulses: Pulses = 1
 
     def __str__(self) -> str:
-        return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} a presentation"
+        return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} a trial"
 
 
 @record
 class Protocol:
     """What is done in one recording; with patterns and a seed it becomes a `Schedule` (`animat.stimulation.schedule`).
 
-    Every pulse comes 1/f after the one before it, f being the frequency of its own presentation, and the response is
-    read after the last pulse of a presentation. The defaults are the paper's: five frequencies as blocks in random
-    order, each of 100 patterns once at each, one pulse a presentation.
+    Every pulse comes 1/f after the one before it, f being the frequency of its own trial, and the response is
+    read after the last pulse of a trial. The defaults are the paper's: five frequencies as blocks in random
+    order, each of 100 patterns once at each, one pulse a trial.
 
     Attributes:
         frequencies_hz: the conditions, each once.
-        order: `"blocked"` or `"mixed"`: the conditions' presentations shuffled together, as a closed loop meets them.
-        pulses: of one presentation, with different patterns where there are enough.
+        order: `"blocked"` or `"mixed"`: the conditions' trials shuffled together, as a closed loop meets them.
+        pulses: of one trial, with different patterns where there are enough.
         patterns: how many of the culture's patterns are used, the first ones; 1 repeats one pattern.
-        presentations: at each frequency; each pattern is read equally often, in random order.
+        trials: at each frequency; each pattern is read equally often, in random order.
         places: groups of electrodes, `"halves"` or `"quadrants"` (`animat.stimulation.places`), in place of patterns:
-            each at each frequency is then a condition of its own, presented so often, all pulses on the whole group.
+            each at each frequency is then a condition of its own, presented as often, all pulses on the whole group.
         setup_s: before each block (mixed: before the one block), the time that setting up takes. Nothing is recorded
             meanwhile, and the recording's clock leaves it out.
         pause_s: recorded without stimuli before each block.
@@ -83,7 +85,7 @@ class Protocol:
     order: Order = "blocked"
     pulses: Pulses = 1
     patterns: Count = 100
-    presentations: Count = 100
+    trials: Count = 100
     places: Annotated[Places, SkipValidation] = ()
     setup_s: Seconds = 14.0
     pause_s: Seconds = 2.0
@@ -94,11 +96,11 @@ class Protocol:
         if len(set(self.frequencies_hz)) < len(self.frequencies_hz):
             raise InvalidArgument(f"frequencies_hz: expected each once, got {self.frequencies_hz}")
         object.__setattr__(self, "places", check_places(self.places))
-        of_each = self.presentations * self.pulses * max(1, self.n_places)
+        of_each = self.trials * self.pulses * max(1, self.n_places)
         pulses = len(self.frequencies_hz) * of_each
         if pulses > _MOST_PULSES:
             raise InvalidArgument(
-                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x places x presentations x "
+                f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x places x trials x "
                 f"pulses), got {pulses:,}"
             )
 
@@ -152,6 +154,8 @@ class Protocol:
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
         if defaults is None and "pulse" not in data:
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
+        if "trials" not in data:
+            data = {_FORMER.get(name, name): value for name, value in data.items()}
         return replace(defaults or PAPER, **data)
 
 
@@ -184,6 +188,6 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 PAPER = Protocol()
 """The paper's recording."""
 
-CLOSED_LOOP = Protocol(order="mixed", presentations=500)
-"""What a closed loop needs: frequencies mixed at random, one pulse a presentation, and so many of each that a simulator
-with memory finds responses with a like past."""
+CLOSED_LOOP = Protocol(order="mixed", trials=500)
+"""What a closed loop needs: frequencies mixed at random, one pulse a trial, and so many of each that a simulator
+with memory finds responses with a similar history."""

@@ -93,7 +93,7 @@ def make_schedule(
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 7])
-    n_frequencies, each = len(protocol.frequencies_hz), protocol.presentations
+    n_frequencies, each = len(protocol.frequencies_hz), protocol.trials
     n_conditions = n_frequencies * max(1, len(places))
     if protocol.order == "blocked":
         orders = [np.full(each, condition) for condition in rng.permutation(n_conditions)]
@@ -118,7 +118,7 @@ def make_schedule(
 
 def _at_places(
     protocol: Protocol,
-    orders: Sequence[Int64[np.ndarray, " presentations"]],
+    orders: Sequence[Int64[np.ndarray, " trials"]],
     patterns: Int64[np.ndarray, "patterns size"],
     places: Sequence[tuple[int, ...]],
 ) -> tuple[Block, ...]:
@@ -184,10 +184,10 @@ def _block(
     )
 
 
-def _balanced(rng: np.random.Generator, patterns: int, presentations: int) -> Int64[np.ndarray, " presentations"]:
+def _balanced(rng: np.random.Generator, patterns: int, trials: int) -> Int64[np.ndarray, " trials"]:
     """Each pattern as often as the others, one round after the other, each round in random order."""
-    rounds = -(-presentations // patterns)
-    return np.concatenate([rng.permutation(patterns) for _ in range(rounds)])[:presentations]
+    rounds = -(-trials // patterns)
+    return np.concatenate([rng.permutation(patterns) for _ in range(rounds)])[:trials]
 
 
 def _train(rng: np.random.Generator, protocol: Protocol, last: int) -> Int64[np.ndarray, " pulses"]:

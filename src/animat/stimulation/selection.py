@@ -18,7 +18,7 @@ from animat.records import Number, Whole, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 _MOST_BYTES = 2**24
 
@@ -149,7 +149,7 @@ class Selection:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
-        with written_whole(path) as beside:
+        with atomic_write(path) as beside:
             beside.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
 
     @staticmethod

@@ -48,7 +48,7 @@ ROBOT: dict[str, tuple[str, str]] = {
     "comparisons": (
         "comparisons",
         "Every point is a policy's mean return. Boxes: quartiles and median. * p < 0.05, ** p < 0.01, *** p < 0.001, "
-        "two-sided Mann-Whitney U, normal approximation, corrected by Holm as in the table. Under each condition: "
+        "two-sided Mann-Whitney U, normal approximation, corrected by Holm as in the table. Under each arm: "
         "(mean − random) / (optimal − random).",
     ),
     "over-time": (

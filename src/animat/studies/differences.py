@@ -1,4 +1,4 @@
-"""Where the study departs from the paper: decisions taken, and comparisons that came out otherwise, with the limit."""
+"""Where the study departs from the paper: decisions taken, and comparisons that came out otherwise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from animat.studies.tabulating import AIM, LEVEL
 _CULTURES = {
     "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
     "to the paper's results. How large its responses are and how they tire differ from the paper's.",
-    "made-up": "Here responses are synthetic: drawn from distributions that were written down, for trials.",
+    "synthetic": "Here responses are synthetic: drawn from distributions that were written down, for trials.",
     "files": "Here recordings at hand are used.",
 }
 
@@ -34,14 +34,14 @@ def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
 
 
 def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
-    if any(condition.mapping == "9-thresholds" for condition in study.conditions):
+    if any(arm.mapping == "9-thresholds" for arm in study.arms):
         yield (
             "Nine levels without zero",
             "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
             "eleven. Zero is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
         )
-    for body in study.robots:
-        yield from body.robot().departures()
+    for spec in study.robots:
+        yield from spec.robot().departures()
 
 
 def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
@@ -74,12 +74,12 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
             "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into "
             "the last bin, and is reported.",
         )
-    held = any(condition.percentiles == "first" for condition in study.conditions)
+    fixed = any(arm.percentiles == "first" for arm in study.arms)
     yield (
         "Percentiles",
         "The paper does not say which recording the thresholds are taken from. Here they come from the recording whose "
         "simulator is in use, so "
-        + ("they move, except in the conditions that hold the first recording's." if held else "they move with it."),
+        + ("they move, except in the arms with those of the first recording." if fixed else "they move with it."),
     )
 
 
@@ -102,7 +102,7 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
             "Drawn actions",
             "The paper does not say whether policies draw their actions when they are evaluated. Here they do.",
         )
-    if any(not condition.trained for condition in study.conditions):
+    if any(not arm.trained for arm in study.arms):
         yield (
             "Before training",
             "The policies before training are networks as training starts from them, drawn at random: all actions are "
@@ -118,7 +118,7 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
 def came_out_otherwise(
     rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
 ) -> tuple[tuple[str, str], ...]:
-    """For each comparison that differs from the paper or cannot tell: what came out, and what its limit says to it.
+    """For each comparison that differs from the paper or cannot tell: what came out, and what its optimum says to it.
 
     Args:
         rows: of the table of comparisons.
@@ -136,51 +136,51 @@ def came_out_otherwise(
         loss = (lost or {}).get(row.at_min, 0.0)
         if loss > LARGEST_LOSS:
             words += (
-                f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and limit are those of the "
-                "simulator, and not all that the culture would allow."
+                f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and optimum are those of "
+                "the simulator, and not all that the culture would allow."
             )
         told.append((f"{row.comparison}, {row.robot}", words))
     return tuple(told)
 
 
 def explain(row: ComparedReturns) -> str:
-    """What the limits say to a comparison's outcome."""
+    """What the optima say to a comparison's outcome."""
     n = row.n
     smallest = p_of_u(0.0, n, n)
     if smallest >= LEVEL:
         return f"With {n} policies a side p cannot fall below {smallest:.2g}, however they differ: take more policies."
-    first, second, random = row.limit_first, row.limit_second, row.random_second
+    first, second, random = row.optimum_first, row.optimum_second, row.random_second
     if second is None or random is None:
-        return "There is no limit to compare with."
-    error_second = row.limit_error_second or 0.0
+        return "There is no optimum to compare with."
+    error_second = row.optimum_error_second or 0.0
     if second - random <= error_second:
         return (
             f"The optimal return for {row.second}, {second:.1f}, is not above that of random actions: "
             "there is nothing to learn."
         )
-    limits = f"The optimal return is {second:.1f} for {row.second}"
+    optima = f"The optimal return is {second:.1f} for {row.second}"
     if first is None:
-        # A control has no limit of its own: whatever it chooses, another condition is delivered.
-        limits += f"; {row.first} cannot do better than random actions, {random:.1f}"
+        # A control has no optimum of its own: whatever it chooses, another condition is delivered.
+        optima += f"; {row.first} cannot do better than random actions, {random:.1f}"
     else:
-        limits = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
-        error = (row.limit_error_first or 0.0) + error_second
+        optima = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
+        error = (row.optimum_error_first or 0.0) + error_second
         if first - second > error:
-            return f"{limits}: with these responses the order of the limits is itself the other way round."
+            return f"{optima}: with these responses the order of the optima is itself the other way round."
         if abs(first - second) <= error:
-            limits += ", which is the same within their errors"
-    # How much more than the first condition the second could have, as a part of all there is to learn.
+            optima += ", which is the same within their errors"
+    # How much more than the first arm the second could have, as a part of all there is to learn.
     room = (second - row.mean_first) / (second - random)
     if room <= 1 - AIM:
         return (
-            f"{limits}, and {row.first} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
+            f"{optima}, and {row.first} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
             "actions and that: no room is left."
         )
     score = row.score_second
     if score is not None and score >= AIM:
-        return f"{limits}; {row.second} is at its limit (score {score:.2f}), so more cannot be had from it."
+        return f"{optima}; {row.second} is at its optimum (score {score:.2f}), so more cannot be had from it."
     scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row.score_first, score))
     return (
-        f"{limits}, random {random:.1f}; scores are {scores}. The limit leaves room, {second - row.mean_first:.1f} "
+        f"{optima}, random {random:.1f}; scores are {scores}. The optimum leaves room, {second - row.mean_first:.1f} "
         f"above {row.first}, so it does not explain this."
     )

@@ -6,5 +6,5 @@ import hashlib
 
 
 def draw_seed(*names: object) -> int:
-    """A seed from the names of what is drawn, so that no two conditions share their luck."""
+    """A seed from the names of what is drawn, so that no two arms share their luck."""
     return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1

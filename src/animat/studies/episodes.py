@@ -19,7 +19,7 @@ COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "
 """Of the table:
 
 - robot: its name in the study.
-- arm: what it was run in: a condition's name, or of controls what they act through (`named_mapping`).
+- arm: what it was run in: an arm's name, or of controls what they act through (`named_mapping`).
 - agent: `POLICY`, or the control's name.
 - actor: which of several, from 0: of policies p0, p1, ...
 - at_min: the recording that answers.
@@ -30,6 +30,10 @@ COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "
 """
 POLICY = "policy"
 RANDOM = "random"
+FORMER_AGENTS = {"made by hand": "heuristic"}
+"""What files of before call agents."""
+FORMER_MAPPING = ", percentiles held", ", percentiles fixed"
+"""How files of before name mappings, and how they are named now."""
 
 
 def tabulated(
@@ -69,7 +73,10 @@ def read_episodes(paths: Iterable[Path]) -> DataFrame:
     """The table, put together from its files; raises InvalidFile if one cannot be read."""
     import pandas as pd
 
-    return pd.concat([pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths], ignore_index=True)
+    parts = [pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths]
+    table = pd.concat(parts, ignore_index=True).replace({"agent": FORMER_AGENTS})
+    table["arm"] = table["arm"].str.replace(*FORMER_MAPPING, regex=False)
+    return table
 
 
 def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.ndarray, " actors"]:

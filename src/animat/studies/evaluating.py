@@ -1,4 +1,4 @@
-"""Evaluation as jobs: a condition's policies on one robot, and the controls that ask whether the culture does it."""
+"""Evaluation as jobs: an arm's policies on one robot, and the controls that ask whether the culture does it."""
 
 from __future__ import annotations
 
@@ -17,83 +17,87 @@ from animat.studies.episodes import RANDOM, tabulated, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Study, StudyCondition, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
 from animat.training.policy import Policy
+
+_DRAWN_BY = {"heuristic": "made by hand"}
+"""Names that random numbers are drawn by where controls have been renamed since: a seed's numbers stay as they are."""
 
 
 @final
 @dataclass(frozen=True)
 class Evaluate(StudyTask):
-    """Run a condition's policies at the minutes of its comparisons, at every recording, and once for their paths."""
+    """Run an arm's policies at the minutes of its comparisons, at every recording, and once for their paths."""
 
     sizes = ("policies", "episodes", "episodes_over_time")
 
-    body: Body
-    condition: StudyCondition
+    spec: RobotSpec
+    arm: Arm
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
-        setting = setting_of(study, self.body, self.condition, timeline)
-        networks = _networks(study, folder, self.body, self.condition)
-        robot, slug, n = self.body.name, self.condition.slug, study.policies
+        setting = setting_of(study, self.spec, self.arm, timeline)
+        networks = _networks(study, folder, self.spec, self.arm)
+        robot, slug, n = self.spec.name, self.arm.slug, study.policies
         first, last = first_minute(timeline), last_minute(timeline)
         parts = []
-        for at_min, episodes in study.minutes_of(self.condition, first, last).items():
+        for at_min, episodes in study.minutes_of(self.arm, first, last).items():
             ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
-            parts.append(tabulated(ran, robot=robot, arm=self.condition.name, at_min=at_min))
-        if self.condition.through_neurons and timeline is not None:
+            parts.append(tabulated(ran, robot=robot, arm=self.arm.name, at_min=at_min))
+        if self.arm.through_neurons and timeline is not None:
             for i, at_min in enumerate(timeline.start_min.tolist()):
                 progress.update(i, len(timeline), "over time")
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
                 ran = setting.run(networks, n, at_min, study.episodes_over_time, seed)
-                parts.append(tabulated(ran, robot=robot, arm=self.condition.name, at_min=at_min, over_time=True))
+                parts.append(tabulated(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
         seed = draw_seed(study.seed, robot, slug, last, "paths")
         paths = record_paths(setting.environment, setting.simulator(last), networks, n, seed)
         return [
-            write_episodes(episodes_file(folder, self.body, self.condition), parts),
-            paths.save(paths_file(folder, self.body, self.condition)),
+            write_episodes(episodes_file(folder, self.spec, self.arm), parts),
+            paths.save(paths_file(folder, self.spec, self.arm)),
         ]
 
 
 @final
 @dataclass(frozen=True)
 class Control(StudyTask):
-    """Run the controls of a mapping on a robot: random, constant, made by hand; and silent and shuffled with policies.
+    """Run the controls of a mapping on a robot: random, constant, heuristic; and silent and shuffled with policies.
 
     Attributes:
-        plain: condition that gives the mapping; the one whose policies are used, if it is trained as usual.
+        plain: arm that gives the mapping; the one whose policies are used, if it is trained as usual.
     """
 
     sizes = ("policies", "episodes", "episodes_over_time")
 
-    body: Body
-    plain: StudyCondition
+    spec: RobotSpec
+    plain: Arm
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
-        condition, robot = replace(self.plain, delivery="chosen"), self.body.name
-        setting = setting_of(study, self.body, condition, timeline)
-        name = f"controls-{condition.thresholds}"
-        arm = named_mapping(condition.mapping, condition.percentiles)
-        networks = _networks(study, folder, self.body, self.plain) if is_usual(self.plain) else None
+        arm, robot = replace(self.plain, delivery="chosen"), self.spec.name
+        setting = setting_of(study, self.spec, arm, timeline)
+        name = f"controls-{arm.thresholds}"
+        through = named_mapping(arm.mapping, arm.percentiles)
+        networks = _networks(study, folder, self.spec, self.plain) if is_usual(self.plain) else None
         parts = []
         first, last = first_minute(timeline), last_minute(timeline)
-        minutes = study.limit_minutes(first, last) if condition.through_neurons else [last]
+        minutes = study.optimum_minutes(first, last) if arm.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
             answering = setting.simulator(at_min)
             for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
-                seed, n = draw_seed(study.seed, robot, name, at_min, each.name), each.n_actors
+                drawn_by = _DRAWN_BY.get(each.name, each.name)
+                seed, n = draw_seed(study.seed, robot, name, at_min, drawn_by), each.n_actors
                 ran = roll_out(each.environment, each.simulator, each.actor, n, episodes=study.episodes, seed=seed)
-                parts.append(tabulated(ran, robot=robot, arm=arm, at_min=at_min, agent=each.name))
-        if timeline is not None and condition.through_neurons:
+                parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
+        if timeline is not None and arm.through_neurons:
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
                 ran = setting.run(Uniform(), 1, at_min, study.episodes, seed)
-                parts.append(tabulated(ran, robot=robot, arm=arm, at_min=at_min, agent=RANDOM, over_time=True))
-        return [write_episodes(controls_file(folder, self.body, condition), parts)]
+                parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
+        return [write_episodes(controls_file(folder, self.spec, arm), parts)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +122,13 @@ class Setting:
         return roll_out(self.environment, self.simulator(at_min), actor, n, episodes=episodes, seed=seed)
 
 
-def setting_of(study: Study, body: Body, condition: StudyCondition, timeline: SimulatorTimeline | None) -> Setting:
-    """What a condition's policies are evaluated in."""
-    training = training_of(study, body, condition)
-    if not condition.through_neurons or timeline is None:
+def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimeline | None) -> Setting:
+    """What an arm's policies are evaluated in."""
+    training = training_of(study, spec, arm)
+    if not arm.through_neurons or timeline is None:
         labels = tuple(f"{command:+g}" for command in training.commands or ())
         return Setting(training.environment(0), None, labels)
-    if condition.percentiles == "first":
+    if arm.percentiles == "first":
         timeline = timeline.with_first_percentiles()
     labels = tuple(each.label for each in timeline.conditions)
     return Setting(training.environment(len(timeline.conditions)), timeline, labels)
@@ -136,9 +140,9 @@ def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | 
     return study.at_recordings([] if timeline is None else timeline.start_min.tolist()), timeline
 
 
-def is_usual(condition: StudyCondition) -> bool:
+def is_usual(arm: Arm) -> bool:
     """Whether its policies are trained, and get what they choose."""
-    return condition.trained and condition.delivery == "chosen" and condition.through_neurons
+    return arm.trained and arm.delivery == "chosen" and arm.through_neurons
 
 
 def first_minute(timeline: SimulatorTimeline | None) -> float:
@@ -151,7 +155,7 @@ def last_minute(timeline: SimulatorTimeline | None) -> float:
     return 0.0 if timeline is None else float(timeline.start_min[-1])
 
 
-def _networks(study: Study, folder: Path, body: Body, condition: StudyCondition) -> Networks:
-    out = policies_folder(folder, body, condition)
+def _networks(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Networks:
+    out = policies_folder(folder, spec, arm)
     policies = [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
     return networks_of(policies, greedy=study.actions == "most probable")

@@ -88,43 +88,43 @@ def write_array(folder: Path, recording: Recording) -> Path:
 
 
 def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) -> Path:
-    """Learning curves as means over policies with their 95 % intervals, random actions and the limit beside."""
-    head = ("condition", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "limit")
+    """Learning curves as means over policies with their 95 % intervals, random actions and the optimum beside."""
+    head = ("arm", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "optimum")
     rows: list[tuple[Any, ...]] = []
     for curve in curves:
         ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
         interval = (column.tolist() for column in mean_with_interval(curve.returns))
-        beside = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.limit))
+        beside = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.optimum))
         iterations = (int(done) for done in curve.iterations)
         rows += [(curve.name, *told) for told in zip(iterations, ended, *interval, *beside, strict=True)]
     return _write(folder, f"{robot}-learning", head, rows)
 
 
 def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
-    """Quartiles over policies of every condition at every recording, random actions and the limits beside."""
-    head = ("mapping", "condition", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
+    """Quartiles over policies of every arm at every recording, random actions and the optima beside."""
+    head = ("mapping", "arm", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
     rows = []
     for panel in panels:
-        fine = dict(panel.fine_limit)
+        fine = dict(panel.fine_optimum)
         for course in panel.courses:
             for i, at_min in enumerate(course.minutes.tolist()):
-                beside = (None if each is None else float(each[i]) for each in (panel.random, panel.limit))
+                beside = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
                 quartiles = course.quartiles[:, i].tolist()
                 rows.append(
                     (panel.title, course.name, at_min, len(course.returns), *quartiles, *beside, fine.get(at_min))
                 )
-    return _write(folder, f"{robot}-over-time", (*head, "limit_rough_grid", "limit_fine_grid"), rows)
+    return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
 
 
-def write_paths(folder: Path, robot: str, quantities: Sequence[str], paths: Mapping[str, Paths]) -> Path:
-    """One episode of each policy of every condition: what is observed, and the command that led there."""
+def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[str, Paths]) -> Path:
+    """One episode of each policy of every arm: what is observed, and the command that led there."""
     rows = (
-        (condition, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
-        for condition, of in paths.items()
+        (arm, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
+        for arm, of in paths.items()
         for actor, (observations, commands) in enumerate(of.whole())
         for i, observed in enumerate(observations)
     )
-    return _write(folder, f"{robot}-paths", ("condition", "policy", "iteration", *quantities, "command"), rows)
+    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, "command"), rows)
 
 
 def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:

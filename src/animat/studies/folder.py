@@ -17,7 +17,7 @@ from animat.recordings.formats.csv import stimuli_beside
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
-from animat.writing import LOCK, alone_in, clear_away, is_unfinished, written_whole
+from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
@@ -107,13 +107,13 @@ def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the study, got a file")
     _is_ours(folder, manifest)
-    with alone_in(folder):
+    with exclusive_lock(folder):
         if not _is_ours(folder, manifest):
             for path, words in (
                 (folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True) + "\n"),
                 (folder / SPECIFICATION, _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)),
             ):
-                with written_whole(path) as beside:
+                with atomic_write(path) as beside:
                     beside.write_text(words)
         for leftover in [*folder.iterdir(), *(path for name in OWN_FOLDERS for path in (folder / name).rglob("*"))]:
             if is_unfinished(leftover):

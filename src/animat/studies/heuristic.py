@@ -9,28 +9,28 @@ from animat.evaluation.verdict import beside
 from animat.studies.episodes import POLICY
 from animat.studies.evaluating import is_usual
 from animat.studies.results import BesideHeuristic, Results
-from animat.studies.specification import Body, Study, named_mapping
+from animat.studies.specification import RobotSpec, Study, named_mapping
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-HEURISTIC = "made by hand"
+HEURISTIC = "heuristic"
 OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few episodes to tell"
 
 
-def beside_heuristic(study: Study, table: DataFrame, body: Body) -> Iterator[BesideHeuristic]:
-    """Each condition that is trained as usual, at each minute at which the rule was run too.
+def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[BesideHeuristic]:
+    """Each arm that is trained as usual, at each minute at which the rule was run too.
 
     Args:
         table: of episodes.
     """
-    at = table[(table["robot"] == body.name) & ~table["over_time"]]
-    for condition in study.conditions:
-        if not is_usual(condition):
+    at = table[(table["robot"] == spec.name) & ~table["over_time"]]
+    for arm in study.arms:
+        if not is_usual(arm):
             continue
-        arm = named_mapping(condition.mapping, condition.percentiles)
-        heuristic = at[(at["arm"] == arm) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
-        policies = at[(at["arm"] == condition.name) & (at["agent"] == POLICY)].groupby("at_min")["return"]
+        through = named_mapping(arm.mapping, arm.percentiles)
+        heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
+        policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")["return"]
         rule = {at_min: returns.to_numpy() for at_min, returns in heuristic}
         for at_min, returns in policies:
             if at_min in rule:
@@ -38,13 +38,13 @@ def beside_heuristic(study: Study, table: DataFrame, body: Body) -> Iterator[Bes
                 found = beside(ours, theirs)
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.can_tell else TOO_FEW
                 means = float(ours.mean()), float(theirs.mean())
-                yield BesideHeuristic(body.name, condition.name, at_min, *means, found.p, found.wins, outcome)
+                yield BesideHeuristic(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
 
 
 def not_outperforming(results: Results) -> list[str]:
     """A sentence for each row whose policies do not outperform the rule."""
     return [
-        f"{row.robot}, {row.condition}, at {row.at_min:g} min: the policies do not outperform the heuristic policy "
+        f"{row.robot}, {row.arm}, at {row.at_min:g} min: the policies do not outperform the heuristic policy "
         f"({row.mean_return:.1f} against {row.heuristic:.1f}; p = {row.p:.2g})"
         for row in results.heuristic
         if row.outcome == NOT

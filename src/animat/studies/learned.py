@@ -1,4 +1,4 @@
-"""Learning as good as the limit allows: how conditions that are trained on one recording do on that very one."""
+"""Learning as good as the optimum allows: how arms that are trained on one recording do on that very one."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from collections.abc import Sequence
 
 from animat.report.html import Table, with_error
 from animat.studies.results import Score
-from animat.studies.specification import Body, Study
+from animat.studies.specification import RobotSpec, Study
 from animat.studies.tabulating import AIM
 
 
 def learned_of(study: Study, scores: Sequence[Score]) -> list[Score]:
-    """Of the table of scores, the rows of conditions on the one recording that they were trained on, the first."""
-    learned = {condition.name for condition in study.conditions if condition.learns_one_recording}
+    """Of the table of scores, the rows of arms on the one recording that they were trained on, the first."""
+    learned = {arm.name for arm in study.arms if arm.learns_one_recording}
     first: dict[tuple[str, str], Score] = {}
     for row in scores:
-        if row.condition in learned:
-            known = first.setdefault((row.robot, row.condition), row)
+        if row.arm in learned:
+            known = first.setdefault((row.robot, row.arm), row)
             if row.at_min < known.at_min:
-                first[row.robot, row.condition] = row
+                first[row.robot, row.arm] = row
     return list(first.values())
 
 
-def as_good_as_the_limit_allows(study: Study, rows: Sequence[Score]) -> Table:
+def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
     """Scores beside `AIM`, with what is known of the difference."""
-    bodies = {body.name: body for body in study.robots}
+    bodies = {spec.name: spec for spec in study.robots}
     head = (
         "robot",
-        "condition",
+        "arm",
         "mapping",
         "at (min)",
         "mean ± s.e.",
         "random",
-        "limit",
+        "optimum",
         "run",
         "without clock",
         "score",
@@ -48,47 +48,47 @@ def as_good_as_the_limit_allows(study: Study, rows: Sequence[Score]) -> Table:
         cells.append(
             (
                 row.robot,
-                row.condition,
+                row.arm,
                 row.mapping,
                 row.at_min,
                 with_error(row.mean_return, error),
                 row.random,
-                row.limit,
-                row.limit_run,
-                row.limit_without_clock,
+                row.optimum,
+                row.optimum_run,
+                row.optimum_without_clock,
                 row.normalised_score,
                 row.score_without_clock,
                 known_of(row, bodies[row.robot]),
             )
         )
     return Table(
-        f"As good as the limit allows: scores on the simulator trained on, beside {AIM:g}",
+        f"As good as the optimum: scores on the simulator trained on, beside {AIM:g}",
         head,
         tuple(cells),
-        note="Run: the return that the limit's controller was seen to get. Without clock: what the same controller "
-        "gets if it does not know the time left, as policies do not; a better one may exist, not above the limit. Of "
-        "without clock: the score with this in place of the limit.",
+        note="Run: the return that the optimum's controller was seen to get. Without clock: what the same controller "
+        "gets if it does not know the time left, as policies do not; a better one may exist, not above the optimum. Of "
+        "without clock: the score with this in place of the optimum.",
         beside="tables/scores.csv",
         marked=tuple(i for i, row in enumerate(rows) if (row.normalised_score or 0.0) < AIM),
     )
 
 
-def known_of(row: Score, body: Body) -> str:
-    """What is known of a score: that it is reached, or what stands between it and the limit."""
+def known_of(row: Score, spec: RobotSpec) -> str:
+    """What is known of a score: that it is reached, or what stands between it and the optimum."""
     score, without_clock = row.normalised_score, row.score_without_clock
-    if row.limit is None:
-        return "no limit: conditions with few responses are left out of it"
+    if row.optimum is None:
+        return "no optimum: conditions with few responses are left out of it"
     if score is None:
-        return "nothing to learn: the limit is not above random actions"
+        return "nothing to learn: the optimum is not above random actions"
     if score >= AIM:
         return "reached"
-    run, random = row.limit_run, row.random
+    run, random = row.optimum_run, row.random
     if run is not None and random is not None and (row.mean_return - random) >= AIM * (run - random):
-        return f"short of the limit, not of what its controller was seen to get ({run:.1f})"
+        return f"short of the optimum, not of what its controller was seen to get ({run:.1f})"
     if without_clock is not None and without_clock >= AIM:
         return "short by the clock: reached against the same controller without knowing the time left"
     known = f"short by {AIM - score:.2f}, which neither the clock nor the grid explains"
-    usual = body.robot().paper_iterations
-    if body.trained_for < usual:
-        known += f"; trained for {body.trained_for:,} iterations, not {usual:,}"
+    usual = spec.robot().paper_iterations
+    if spec.trained_for < usual:
+        known += f"; trained for {spec.trained_for:,} iterations, not {usual:,}"
     return known

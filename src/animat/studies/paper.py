@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from animat.studies.source import Source
-from animat.studies.specification import Body, Compared, Study, StudyCondition
+from animat.studies.specification import Arm, Compared, RobotSpec, Study
 
 
 @dataclass(frozen=True)
 class Printed:
-    """A comparison as the paper gives it: p, and the U that this p implies. The second condition was the better."""
+    """A comparison as the paper gives it: p, and the U that this p implies. The second arm was the better."""
 
     p: float
     u: float
@@ -28,14 +28,14 @@ PRINTED: dict[tuple[str, str], Printed] = {
 }
 """By the comparison's and the robot's name. Source: Sawada et al. 2022, its table of comparisons."""
 
-CONDITIONS = (
-    StudyCondition("before training", trained=False),
-    StudyCondition("1 threshold"),
-    StudyCondition("9 thresholds", mapping="9-thresholds"),
-    StudyCondition("control", delivery="shuffled"),
-    StudyCondition("without shadowing", shadowing=False),
-    StudyCondition("linear", mapping="linear"),
-    StudyCondition("without neurons", mapping="none"),
+ARMS = (
+    Arm("before training", trained=False),
+    Arm("1 threshold"),
+    Arm("9 thresholds", mapping="9-thresholds"),
+    Arm("control", delivery="shuffled"),
+    Arm("without shadowing", shadowing=False),
+    Arm("linear", mapping="linear"),
+    Arm("without neurons", mapping="none"),
 )
 
 COMPARISONS = (
@@ -59,8 +59,8 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
             title="The paper's study on a virtual culture",
             culture=Source(seed=culture_seed),
             # On navigation's grid 0.6 of the steps leave an error of a hundredth.
-            robots=(Body("cartpole"), Body("navigation", limit_resolution=0.6)),
-            conditions=CONDITIONS,
+            robots=(RobotSpec("cartpole"), RobotSpec("navigation", optimum_resolution=0.6)),
+            arms=ARMS,
             comparisons=COMPARISONS,
             seed=seed,
             paper=True,
@@ -68,12 +68,12 @@ def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) ->
     return Study(
         title="The paper's study on a virtual culture, in short",
         culture=Source(seed=culture_seed, sessions=8, interval_min=20.0),
-        robots=(Body("cartpole", iterations=60_000), Body("navigation", iterations=60_000)),
-        conditions=CONDITIONS,
+        robots=(RobotSpec("cartpole", iterations=60_000), RobotSpec("navigation", iterations=60_000)),
+        arms=ARMS,
         comparisons=COMPARISONS,
         policies=4,
         seed=seed,
-        limit_resolution=0.5,
-        limit_episodes=1000,
+        optimum_resolution=0.5,
+        optimum_episodes=1000,
         paper=True,
     )

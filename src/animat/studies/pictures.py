@@ -41,12 +41,12 @@ from animat.studies.figure_tables import (
     write_paths,
     write_psth,
 )
-from animat.studies.limits import kinds_of, limits_of_all
+from animat.studies.optima import kinds_of, optima_of_all
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
 from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
 from animat.studies.simulating import read_series
-from animat.studies.specification import Body, Study, StudyCondition, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import TRAINED, References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 
@@ -99,18 +99,18 @@ class RobotPictures(StudyTask):
     The numbers of what no other table holds are written beside: learning with its intervals, and the course.
     """
 
-    body: Body
+    spec: RobotSpec
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        robot, name = self.body.robot(), self.body.name
+        robot, name = self.spec.robot(), self.spec.name
         study, timeline = as_recorded(self.study, folder)
-        table = all_episodes(study, folder, [self.body])
-        known = References(study, folder, self.body, table)
+        table = all_episodes(study, folder, [self.spec])
+        known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
-        rough = _over_time(study, folder, self.body, table)
+        rough = _over_time(study, folder, self.spec, table)
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
-        curves = _curves(study, folder, self.body, known, rough, timeline)
+        curves = _curves(study, folder, self.spec, known, rough, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(write_learning(folder, name, curves))
@@ -127,16 +127,16 @@ class RobotPictures(StudyTask):
         figures["controls"] = draw_controls(
             _controls(study, [row for row in results.controls if row.robot == name]), f"{name}: controls"
         )
-        recorded = {each.name: Paths.load(paths_file(folder, self.body, each)) for each in study.conditions}
-        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.quantities], recorded))
-        paths = {condition: of.whole() for condition, of in recorded.items()}
+        recorded = {each.name: Paths.load(paths_file(folder, self.spec, each)) for each in study.arms}
+        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
+        paths = {arm: of.whole() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
             only_paths = {c: [path for path, _ in each] for c, each in paths.items()}
             figures["paths"] = draw_paths(robot, only_paths, f"{name}: one episode of each policy")
         if "draw" not in lacks:
             middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
-            figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each condition")
+            figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each arm")
         return tables + _save(folder, name, figures, progress)
 
 
@@ -149,48 +149,46 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
 
 
 Rough: TypeAlias = dict[tuple[str, str, float], tuple[float, float | None]]
-"""By mapping, percentiles and minute: the mean return of random actions, and the limit on a rough grid if known."""
+"""By mapping, percentiles and minute: the mean return of random actions, and the optimum on a rough grid if known."""
 
 
 def _curves(
-    study: Study, folder: Path, body: Body, known: References, rough: Rough, timeline: SimulatorTimeline | None
+    study: Study, folder: Path, spec: RobotSpec, known: References, rough: Rough, timeline: SimulatorTimeline | None
 ) -> list[LearningCurve]:
     curves = []
-    for condition in study.conditions:
-        if not condition.trained:
+    for arm in study.arms:
+        if not arm.trained:
             continue
-        told = learning_of(study, folder, body, condition)
-        random, limit = [], []
-        for at_min in _minutes_in_training(study, condition, timeline, told.shape[1]):
-            best = known.limit(condition, at_min)
-            near = rough.get((condition.mapping, condition.percentiles, at_min), (None, None))
-            random.append(near[0] if condition.through_neurons else known.random(condition, at_min))
-            fallback = near[1] if condition.delivery == "chosen" else None
-            limit.append(fallback if best is None else best.best_return)
-        beside = np.array(random, np.float64), np.array(limit, np.float64)
-        curves.append(LearningCurve(condition.name, told[0, :, 0], told[:, :, 2], *beside))
+        told = learning_of(study, folder, spec, arm)
+        random, optimum = [], []
+        for at_min in _minutes_in_training(study, arm, timeline, told.shape[1]):
+            best = known.optimum(arm, at_min)
+            near = rough.get((arm.mapping, arm.percentiles, at_min), (None, None))
+            random.append(near[0] if arm.through_neurons else known.random(arm, at_min))
+            fallback = near[1] if arm.delivery == "chosen" else None
+            optimum.append(fallback if best is None else best.best_return)
+        beside = np.array(random, np.float64), np.array(optimum, np.float64)
+        curves.append(LearningCurve(arm.name, told[0, :, 0], told[:, :, 2], *beside))
     return curves
 
 
-def _minutes_in_training(
-    study: Study, condition: StudyCondition, timeline: SimulatorTimeline | None, parts: int
-) -> list[float]:
+def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, parts: int) -> list[float]:
     """The recording that answers in each part of a training."""
-    if timeline is None or not condition.through_neurons:
+    if timeline is None or not arm.through_neurons:
         return [last_minute(timeline)] * parts
     start = first_minute(timeline)
-    share = 1 / parts if condition.shadowing else 0.0
+    share = 1 / parts if arm.shadowing else 0.0
     rows = [timeline.row_at(start + study.training_min * share * part) for part in range(parts)]
     return [float(timeline.start_min[row]) for row in rows]
 
 
-def _over_time(study: Study, folder: Path, body: Body, table: DataFrame) -> Rough:
-    """Random actions and the limit on a rough grid (None where it was not computed) at every recording."""
+def _over_time(study: Study, folder: Path, spec: RobotSpec, table: DataFrame) -> Rough:
+    """Random actions and the optimum on a rough grid (None where it was not computed) at every recording."""
     if not study.needs_neurons:
         return {}
-    limits = {
-        (limit.mapping, limit.percentiles, limit.at_min): limit.best_return
-        for limit in limits_of_all(folder, body.name, "over-time")
+    optima = {
+        (optimum.mapping, optimum.percentiles, optimum.at_min): optimum.best_return
+        for optimum in optima_of_all(folder, spec.name, "over-time")
     }
     found: Rough = {}
     random = table[(table["agent"] == RANDOM) & table["over_time"]]
@@ -198,7 +196,7 @@ def _over_time(study: Study, folder: Path, body: Body, table: DataFrame) -> Roug
         of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
         for at_min, returns in of_kind.groupby("at_min")["return"]:
             key = (kind.mapping, kind.percentiles, at_min)
-            found[key] = (float(returns.to_numpy().mean()), limits.get(key))
+            found[key] = (float(returns.to_numpy().mean()), optima.get(key))
     return found
 
 
@@ -207,14 +205,14 @@ def _pairs(study: Study, rows: list[ComparedReturns], table: DataFrame, known: R
     for row in rows:
         groups = []
         for name, score in ((row.first, row.score_first), (row.second, row.score_second)):
-            condition = study.condition(name)
-            limit = known.limit(condition, row.at_min)
+            arm = study.arm(name)
+            optimum = known.optimum(arm, row.at_min)
             groups.append(
                 Group(
                     name,
-                    performances(table, row.robot, condition, row.at_min, row.episodes),
-                    known.random(condition, row.at_min),
-                    None if limit is None else limit.best_return,
+                    performances(table, row.robot, arm, row.at_min, row.episodes),
+                    known.random(arm, row.at_min),
+                    None if optimum is None else optimum.best_return,
                     score,
                 )
             )
@@ -231,21 +229,23 @@ def _courses(
     panels = []
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
         courses = []
-        for condition in study.conditions:
-            if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles):
-                of_minute = over_time[over_time["arm"] == condition.name].groupby("at_min")
+        for arm in study.arms:
+            if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles):
+                of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
                 returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
-                courses.append(Course(condition.name, np.array(every_min), returns))
+                courses.append(Course(arm.name, np.array(every_min), returns))
         at = [rough[kind.mapping, kind.percentiles, at_min] for at_min in every_min]
-        limits = ((at_min, known.limit(kind, at_min)) for at_min in every_min)
+        optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
                 named_mapping(kind.mapping, kind.percentiles),
                 tuple(courses),
                 np.array([random for random, _ in at]),
-                None if at[0][1] is None else np.array([limit for _, limit in at], np.float64),
+                None if at[0][1] is None else np.array([optimum for _, optimum in at], np.float64),
                 tuple(
-                    (at_min, limit.best_return) for at_min, limit in limits if limit and limit.best_return is not None
+                    (at_min, optimum.best_return)
+                    for at_min, optimum in optima
+                    if optimum and optimum.best_return is not None
                 ),
             )
         )
@@ -253,7 +253,7 @@ def _courses(
 
 
 def _controls(study: Study, rows: list[ControlReturns]) -> list[Controls]:
-    trained = {f"{TRAINED}{condition.name}" for condition in study.conditions}
+    trained = {f"{TRAINED}{arm.name}" for arm in study.arms}
     of_panel: dict[tuple[str, str, float], list[ControlReturns]] = defaultdict(list)
     for row in rows:
         of_panel[row.mapping, row.percentiles, row.at_min].append(row)
@@ -266,7 +266,7 @@ def _controls(study: Study, rows: list[ControlReturns]) -> list[Controls]:
                 tuple((row.control, row.mean_return, row.standard_error) for row in same),
                 sum(row.control in trained for row in same),
                 same[0].random,
-                same[0].limit,
+                same[0].optimum,
             )
         )
     return panels

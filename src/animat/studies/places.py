@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from animat.execution.task import UNFINISHED
-from animat.studies.specification import Body, StudyCondition
+from animat.studies.specification import Arm, RobotSpec
 
 RECORDINGS = "recordings"
 TIMELINE = "simulators/timeline.safetensors"
@@ -18,7 +18,7 @@ OWN_FOLDERS = (
     "policies",
     "episodes",
     "controls",
-    "limits",
+    "optima",
     "tables",
     "figures",
     RECEIPTS,
@@ -27,32 +27,32 @@ OWN_FOLDERS = (
 """All that a study makes in its folder, beside the report, the specification and its description."""
 
 
-def policies_folder(folder: Path, body: Body, condition: StudyCondition) -> Path:
-    """Of the policies of a condition on a robot."""
-    return folder / "policies" / body.name / condition.slug
+def policies_folder(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """Of the policies of an arm on a robot."""
+    return folder / "policies" / spec.name / arm.slug
 
 
-def episodes_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
-    """The episodes of a condition's policies on a robot.
+def episodes_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """The episodes of an arm's policies on a robot.
 
-    Every condition has a folder of its own, so that no name of one can be a file of another's.
+    Every arm has a folder of its own, so that no name of one can be a file of another's.
     """
-    return folder / "episodes" / body.name / condition.slug / "episodes.npz"
+    return folder / "episodes" / spec.name / arm.slug / "episodes.npz"
 
 
-def paths_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
-    """One whole episode of each of a condition's policies on a robot."""
-    return folder / "episodes" / body.name / condition.slug / "paths.npz"
+def paths_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """One whole episode of each of an arm's policies on a robot."""
+    return folder / "episodes" / spec.name / arm.slug / "paths.npz"
 
 
-def controls_file(folder: Path, body: Body, condition: StudyCondition) -> Path:
-    """The episodes of the controls of a condition's mapping on a robot."""
-    return folder / "controls" / body.name / condition.thresholds / "episodes.npz"
+def controls_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
+    """The episodes of the controls of an arm's mapping on a robot."""
+    return folder / "controls" / spec.name / arm.thresholds / "episodes.npz"
 
 
-def limits_file(folder: Path, robot: str, what: str = "limits") -> Path:
+def optima_file(folder: Path, robot: str, what: str = "optima") -> Path:
     """The optimal returns on a robot."""
-    return folder / "limits" / f"{robot}-{what}.json"
+    return folder / "optima" / f"{robot}-{what}.json"
 
 
 def results_file(folder: Path) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from animat.execution.jobs import Job
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Study
 
 ITERATIONS_PER_S = 110_000
 """Of training on one core, all policies of a group together; only the order of jobs and the time left rest on it."""
@@ -38,48 +38,48 @@ def plan_study(study: Study, base: Path) -> list[Job]:
             Job("pictures/culture", CulturePictures(study), (JOB, "fit"), 15),
         ]
         neurons = ("fit",)
-    for body in study.robots:
-        for condition in study.conditions:
-            needs = neurons if condition.through_neurons else ()
+    for spec in study.robots:
+        for arm in study.arms:
+            needs = neurons if arm.through_neurons else ()
             groups = []
             for members in split_groups(study.policies):
-                groups.append(f"train/{body.name}/{condition.slug}/p{members[0]}")
-                trained = body.trained_for * len(members) / ITERATIONS_PER_S if condition.trained else 0.0
-                jobs.append(Job(groups[-1], TrainGroup(study, body, condition, members), needs, 4 + trained))
+                groups.append(f"train/{spec.name}/{arm.slug}/p{members[0]}")
+                trained = spec.trained_for * len(members) / ITERATIONS_PER_S if arm.trained else 0.0
+                jobs.append(Job(groups[-1], TrainGroup(study, spec, arm, members), needs, 4 + trained))
             # Its minute is the last recording's, also without neurons.
             needs = (*groups, *neurons)
-            jobs.append(Job(f"evaluate/{body.name}/{condition.slug}", Evaluate(study, body, condition), needs, 4))
-        jobs += _beside(study, body, neurons)
-        results = [job.name for job in jobs if job.name.split("/")[1:2] == [body.name]]
-        jobs.append(Job(f"pictures/{body.name}", RobotPictures(study, body), (*results, *neurons, "tables"), 15))
-    everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "limit", "train")]
+            jobs.append(Job(f"evaluate/{spec.name}/{arm.slug}", Evaluate(study, spec, arm), needs, 4))
+        jobs += _beside(study, spec, neurons)
+        results = [job.name for job in jobs if job.name.split("/")[1:2] == [spec.name]]
+        jobs.append(Job(f"pictures/{spec.name}", RobotPictures(study, spec), (*results, *neurons, "tables"), 15))
+    everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "optimum", "train")]
     jobs.append(Job("tables", Tabulate(study), (*everything, *neurons), 2))
     pictures = [job.name for job in jobs if job.name.startswith("pictures/")]
     jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1))
     return jobs
 
 
-def _beside(study: Study, body: Body, neurons: tuple[str, ...]) -> list[Job]:
-    """Controls and limits on a robot."""
+def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job]:
+    """Controls and optima on a robot."""
     from animat.studies.evaluating import Control
-    from animat.studies.limits import FindLimits, kinds_of
+    from animat.studies.optima import FindOptima, kinds_of
     from animat.training.group import split_groups
 
     jobs = []
     for kind in kinds_of(study):
-        plain = plain_condition(study, kind)
-        groups = [f"train/{body.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies)]
-        name = f"controls/{body.name}/{kind.thresholds}"
-        jobs.append(Job(name, Control(study, body, plain), (*groups, *neurons), 6))
-    resolution = body.limit_resolution or study.limit_resolution
-    cost_s = 40 * resolution ** len(body.robot().quantities) + 10
-    jobs.append(Job(f"limit/{body.name}", FindLimits(study, body), neurons, cost_s))
+        plain = plain_arm(study, kind)
+        groups = [f"train/{spec.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies)]
+        name = f"controls/{spec.name}/{kind.thresholds}"
+        jobs.append(Job(name, Control(study, spec, plain), (*groups, *neurons), 6))
+    resolution = spec.optimum_resolution or study.optimum_resolution
+    cost_s = 40 * resolution ** len(spec.robot().observation_spec) + 10
+    jobs.append(Job(f"optimum/{spec.name}", FindOptima(study, spec), neurons, cost_s))
     if neurons:
-        jobs.append(Job(f"limit/{body.name}/over-time", FindLimits(study, body, over_time=True), neurons, 12))
+        jobs.append(Job(f"optimum/{spec.name}/over-time", FindOptima(study, spec, over_time=True), neurons, 12))
     return jobs
 
 
-def plain_condition(study: Study, kind: StudyCondition) -> StudyCondition:
-    """Of the conditions with a mapping, the one trained most plainly: its policies stand for the mapping."""
-    same = [c for c in study.conditions if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
+def plain_arm(study: Study, kind: Arm) -> Arm:
+    """Of the arms with a mapping, the one trained most plainly: its policies stand for the mapping."""
+    same = [c for c in study.arms if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
     return max(same, key=lambda c: (c.trained, c.delivery == "chosen", c.shadowing))

@@ -19,7 +19,7 @@ from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
 from animat.studies.heuristic import not_outperforming
-from animat.studies.learned import as_good_as_the_limit_allows, learned_of
+from animat.studies.learned import beside_the_optimum, learned_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
 from animat.studies.results import ComparedReturns, Results, read_typed
 from animat.studies.shown import (
@@ -27,7 +27,7 @@ from animat.studies.shown import (
     controllability_shown,
     controls_shown,
     heuristic_shown,
-    limits_shown,
+    optima_shown,
     returns_shown,
     scores_shown,
 )
@@ -54,9 +54,9 @@ class Publish(StudyTask):
             table = controllability_shown(study, folder, kept)
             pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE)
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
-        for body in study.robots:
-            pictures = _pictures(folder, body.name, ROBOT, _NUMBERS_OF_ROBOT)
-            sections.append(Section(body.name.capitalize(), pictures=pictures))
+        for spec in study.robots:
+            pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT)
+            sections.append(Section(spec.name.capitalize(), pictures=pictures))
         sections += [_controls(study, results), _done(study, results)]
         if study.paper:
             sections.append(_differences(study, results, kept))
@@ -72,13 +72,13 @@ class Publish(StudyTask):
 
 
 def _lead(study: Study) -> str:
-    robots = " and ".join(body.name for body in study.robots)
-    neurons = {"virtual": "a virtual culture", "made-up": "made-up responses", "files": "recordings"}[
+    robots = " and ".join(spec.name for spec in study.robots)
+    neurons = {"virtual": "a virtual culture", "synthetic": "synthetic responses", "files": "recordings"}[
         study.culture.kind
     ]
     return (
-        f"{robots.capitalize()}, driven through {neurons}: {len(study.conditions)} conditions with {study.policies} "
-        f"policies each, " + ", ".join(f"{body.trained_for:,} iterations on {body.name}" for body in study.robots) + "."
+        f"{robots.capitalize()}, driven through {neurons}: {len(study.arms)} arms with {study.policies} "
+        f"policies each, " + ", ".join(f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots) + "."
     )
 
 
@@ -95,15 +95,15 @@ def _short(study: Study, results: Results) -> Section:
             "first look, and no results."
         )
     if not rows:
-        paragraphs.append("The study compares no conditions; how each did is under Scores.")
+        paragraphs.append("The study compares no arms; how each did is under Scores.")
     paragraphs.append(
         "A policy's performance is its mean return over the episodes. Policies are compared by the two-sided "
         "Mann-Whitney U test: p by the normal approximation with continuity correction, as in the paper, and "
         "exactly; p corrected is Holm's for the number of comparisons. Stars in figures are of the corrected p. The "
-        "outcome goes by the first p, as in the paper: the better one of two conditions counts as found at p < "
+        "outcome goes by the first p, as in the paper: the better one of two arms counts as found at p < "
         f"{LEVEL:g}, and where the corrected p is not below that, the table says so. That none was found does not say "
         "that there is no difference. The effect is the rank-biserial correlation, +1 where every "
-        "policy of the second condition is better, with Newcombe's 95 % interval."
+        "policy of the second arm is better, with Newcombe's 95 % interval."
     )
     return Section(
         "Results in short", tuple(paragraphs), tables=(comparisons_shown(rows), returns_shown(rows)) if rows else ()
@@ -125,17 +125,17 @@ def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
 
 def _scores(study: Study, results: Results) -> Section:
     learned = learned_of(study, results.scores)
-    tables = [scores_shown(results.scores), limits_shown(results.limits)]
+    tables = [scores_shown(results.scores), optima_shown(results.optima)]
     paragraphs = [
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     ]
     if learned:
         paragraphs.append(
-            f"As good as the limit allows: a score of {AIM:g} on the very simulator that policies were trained on is "
-            "what learning should come to. Conditions whose simulators are refreshed during training are not asked "
+            f"As good as the optimum: a score of {AIM:g} on the very simulator that policies were trained on is "
+            "what learning should come to. Arms whose simulators are refreshed during training are not asked "
             "this, as they are trained on several."
         )
-        tables.insert(0, as_good_as_the_limit_allows(study, learned))
+        tables.insert(0, beside_the_optimum(study, learned))
     return Section("Scores", tuple(paragraphs), tables=tuple(tables))
 
 
@@ -175,7 +175,7 @@ def _controls(study: Study, results: Results) -> Section:
         ("random", "Any action, equally likely, whatever is observed."),
         ("constant", "One stimulus always (without neurons: one command)."),
         (
-            "made by hand",
+            "heuristic",
             "A rule instead of learning: the stimulus whose mean command is nearest to a push to the side where the "
             "pole will lean in 0.1 s, to a turn towards the goal, or to what another robot's rule wants.",
         ),
@@ -199,7 +199,7 @@ def _done(study: Study, results: Results) -> Section:
         recorded = (
             f"{culture.sessions} recordings, one every {culture.interval_min:g} min, of the {culture.kind} culture of "
             f"seed {culture.seed}; stimuli {Presentation(culture.order, culture.pulses)}, "
-            f"{culture.presentations} presentations of each."
+            f"{culture.trials} trials of each."
         )
     points = [
         ("Recordings", recorded),
@@ -216,25 +216,23 @@ def _done(study: Study, results: Results) -> Section:
         ),
         (
             "Training",
-            f"{study.policies} policies of each condition on each robot, each from random numbers of its own; "
+            f"{study.policies} policies of each arm on each robot, each from random numbers of its own; "
             f"training stands for {study.training_min:g} min of the culture's clock.",
         ),
     ]
     points.append(("Evaluation", _ACTIONS[study.actions]))
-    points += [("Left out", f"{finding.sentence}.") for finding in results.findings if finding.name == LEFT_OUT]
-    for condition in study.conditions:
-        said = [f"mapping {condition.mapping}" if condition.through_neurons else "the robot is moved directly"]
-        if condition.through_neurons:
-            said.append(
-                "simulators refreshed during training" if condition.shadowing else "the first simulator throughout"
-            )
-        if condition.delivery == "shuffled":
+    points += [("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT]
+    for arm in study.arms:
+        said = [f"mapping {arm.mapping}" if arm.through_neurons else "the robot is moved directly"]
+        if arm.through_neurons:
+            said.append("simulators refreshed during training" if arm.shadowing else "the first simulator throughout")
+        if arm.delivery == "shuffled":
             said.append("the delivered stimulus is drawn at random, in training and in evaluation")
-        if condition.percentiles == "first":
-            said.append("percentiles of the first recording held")
-        if not condition.trained:
+        if arm.percentiles == "first":
+            said.append("fixed percentiles, those of the first recording")
+        if not arm.trained:
             said.append("not trained")
-        points.append((f"Condition: {condition.name}", "; ".join(said) + "."))
+        points.append((f"Arm: {arm.name}", "; ".join(said) + "."))
     return Section("How it was done", points=tuple(points))
 
 
@@ -261,9 +259,9 @@ def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity])
 def _noticed(results: Results) -> Section:
     grave = [finding for finding in results.findings if finding.severity != "note"]
     notes = len(results.findings) - len(grave)
-    shown = tuple((finding.name, finding.sentence) for finding in grave)
+    shown = tuple((finding.name, finding.message) for finding in grave)
     said = (
-        f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the limits; all "
+        f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the optima; all "
         "are in tables/findings.csv."
     )
     table: tuple[Any, ...] = (

@@ -28,7 +28,7 @@ class Record(StudyTask):
         base: what a specification's file names are relative to.
     """
 
-    sizes = ("culture.presentations", "culture.pulses", "culture.channels")
+    sizes = ("culture.trials", "culture.pulses", "culture.channels")
 
     base: Path
 
@@ -36,7 +36,7 @@ class Record(StudyTask):
         out = folder / RECORDINGS
         _remove_changed(folder)
         kind = self.study.culture.kind
-        make = {"virtual": _virtual, "made-up": _made_up, "files": self._copies}[kind]
+        make = {"virtual": _virtual, "synthetic": _synthetic, "files": self._copies}[kind]
         files = make(self.study, out, progress)
         kept = (SELECTION_FILE, STATE_FILE) if kind == "virtual" else ()
         return [*files, *(out / name for name in kept)]
@@ -72,7 +72,7 @@ def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     culture = study.culture
     return record_virtual_series(
         lambda: VirtualCulture(culture.seed),
-        Protocol(order=culture.order, pulses=culture.pulses, presentations=culture.presentations),
+        Protocol(order=culture.order, pulses=culture.pulses, trials=culture.trials),
         out,
         sessions=culture.sessions,
         interval_min=culture.interval_min,
@@ -82,16 +82,16 @@ def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     )
 
 
-def _made_up(study: Study, out: Path, progress: Progress) -> list[Path]:
-    from animat.recordings.made_up import write_made_up_series
+def _synthetic(study: Study, out: Path, progress: Progress) -> list[Path]:
+    from animat.recordings.synthetic import write_synthetic_series
 
     culture = study.culture
-    return write_made_up_series(
+    return write_synthetic_series(
         culture.seed,
         out,
         sessions=culture.sessions,
         interval_min=culture.interval_min,
         progress=progress,
-        patterns=culture.presentations,
+        patterns=culture.trials,
         channels=culture.channels,
     )

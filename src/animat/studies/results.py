@@ -17,13 +17,13 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.optimum import bracket_findings
 from animat.recordings.findings import Finding
 from animat.records import read_record
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Limit:
+class StudyOptimum:
     """The optimal return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
 
     Attributes:
@@ -56,10 +56,10 @@ class Limit:
 
 @dataclass(frozen=True)
 class Score:
-    """A condition at a minute: means over policies, beside random actions and the limit."""
+    """An arm at a minute: means over policies, beside random actions and the optimum."""
 
     robot: str
-    condition: str
+    arm: str
     mapping: str
     at_min: float
     policies: int
@@ -70,18 +70,18 @@ class Score:
     low_95: float | None
     high_95: float | None
     random: float | None
-    limit: float | None
-    limit_grid_error: float | None
-    limit_run: float | None
-    limit_run_standard_error: float | None
-    limit_without_clock: float | None
+    optimum: float | None
+    optimum_grid_error: float | None
+    optimum_run: float | None
+    optimum_run_standard_error: float | None
+    optimum_without_clock: float | None
     normalised_score: float | None
     score_without_clock: float | None
 
 
 @dataclass(frozen=True)
 class ComparedReturns:
-    """Two conditions on a robot: the test, its outcome, and the paper's where it printed one."""
+    """Two arms on a robot: the test, its outcome, and the paper's where it printed one."""
 
     comparison: str
     robot: str
@@ -95,10 +95,10 @@ class ComparedReturns:
     score_first: float | None
     score_second: float | None
     random_second: float | None
-    limit_first: float | None
-    limit_second: float | None
-    limit_error_first: float | None
-    limit_error_second: float | None
+    optimum_first: float | None
+    optimum_second: float | None
+    optimum_error_first: float | None
+    optimum_error_second: float | None
     u: float
     p_normal: float
     p_exact: float
@@ -125,7 +125,7 @@ class ControlReturns:
     mean_return: float
     standard_error: float | None
     random: float | None
-    limit: float | None
+    optimum: float | None
     normalised_score: float | None
 
 
@@ -134,7 +134,7 @@ class BesideHeuristic:
     """Trained policies beside the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
 
     robot: str
-    condition: str
+    arm: str
     at_min: float
     mean_return: float
     heuristic: float
@@ -151,13 +151,13 @@ class Results:
     comparisons: tuple[ComparedReturns, ...]
     controls: tuple[ControlReturns, ...]
     heuristic: tuple[BesideHeuristic, ...]
-    limits: tuple[Limit, ...]
+    optima: tuple[StudyOptimum, ...]
     findings: tuple[Finding, ...]
 
 
 def write_typed(path: Path, value: Any) -> Path:
     """Write records, complete or absent: `read_typed` reads them."""
-    with written_whole(path) as beside:
+    with atomic_write(path) as beside:
         plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
         beside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
     return path
@@ -177,7 +177,7 @@ def read_typed(path: Path, kind: type[T]) -> T:
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Write arrays by name as NumPy's npz, complete or absent; the same bytes always."""
-    with written_whole(path) as beside, beside.open("wb") as file:
+    with atomic_write(path) as beside, beside.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return path
 
@@ -197,7 +197,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
     """Write a CSV file, complete or absent; numbers with all their digits, None as nothing."""
-    with written_whole(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(head)
         writer.writerows(rows)

@@ -80,12 +80,12 @@ def run_study(
                 raise InvalidFile(
                     f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
                 )
-            for body in study.robots:
-                if ":" in body.kind:
-                    check_robot(body.robot())
-            for condition in study.conditions:
-                if ":" in condition.mapping:
-                    check_mapping(mapping_named(condition.mapping))
+            for spec in study.robots:
+                if ":" in spec.kind:
+                    check_robot(spec.robot())
+            for arm in study.arms:
+                if ":" in arm.mapping:
+                    check_mapping(mapping_named(arm.mapping))
             took_s = left.run(workers=workers, executor=executor, progress=progress or Silent())
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     return Ran(folder, folder / REPORT, len(jobs), took_s)

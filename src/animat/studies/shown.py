@@ -10,8 +10,8 @@ from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Table, cell, with_error
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
-from animat.studies.limits import limits_of_all, rough_kinds
-from animat.studies.results import BesideHeuristic, ComparedReturns, ControlReturns, Limit, Score
+from animat.studies.optima import optima_of_all, rough_kinds
+from animat.studies.results import BesideHeuristic, ComparedReturns, ControlReturns, Score, StudyOptimum
 from animat.studies.specification import Study, named_mapping
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
@@ -22,9 +22,9 @@ _MOST_LABELS = 12
 _MOST_ROWS = 40
 
 _SCORE_NOTE = (
-    "Limit: the optimal return of any controller with the same neurons, mapping and robot, by dynamic "
-    "programming. Score: (mean − random) / (limit − random); 0 is as good as random actions, 1 the limit, which "
-    "chance can pass. A control, whose delivery is drawn at random, has no limit: whatever it chooses is as good as "
+    "Optimum: the optimal return of any controller with the same neurons, mapping and robot, by dynamic "
+    "programming. Score: (mean − random) / (optimum − random); 0 is as good as random actions, 1 the optimum, which "
+    "chance can pass. A control, whose delivery is drawn at random, has no optimum: whatever it chooses is as good as "
     "random."
 )
 
@@ -58,7 +58,7 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
 
 
 def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
-    """The same comparisons as mean returns, limits and scores."""
+    """The same comparisons as mean returns, optima and scores."""
     return Table(
         "The same comparisons as returns",
         *_columns(
@@ -70,8 +70,8 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
                 ("mean first", "mean_first"),
                 ("mean second", "mean_second"),
                 ("random", "random_second"),
-                ("limit first", _pair("limit_first", "limit_error_first")),
-                ("limit second", _pair("limit_second", "limit_error_second")),
+                ("optimum first", _pair("optimum_first", "optimum_error_first")),
+                ("optimum second", _pair("optimum_second", "optimum_error_second")),
                 ("score first", "score_first"),
                 ("score second", "score_second"),
             ],
@@ -82,14 +82,14 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
 
 
 def scores_shown(rows: Sequence[Score]) -> Table:
-    """Every condition at every minute it was evaluated at."""
+    """Every arm at every minute it was evaluated at."""
     return Table(
-        "Every condition",
+        "Every arm",
         *_columns(
             rows,
             [
                 ("robot", "robot"),
-                ("condition", "condition"),
+                ("arm", "arm"),
                 ("at (min)", "at_min"),
                 ("policies", "policies"),
                 ("episodes", "episodes"),
@@ -97,7 +97,7 @@ def scores_shown(rows: Sequence[Score]) -> Table:
                 ("s.d.", "standard_deviation"),
                 ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
                 ("random", "random"),
-                ("limit", "limit"),
+                ("optimum", "optimum"),
                 ("score", "normalised_score"),
             ],
         ),
@@ -106,38 +106,38 @@ def scores_shown(rows: Sequence[Score]) -> Table:
     )
 
 
-def limits_shown(limits: Sequence[Limit]) -> Table:
+def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
     """The optimal returns as brackets, with their intervals; what was left out of them is said."""
     columns: Columns = [
         ("robot", "robot"),
         ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
         ("at (min)", "at_min"),
-        ("limit ± grid", _pair("best_return", "grid_error")),
+        ("optimum ± grid", _pair("best_return", "grid_error")),
         ("95 % interval", lambda row: None if row.low_95 is None else _ends(row.low_95, row.high_95)),
         ("its controller, run", _pair("monte_carlo", "standard_error")),
         ("without clock", _pair("without_clock", "without_clock_standard_error")),
         ("nodes", "nodes"),
     ]
-    without = [row for row in limits if row.left_out is not None]
+    without = [row for row in optima if row.left_out is not None]
     left_out = ""
     if without:
         columns.append(("left out (responses)", "left_out"))
         left_out = (
-            f" {len(without)} of {len(limits)} limits leave out conditions with fewer than {FEW_SAMPLES} responses, "
+            f" {len(without)} of {len(optima)} optima leave out conditions with fewer than {FEW_SAMPLES} responses, "
             "which would promise too much: no score is against these, as policies act on all conditions."
         )
     return Table(
         "Optimal returns",
-        *_columns(limits, columns),
+        *_columns(optima, columns),
         note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses "
-        "determine the value, bootstrapped 39 times; for threshold mappings, where a condition is evaluated. "
+        "determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its "
         "standard error: a return that can be had. The optimal return lies between the two; scores keep to "
         "the value, the upper end. Highlighted: they part by more than 3 standard errors and the grid's "
         "error. Without clock: the same controller if it does not know the time left, as policies do not. On "
-        "a rough grid at every recording: limits/." + left_out,
-        beside="tables/limits.csv",
-        marked=tuple(i for i, row in enumerate(limits) if row.findings()),
+        "a rough grid at every recording: optima/." + left_out,
+        beside="tables/optima.csv",
+        marked=tuple(i for i, row in enumerate(optima) if row.findings()),
     )
 
 
@@ -148,13 +148,13 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
         kept: what the simulator keeps of each recording, by its minute.
     """
     kinds = rough_kinds(study)[:1]
-    limits = {
-        body.name: {
-            limit.at_min: limit.best_return
-            for limit in limits_of_all(folder, body.name, "over-time")
-            if (limit.mapping, limit.percentiles) == (kinds[0].mapping, kinds[0].percentiles)
+    optima = {
+        spec.name: {
+            optimum.at_min: optimum.best_return
+            for optimum in optima_of_all(folder, spec.name, "over-time")
+            if (optimum.mapping, optimum.percentiles) == (kinds[0].mapping, kinds[0].percentiles)
         }
-        for body in study.robots
+        for spec in study.robots
         if kinds
     }
     labels = next(iter(kept.values())).labels
@@ -166,18 +166,18 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
             for a, b in zip(in_data, in_simulator, strict=True)
         ]
         apart = (max(each) - min(each) for each in (in_data, in_simulator))
-        rows.append((at_min, *shares[:_MOST_LABELS], *apart, *(by_minute.get(at_min) for by_minute in limits.values())))
+        rows.append((at_min, *shares[:_MOST_LABELS], *apart, *(by_minute.get(at_min) for by_minute in optima.values())))
         if of.largest_loss > LARGEST_LOSS:
             marked.append(i)
     note = (
         "P(x ≥ P50) of each condition: how often it answers above the median of all. A controller can only work with "
         "the difference between them, and of that with what the simulator keeps of the responses. Highlighted, with "
-        f"an arrow: binning moves a share by more than {LARGEST_LOSS:g}, and what the simulator, limits and policies "
+        f"an arrow: binning moves a share by more than {LARGEST_LOSS:g}, and what the simulator, optima and policies "
         "have is not what the culture would give."
     )
     if kinds:
         mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)
-        note += f" Limit: the optimal return with {mapping} on a rough grid."
+        note += f" Optimum: the optimal return with {mapping} on a rough grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."
     return Table(
@@ -187,7 +187,7 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
             *labels[:_MOST_LABELS],
             "difference, data",
             "difference, simulator",
-            *(f"limit, {robot}" for robot in limits),
+            *(f"optimum, {robot}" for robot in optima),
         ),
         tuple(rows),
         note=note,
@@ -210,16 +210,16 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
                 ("actors", "actors"),
                 ("mean return", _pair("mean_return", "standard_error")),
                 ("random", "random"),
-                ("limit", "limit"),
+                ("optimum", "optimum"),
                 ("score", "normalised_score"),
             ],
         ),
         note="Trained policies stand beside their controls, as in the figures above. ±: standard error over actors, of "
-        "one actor over its episodes. Limits are those of the culture as it answers, also beside silent and shuffled."
+        "one actor over its episodes. Optima are those of the culture as it answers, also beside silent and shuffled."
         + (
             " Without neurons, where any command can be chosen, none is held constant."
             if any(row.mapping == "none" for row in rows)
-            and any(body.robot().baseline_commands is None for body in study.robots)
+            and any(spec.robot().baseline_commands is None for spec in study.robots)
             else ""
         ),
         beside="tables/controls.csv",
@@ -235,7 +235,7 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
             rows,
             [
                 ("robot", "robot"),
-                ("condition", "condition"),
+                ("arm", "arm"),
                 ("at (min)", "at_min"),
                 ("policies", "mean_return"),
                 ("heuristic", "heuristic"),

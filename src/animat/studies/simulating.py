@@ -28,8 +28,10 @@ from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
 from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
+_FORMER = {"reach": "neighbour_exponent"}
+"""What files of before call arrays of simulators."""
 _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator, MemorySimulator)}
 
 
@@ -38,7 +40,7 @@ _KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulato
 class Fit(StudyTask):
     """Read the responses of all recordings and fit a simulator to each."""
 
-    sizes = ("culture.sessions", "culture.presentations", "simulators.bins")
+    sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, settings = self.study, self.study.simulators
@@ -117,7 +119,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "findings": [asdict(finding) for finding in timeline.findings],
         "fitted": timeline.fitted,
     }
-    with written_whole(path) as beside:
+    with atomic_write(path) as beside:
         beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
 
 
@@ -138,13 +140,15 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         return SimulatorTimeline(
-            simulators=_KINDS[told["kind"]](**{name: jnp.asarray(array) for name, array in load(data).items()}),
+            simulators=_KINDS[told["kind"]](
+                **{_FORMER.get(name, name): jnp.asarray(array) for name, array in load(data).items()}
+            ),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),
             presentation=None if presentation is None else Presentation(**presentation),
             fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n) for a, b, n in kept),
-            findings=tuple(Finding(**each) for each in told["findings"]),
+            findings=tuple(Finding.from_dict(each) for each in told["findings"]),
             fitted=told["fitted"],
         )
     except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:

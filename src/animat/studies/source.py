@@ -9,12 +9,12 @@ from pydantic import Field
 
 from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
-from animat.recordings.made_up import MadeUpCulture
+from animat.recordings.synthetic import SyntheticCulture
 from animat.records import Positive, Seed, Whole, record
 from animat.stimulation.protocol import Protocol
 
-MOST_SESSIONS, MOST_PRESENTATIONS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
-"""Recordings, presentations in each, and entries of a list; `docs/studies.md` states them."""
+MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
+"""Recordings, trials in each, and entries of a list; `docs/studies.md` states them."""
 
 LISTED = Field(max_length=MOST_ENTRIES)
 
@@ -24,22 +24,22 @@ class Source:
     """Where the recordings come from: files, or a culture that is recorded for the study.
 
     Attributes:
-        kind: `"virtual"`, simulated neurons; `"made-up"`, responses of known distributions, for trials; `"files"`.
+        kind: `"virtual"`, simulated neurons; `"synthetic"`, responses of known distributions, to try things; `"files"`.
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
-        seed: which virtual or made-up culture.
+        seed: which virtual or synthetic culture.
         sessions, interval_min: how many recordings, and the minutes from one to the next.
-        order, pulses, presentations: how stimuli are presented (`animat.stimulation.protocol`).
-        channels: of a made-up culture.
+        order, pulses, trials: how stimuli are presented (`animat.stimulation.protocol`).
+        channels: of a synthetic culture.
     """
 
-    kind: Literal["virtual", "made-up", "files"] = "virtual"
+    kind: Literal["virtual", "synthetic", "files"] = "virtual"
     files: Annotated[tuple[str, ...], LISTED] = ()
     seed: Seed = 1
     sessions: Annotated[Whole, Field(ge=1, le=MOST_SESSIONS)] = 15
     interval_min: Positive = 10.0
     order: Literal["blocked", "mixed"] = "blocked"
-    pulses: Annotated[Whole, Field(ge=1, le=MOST_PRESENTATIONS)] = 1
-    presentations: Annotated[Whole, Field(ge=2, le=MOST_PRESENTATIONS)] = 100
+    pulses: Annotated[Whole, Field(ge=1, le=MOST_TRIALS)] = 1
+    trials: Annotated[Whole, Field(ge=2, le=MOST_TRIALS)] = 100
     channels: Annotated[Whole, Field(ge=1, le=1024)] = 256
 
     def __post_init__(self) -> None:
@@ -59,10 +59,10 @@ class Source:
                     raise InvalidArgument(
                         f"{each.name}: expected only for a culture that is recorded, got one of files"
                     )
-        if self.kind == "made-up" and (self.order, self.pulses) != ("blocked", 1):
-            raise InvalidArgument("order: a made-up culture is recorded blocked with one pulse, got otherwise")
+        if self.kind == "synthetic" and (self.order, self.pulses) != ("blocked", 1):
+            raise InvalidArgument("order: a synthetic culture is recorded blocked with one pulse, got otherwise")
         # What the recordings themselves refuse is refused before there is a folder.
         if self.kind == "virtual":
-            Protocol(order=self.order, pulses=self.pulses, presentations=self.presentations)
-        elif self.kind == "made-up":
-            MadeUpCulture(self.seed, patterns=self.presentations, channels=self.channels)
+            Protocol(order=self.order, pulses=self.pulses, trials=self.trials)
+        elif self.kind == "synthetic":
+            SyntheticCulture(self.seed, patterns=self.trials, channels=self.channels)

@@ -1,4 +1,4 @@
-"""What a study is: recordings or a culture, robots, conditions, comparisons, how often and from which seeds."""
+"""What a study is: recordings or a culture, robots, arms, comparisons, how often and from which seeds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, AliasChoices, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import AfterValidator, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
 from animat.coding.mapping import Thresholds, mapping_named
 from animat.errors import InvalidArgument, shown
@@ -21,7 +21,7 @@ from animat.studies.source import LISTED, Source
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
 MOST_TRAINED = 20_000
-"""Policies of all conditions on all robots: each is a file, and five are a job."""
+"""Policies of all arms on all robots: each is a file, and five are a job."""
 FINEST_RESOLUTION = 2.0
 """Of the optimal return's grid: the cartpole's tables are of 2 GiB there, and grow with its fourth power."""
 
@@ -67,8 +67,7 @@ class Simulators:
     conditions: str = ""
     window_ms: tuple[Number, Number] = (2.0, 10.0)
     burst_threshold: Share | None = None
-    # What it was called in files that are still read.
-    allow: Annotated[tuple[str, ...], LISTED, Field(validation_alias=AliasChoices("allow", "despite"))] = ()
+    allow: Annotated[tuple[str, ...], LISTED] = ()
 
     def __post_init__(self) -> None:
         from animat.neurons.simulator import check_binning
@@ -85,7 +84,7 @@ class Simulators:
 
 
 @record
-class Body:
+class RobotSpec:
     """A robot of the study.
 
     Attributes:
@@ -95,12 +94,12 @@ class Body:
             where to import it from, `my_package.robots:Rover`, which is filled in for robots that are not ours.
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
-        limit_resolution: of its optimal return, in place of the study's.
+        optimum_resolution: of its optimal return, in place of the study's.
     """
 
     name: Name
     iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] | None = None
-    limit_resolution: Resolution | None = None
+    optimum_resolution: Resolution | None = None
     parameters: Numbers = Field(default_factory=dict)
     kind: str = ""
 
@@ -126,7 +125,7 @@ class Body:
 
 
 @record
-class StudyCondition:
+class Arm:
     """One way to train policies, on each robot.
 
     Attributes:
@@ -135,7 +134,7 @@ class StudyCondition:
             mappings that are not ours); `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
-        percentiles: of the mapping: `"moving"` with the simulator, or held from the `"first"` recording.
+        percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording.
         trained: false for policies as they are before training.
     """
 
@@ -163,7 +162,7 @@ class StudyCondition:
 
     @property
     def thresholds(self) -> str:
-        """Its mapping and how the percentiles are held, as a folder's name."""
+        """Its mapping and whether the percentiles are fixed, as a folder's name."""
         return self.mapping.replace(":", ".") + ("-held" if self.percentiles == "first" else "")
 
     @property
@@ -178,18 +177,18 @@ class StudyCondition:
 
 
 def named_mapping(mapping: str, percentiles: str) -> str:
-    """A mapping in words, with whether its percentiles are held."""
-    held = ", percentiles held" if percentiles == "first" else ""
-    return "without neurons" if mapping == "none" else f"{mapping}{held}"
+    """A mapping in words, with whether its percentiles are fixed."""
+    fixed = ", percentiles fixed" if percentiles == "first" else ""
+    return "without neurons" if mapping == "none" else f"{mapping}{fixed}"
 
 
 @record
 class Compared:
-    """Two conditions that are compared on every robot, by the policies' mean returns.
+    """Two arms that are compared on every robot, by the policies' mean returns.
 
     Attributes:
         name: of the comparison.
-        first, second: names of conditions; the second is the one expected to be better.
+        first, second: names of arms; the second is the one expected to be better.
         at_min: minute of the recording that they are evaluated on, the nearest to it; None: the last recording.
         episodes: of each policy.
     """
@@ -203,7 +202,7 @@ class Compared:
     def __post_init__(self) -> None:
         if self.first == self.second:
             raise InvalidArgument(
-                f"second: expected another condition than the first, got {self.second!r} twice in {self.name!r}"
+                f"second: expected another arm than the first, got {self.second!r} twice in {self.name!r}"
             )
 
 
@@ -215,15 +214,15 @@ class Study:
         title: of the report.
         culture: the recordings.
         simulators: how responses are read and fitted.
-        robots, conditions, comparisons: what is trained and what is compared.
-        policies: of each condition on each robot.
+        robots, arms, comparisons: what is trained and what is compared.
+        policies: of each arm on each robot.
         seed: decides every draw of training and evaluation.
         training_min: minutes of the culture's clock that a training stands for.
         episodes: of each policy where no comparison says otherwise, and of controls.
         episodes_over_time: of each policy at every recording.
         actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
-        limit_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
-        limit_episodes: episodes in which that controller's return is checked.
+        optimum_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
+        optimum_episodes: episodes in which that controller's return is checked.
         algorithm: settings of `animat.training.settings.SAC` in place of its defaults.
         paper: whether the paper's own figures are printed beside comparisons of the same name and robot.
 
@@ -234,8 +233,8 @@ class Study:
     title: str = "Study"
     culture: Source = Field(default_factory=Source)
     simulators: Simulators = Field(default_factory=Simulators)
-    robots: Annotated[tuple[Body, ...], LISTED] = (Body("cartpole"), Body("navigation"))
-    conditions: Annotated[tuple[StudyCondition, ...], LISTED] = (StudyCondition("1 threshold"),)
+    robots: Annotated[tuple[RobotSpec, ...], LISTED] = (RobotSpec("cartpole"), RobotSpec("navigation"))
+    arms: Annotated[tuple[Arm, ...], LISTED] = (Arm("1 threshold"),)
     comparisons: Annotated[tuple[Compared, ...], LISTED] = ()
     policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
     seed: Seed = 1
@@ -243,17 +242,17 @@ class Study:
     episodes: Episodes = 100
     episodes_over_time: Episodes = 30
     actions: Literal["most probable", "drawn"] = "most probable"
-    limit_resolution: Resolution = 1.0
-    limit_episodes: Annotated[Whole, Field(ge=2, le=MOST_AT_ONCE)] = 4000
+    optimum_resolution: Resolution = 1.0
+    optimum_episodes: Annotated[Whole, Field(ge=2, le=MOST_AT_ONCE)] = 4000
     algorithm: Numbers = Field(default_factory=dict)
     paper: Flag = False
 
     def __post_init__(self) -> None:
-        for what in ("robots", "conditions"):
+        for what in ("robots", "arms"):
             if not getattr(self, what):
                 raise InvalidArgument(f"{what}: expected at least one, got none")
-        _expect_unlike("robots", [body.name for body in self.robots])
-        _expect_unlike("conditions", [condition.slug for condition in self.conditions])
+        _expect_unlike("robots", [spec.name for spec in self.robots])
+        _expect_unlike("arms", [arm.slug for arm in self.arms])
         _expect_unlike("comparisons", [compared.name for compared in self.comparisons])
         # All policies are evaluated side by side.
         for name, episodes in (
@@ -266,19 +265,18 @@ class Study:
                     f"{name}: expected at most {MOST_AT_ONCE:,} of all policies together, got {episodes:,} of each of "
                     f"{self.policies}"
                 )
-        trained = len(self.robots) * len(self.conditions) * self.policies
+        trained = len(self.robots) * len(self.arms) * self.policies
         if trained > MOST_TRAINED:
             raise InvalidArgument(
-                f"policies: expected at most {MOST_TRAINED:,} in a study, got {trained:,} (robots x conditions x "
-                "policies)"
+                f"policies: expected at most {MOST_TRAINED:,} in a study, got {trained:,} (robots x arms x policies)"
             )
-        known = [condition.name for condition in self.conditions]
+        known = [arm.name for arm in self.arms]
         for compared in self.comparisons:
             for side in ("first", "second"):
                 name = getattr(compared, side)
                 if name not in known:
                     raise InvalidArgument(
-                        f"comparisons.{side}: expected one of the conditions {', '.join(known)}, got {name!r} in "
+                        f"comparisons.{side}: expected one of the arms {', '.join(known)}, got {name!r} in "
                         f"{compared.name!r}"
                     )
         if self.culture.kind != "files" and self.needs_neurons:
@@ -286,22 +284,22 @@ class Study:
                 self._minute_of(compared, [i * self.culture.interval_min for i in range(self.culture.sessions)])
         read_record(SAC, self.algorithm, "algorithm")
 
-    def condition(self, name: str) -> StudyCondition:
-        """The condition of this name."""
-        return next(condition for condition in self.conditions if condition.name == name)
+    def arm(self, name: str) -> Arm:
+        """The arm of this name."""
+        return next(arm for arm in self.arms if arm.name == name)
 
-    def minutes_of(self, condition: StudyCondition, first_min: float, last_min: float) -> dict[float, int]:
-        """Minutes that a condition is evaluated at, and in how many episodes: of its comparisons, and the last.
+    def minutes_of(self, arm: Arm, first_min: float, last_min: float) -> dict[float, int]:
+        """Minutes that an arm is evaluated at, and in how many episodes: of its comparisons, and the last.
 
         If it is trained on the first recording alone, also that one: how well did it learn what it was taught?
         """
         minutes: dict[float, int] = {}
         for compared in self.comparisons:
-            if condition.name in (compared.first, compared.second):
+            if arm.name in (compared.first, compared.second):
                 at = last_min if compared.at_min is None else compared.at_min
                 minutes[at] = max(minutes.get(at, 0), compared.episodes)
         minutes.setdefault(last_min, self.episodes)
-        if condition.learns_one_recording:
+        if arm.learns_one_recording:
             minutes[first_min] = max(minutes.get(first_min, 0), self.episodes)
         return minutes
 
@@ -331,14 +329,14 @@ class Study:
             )
         return min(start_min, key=lambda start: (abs(start - at), start))
 
-    def limit_minutes(self, first_min: float, last_min: float) -> list[float]:
+    def optimum_minutes(self, first_min: float, last_min: float) -> list[float]:
         """Minutes at which anything is evaluated, rising."""
-        return sorted({at for condition in self.conditions for at in self.minutes_of(condition, first_min, last_min)})
+        return sorted({at for arm in self.arms for at in self.minutes_of(arm, first_min, last_min)})
 
     @property
     def needs_neurons(self) -> bool:
-        """Whether any condition has neurons in it."""
-        return any(condition.through_neurons for condition in self.conditions)
+        """Whether any arm has neurons in it."""
+        return any(arm.through_neurons for arm in self.arms)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""

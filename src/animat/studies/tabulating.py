@@ -1,4 +1,4 @@
-"""The study's results as tables: scores of every condition, comparisons, controls, learning curves, the culture."""
+"""The study's results as tables: scores of every arm, comparisons, controls, learning curves, the culture."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from animat.recordings.findings import Finding
 from animat.studies.episodes import POLICY, RANDOM, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.heuristic import beside_heuristic
-from animat.studies.limits import kinds_of, left_out, limits_of_all, read_limits
+from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
 from animat.studies.results import (
     BesideHeuristic,
     ComparedReturns,
     ControlReturns,
-    Limit,
     Results,
     Score,
+    StudyOptimum,
     write_records,
     write_table,
     write_typed,
 )
-from animat.studies.specification import Body, Study, StudyCondition, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -47,15 +47,15 @@ LEVEL = 0.01
 """The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
 
 AIM = 0.97
-"""Normalised score from which a condition counts as being as good as its limit allows."""
+"""Normalised score from which an arm counts as being as good as its optimum allows."""
 
 LEFT_OUT = "left-out"
 """The finding that a robot cannot do something, which the study is without."""
 
 TRAINED = "trained: "
-"""In front of a condition's name among the controls."""
+"""In front of an arm's name among the controls."""
 
-CURVES = ("robot", "condition", "policy", "iterations", "episodes", "mean_return")
+CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 
 
 @final
@@ -67,15 +67,15 @@ class Tabulate(StudyTask):
         study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
         table = all_episodes(study, folder)
-        known = {body.name: References(study, folder, body, table) for body in study.robots}
-        limits = tuple(limit for body in study.robots for limit in read_limits(folder, body.name))
+        known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
+        optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
         results = Results(
             scores=tuple(_scores(study, table, first, last, known)),
             comparisons=tuple(_comparisons(study, table, last, known)),
-            controls=tuple(row for body in study.robots for row in _controls(study, table, body, known[body.name])),
-            heuristic=tuple(row for body in study.robots for row in beside_heuristic(study, table, body)),
-            limits=limits,
-            findings=tuple(_findings(study, timeline, limits)),
+            controls=tuple(row for spec in study.robots for row in _controls(study, table, spec, known[spec.name])),
+            heuristic=tuple(row for spec in study.robots for row in beside_heuristic(study, table, spec)),
+            optima=optima,
+            findings=tuple(_findings(study, timeline, optima)),
         )
         files = [write_typed(results_file(folder), results)]
         for name, kind in (
@@ -83,38 +83,38 @@ class Tabulate(StudyTask):
             ("comparisons", ComparedReturns),
             ("controls", ControlReturns),
             ("heuristic", BesideHeuristic),
-            ("limits", Limit),
+            ("optima", StudyOptimum),
         ):
             files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
-        told = ((finding.severity, finding.name, finding.sentence) for finding in results.findings)
-        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "sentence"), told))
+        told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
+        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             files.append(write_table(table_file(folder, "controllability"), head, _controllability(timeline)))
-        with written_whole(table_file(folder, "episodes")) as beside:
+        with atomic_write(table_file(folder, "episodes")) as beside:
             table.to_csv(beside, index=False, lineterminator="\n")
         return [*files, table_file(folder, "episodes")]
 
 
-def all_episodes(study: Study, folder: Path, robots: Iterable[Body] | None = None) -> DataFrame:
+def all_episodes(study: Study, folder: Path, robots: Iterable[RobotSpec] | None = None) -> DataFrame:
     """The table of episodes of all robots, or of some."""
     files = []
-    for body in study.robots if robots is None else robots:
-        files += [episodes_file(folder, body, condition) for condition in study.conditions]
-        files += [controls_file(folder, body, kind) for kind in kinds_of(study)]
+    for spec in study.robots if robots is None else robots:
+        files += [episodes_file(folder, spec, arm) for arm in study.arms]
+        files += [controls_file(folder, spec, kind) for kind in kinds_of(study)]
     return read_episodes(files)
 
 
-def _findings(study: Study, timeline: SimulatorTimeline | None, limits: Iterable[Limit]) -> Iterator[Finding]:
+def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable[StudyOptimum]) -> Iterator[Finding]:
     if timeline is not None:
         yield from timeline.findings
-    for limit in limits:
-        where = f"{limit.robot}, {named_mapping(limit.mapping, limit.percentiles)}, at {limit.at_min:g} min"
-        for told in limit.findings():
-            yield replace(told, sentence=f"{where}: {told.sentence}")
-    for sentence in left_out(study):
-        yield Finding(LEFT_OUT, "note", sentence)
+    for optimum in optima:
+        where = f"{optimum.robot}, {named_mapping(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
+        for told in optimum.findings():
+            yield replace(told, message=f"{where}: {told.message}")
+    for message in left_out(study):
+        yield Finding(LEFT_OUT, "note", message)
 
 
 def _controllability(timeline: SimulatorTimeline) -> Iterator[tuple[Any, ...]]:
@@ -130,36 +130,35 @@ class References:
         table: of the robot's episodes.
     """
 
-    def __init__(self, study: Study, folder: Path, body: Body, table: DataFrame) -> None:
-        self._limits = {
-            (limit.mapping, limit.percentiles, limit.at_min): limit for limit in limits_of_all(folder, body.name)
+    def __init__(self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame) -> None:
+        self._optima = {
+            (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
+            for optimum in optima_of_all(folder, spec.name)
         }
-        random = table[(table["robot"] == body.name) & (table["agent"] == RANDOM) & ~table["over_time"]]
+        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & ~table["over_time"]]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
             of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
             for at_min, returns in of_kind.groupby("at_min")["return"]:
                 self._random[kind.mapping, kind.percentiles, at_min] = float(returns.to_numpy().mean())
 
-    def random(self, condition: StudyCondition, at_min: float) -> float | None:
+    def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._of(self._random, condition, at_min)
+        return self._of(self._random, arm, at_min)
 
-    def limit(self, condition: StudyCondition, at_min: float) -> Limit | None:
+    def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
         """The optimal return and how well it is known.
 
         None for a control, which can do nothing, and where conditions with few responses were left out of it.
         """
-        if condition.delivery == "shuffled":
+        if arm.delivery == "shuffled":
             return None
-        return self._of(self._limits, condition, at_min)
+        return self._of(self._optima, arm, at_min)
 
-    def score(
-        self, condition: StudyCondition, at_min: float, mean: float, against: str = "best_return"
-    ) -> float | None:
-        """The normalised score, against the limit or another of its fields; None where nothing can be learned."""
-        random, limit = self.random(condition, at_min), self.limit(condition, at_min)
-        best = None if limit is None else getattr(limit, against)
+    def score(self, arm: Arm, at_min: float, mean: float, against: str = "best_return") -> float | None:
+        """The normalised score, against the optimum or another of its fields; None where nothing can be learned."""
+        random, optimum = self.random(arm, at_min), self.optimum(arm, at_min)
+        best = None if optimum is None else getattr(optimum, against)
         if random is None or best is None:
             return None
         try:
@@ -168,18 +167,18 @@ class References:
             return None
 
     @staticmethod
-    def _of(known: Mapping[tuple[str, str, float], T], condition: StudyCondition, at_min: float) -> T | None:
-        if condition.through_neurons:
-            return known.get((condition.mapping, condition.percentiles, at_min))
+    def _of(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
+        if arm.through_neurons:
+            return known.get((arm.mapping, arm.percentiles, at_min))
         # Without neurons every minute is the same.
-        return next((value for (mapping, _, _), value in known.items() if mapping == condition.mapping), None)
+        return next((value for (mapping, _, _), value in known.items() if mapping == arm.mapping), None)
 
 
 def performances(
-    table: DataFrame, robot: str, condition: StudyCondition, at_min: float, episodes: int | None = None
+    table: DataFrame, robot: str, arm: Arm, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
     """Each policy's mean return over its first `episodes` at a minute, or all: the paper's measure of a policy."""
-    of_robot = table[(table["robot"] == robot) & (table["arm"] == condition.name) & (table["agent"] == POLICY)]
+    of_robot = table[(table["robot"] == robot) & (table["arm"] == arm.name) & (table["agent"] == POLICY)]
     return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
 
 
@@ -191,18 +190,18 @@ def _known(end: float) -> float | None:
 def _scores(
     study: Study, table: DataFrame, first: float, last: float, references: Mapping[str, References]
 ) -> Iterator[Score]:
-    for body in study.robots:
-        known = references[body.name]
-        for condition in study.conditions:
-            for at_min, episodes in sorted(study.minutes_of(condition, first, last).items()):
-                means = performances(table, body.name, condition, at_min)
+    for spec in study.robots:
+        known = references[spec.name]
+        for arm in study.arms:
+            for at_min, episodes in sorted(study.minutes_of(arm, first, last).items()):
+                means = performances(table, spec.name, arm, at_min)
                 mean = float(means.mean())
-                middle = interquartile_mean(means, within=body.robot().return_range)
-                limit = known.limit(condition, at_min)
+                middle = interquartile_mean(means, within=spec.robot().return_range)
+                optimum = known.optimum(arm, at_min)
                 yield Score(
-                    robot=body.name,
-                    condition=condition.name,
-                    mapping=condition.mapping,
+                    robot=spec.name,
+                    arm=arm.name,
+                    mapping=arm.mapping,
                     at_min=at_min,
                     policies=len(means),
                     episodes=episodes,
@@ -211,14 +210,14 @@ def _scores(
                     interquartile_mean=middle.value,
                     low_95=_known(middle.low),
                     high_95=_known(middle.high),
-                    random=known.random(condition, at_min),
-                    limit=None if limit is None else limit.best_return,
-                    limit_grid_error=None if limit is None else limit.grid_error,
-                    limit_run=None if limit is None else limit.monte_carlo,
-                    limit_run_standard_error=None if limit is None else limit.standard_error,
-                    limit_without_clock=None if limit is None else limit.without_clock,
-                    normalised_score=known.score(condition, at_min, mean),
-                    score_without_clock=known.score(condition, at_min, mean, "without_clock"),
+                    random=known.random(arm, at_min),
+                    optimum=None if optimum is None else optimum.best_return,
+                    optimum_grid_error=None if optimum is None else optimum.grid_error,
+                    optimum_run=None if optimum is None else optimum.monte_carlo,
+                    optimum_run_standard_error=None if optimum is None else optimum.standard_error,
+                    optimum_without_clock=None if optimum is None else optimum.without_clock,
+                    normalised_score=known.score(arm, at_min, mean),
+                    score_without_clock=known.score(arm, at_min, mean, "without_clock"),
                 )
 
 
@@ -230,22 +229,22 @@ FIRST, SECOND, NONE, TOO_FEW = (
 )
 
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
-"""Of each outcome, whether it is the paper's, in which the second condition was always the better."""
+"""Of each outcome, whether it is the paper's, in which the second arm was always the better."""
 
 
 def outcome_of(told: Comparison) -> str:
-    """In words: which condition is better, that neither was found to be, or that it could not have been found."""
+    """In words: which arm is better, that neither was found to be, or that it could not have been found."""
     if told.p_normal < LEVEL:
         return SECOND if told.effect.value > 0 else FIRST
     # With four policies a side even U = 0 has p = 0.03: nothing could be found, which says nothing of a difference.
     return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
 
 
-def _limit_error(limit: Limit | None) -> float | None:
+def _optimum_error(optimum: StudyOptimum | None) -> float | None:
     """How far the optimal return may lie from its value: by the grid, or down to the controller's return."""
-    if limit is None or limit.grid_error is None:
+    if optimum is None or optimum.grid_error is None:
         return None
-    return max(limit.grid_error, *(abs(each.value or 0.0) for each in limit.findings()), 0.0)
+    return max(optimum.grid_error, *(abs(each.value or 0.0) for each in optimum.findings()), 0.0)
 
 
 def _comparisons(
@@ -254,16 +253,16 @@ def _comparisons(
     made = []
     for compared in study.comparisons:
         at_min = last if compared.at_min is None else compared.at_min
-        sides = study.condition(compared.first), study.condition(compared.second)
-        for body in study.robots:
-            a, b = (performances(table, body.name, side, at_min, compared.episodes) for side in sides)
-            made.append((compared, body.name, sides, at_min, a, b, compare(a, b)))
+        sides = study.arm(compared.first), study.arm(compared.second)
+        for spec in study.robots:
+            a, b = (performances(table, spec.name, side, at_min, compared.episodes) for side in sides)
+            made.append((compared, spec.name, sides, at_min, a, b, compare(a, b)))
     corrected = holm({f"{compared.name}/{robot}": told.p_normal for compared, robot, *_, told in made})
     for compared, robot, (first, second), at_min, a, b, told in made:
         known = references[robot]
         printed = PRINTED.get((compared.name, robot)) if study.paper else None
         outcome = outcome_of(told)
-        limits = [known.limit(condition, at_min) for condition in (first, second)]
+        optima = [known.optimum(arm, at_min) for arm in (first, second)]
         yield ComparedReturns(
             comparison=compared.name,
             robot=robot,
@@ -277,10 +276,10 @@ def _comparisons(
             score_first=known.score(first, at_min, float(a.mean())),
             score_second=known.score(second, at_min, float(b.mean())),
             random_second=known.random(second, at_min),
-            limit_first=None if limits[0] is None else limits[0].best_return,
-            limit_second=None if limits[1] is None else limits[1].best_return,
-            limit_error_first=_limit_error(limits[0]),
-            limit_error_second=_limit_error(limits[1]),
+            optimum_first=None if optima[0] is None else optima[0].best_return,
+            optimum_second=None if optima[1] is None else optima[1].best_return,
+            optimum_error_first=_optimum_error(optima[0]),
+            optimum_error_second=_optimum_error(optima[1]),
             u=told.u,
             p_normal=told.p_normal,
             p_exact=told.p_exact,
@@ -295,26 +294,26 @@ def _comparisons(
         )
 
 
-def _controls(study: Study, table: DataFrame, body: Body, known: References) -> Iterator[ControlReturns]:
+def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        arm = named_mapping(kind.mapping, kind.percentiles)
-        of_kind = table[(table["robot"] == body.name) & (table["arm"] == arm) & (table["agent"] != POLICY)]
+        through = named_mapping(kind.mapping, kind.percentiles)
+        of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
         for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
-            for condition in study.conditions:
-                if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles):
-                    means = performances(table, body.name, condition, at_min)
-                    if condition.trained and len(means):
-                        rows.append((f"{TRAINED}{condition.name}", len(means), means))
+            for arm in study.arms:
+                if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles):
+                    means = performances(table, spec.name, arm, at_min)
+                    if arm.trained and len(means):
+                        rows.append((f"{TRAINED}{arm.name}", len(means), means))
             for agent, of_agent in of_minute.groupby("agent", sort=False):
                 means = mean_returns(of_agent)
                 # Over actors, as each is one sample; a control of one actor has its episodes for samples.
                 rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
-            limit = known.limit(kind, at_min)
+            optimum = known.optimum(kind, at_min)
             for name, actors, samples in rows:
                 mean = float(samples.mean())
                 yield ControlReturns(
-                    robot=body.name,
+                    robot=spec.name,
                     mapping=kind.mapping,
                     percentiles=kind.percentiles,
                     at_min=at_min,
@@ -323,24 +322,22 @@ def _controls(study: Study, table: DataFrame, body: Body, known: References) -> 
                     mean_return=mean,
                     standard_error=float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None,
                     random=known.random(kind, at_min),
-                    limit=None if limit is None else limit.best_return,
+                    optimum=None if optimum is None else optimum.best_return,
                     normalised_score=known.score(kind, at_min, mean),
                 )
 
 
-def learning_of(
-    study: Study, folder: Path, body: Body, condition: StudyCondition
-) -> Float64[np.ndarray, "policies parts 3"]:
-    """The learning curves of a condition's policies, as in `Policy.learning_curve`."""
-    out = policies_folder(folder, body, condition)
+def learning_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Float64[np.ndarray, "policies parts 3"]:
+    """The learning curves of an arm's policies, as in `Policy.learning_curve`."""
+    out = policies_folder(folder, spec, arm)
     curves = [Policy.load(out / f"p{i}.safetensors").learning_curve for i in range(study.policies)]
     return np.stack(curves).astype(np.float64)
 
 
 def _curves(study: Study, folder: Path) -> Iterator[tuple[Any, ...]]:
-    for body in study.robots:
-        for condition in (condition for condition in study.conditions if condition.trained):
-            for i, curve in enumerate(learning_of(study, folder, body, condition).tolist()):
+    for spec in study.robots:
+        for arm in (arm for arm in study.arms if arm.trained):
+            for i, curve in enumerate(learning_of(study, folder, spec, arm).tolist()):
                 for iterations, episodes, mean in curve:
                     told = int(iterations), int(episodes), None if np.isnan(mean) else mean
-                    yield body.name, condition.name, f"p{i}", *told
+                    yield spec.name, arm.name, f"p{i}", *told

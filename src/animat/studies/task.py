@@ -31,8 +31,8 @@ class StudyTask(Task):
         return {name: attrgetter(name)(self.study) for name in self.sizes}
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        for body in self.study.robots:
-            body.robot()  # It registers one that is imported, for policies to be loaded.
+        for spec in self.study.robots:
+            spec.robot()  # It registers one that is imported, for policies to be loaded.
         return self.make(folder, progress)
 
     @abc.abstractmethod

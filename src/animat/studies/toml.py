@@ -12,9 +12,20 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
 from animat.records import read_record
 from animat.studies.specification import Study
+from animat.training.settings import FORMER as FORMER_SETTINGS
 
 MOST_BYTES = 2**20
 """Of a specification."""
+FORMER = {
+    "": {"conditions": "arms", "limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
+    "robots": {"limit_resolution": "optimum_resolution"},
+    "culture": {"presentations": "trials"},
+    "simulators": {"despite": "allow"},
+    "algorithm": FORMER_SETTINGS,
+}
+"""What keys are called in files of before, table by table (at the top: none)."""
+FORMER_KINDS = {"made-up": "synthetic"}
+"""Of cultures."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
@@ -38,9 +49,33 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
     try:
-        return read_record(Study, data)
+        return read_record(Study, _in_todays_words(data))
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
+
+
+def _in_todays_words(data: dict[str, Any]) -> dict[str, Any]:
+    """The same with former keys by their names of today; whatever else is wrong is left for the checks."""
+    data = _renamed(data, FORMER[""])
+    for name, names in FORMER.items():
+        table = data.get(name)
+        if isinstance(table, dict):
+            data[name] = _renamed(table, names)
+        elif isinstance(table, list):
+            data[name] = [_renamed(each, names) if isinstance(each, dict) else each for each in table]
+    culture = data.get("culture")
+    if isinstance(culture, dict) and isinstance(kind := culture.get("kind"), str):
+        data["culture"] = {**culture, "kind": FORMER_KINDS.get(kind, kind)}
+    return data
+
+
+def _renamed(table: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
+    found = {}
+    for key, value in table.items():
+        today = names.get(key, key)
+        # Where both are given, the former one is told as a key that is not known.
+        found[key if today in table else today] = value
+    return found
 
 
 def study_to_toml(study: Study) -> str:

@@ -1,4 +1,4 @@
-"""Training as jobs: each a group of one condition's policies on one robot, with its checkpoint in the folder."""
+"""Training as jobs: each a group of one arm's policies on one robot, with its checkpoint in the folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from animat.progress import Progress
 from animat.studies.draws import draw_seed
 from animat.studies.places import TIMELINE, policies_folder
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 from animat.training.folder import describe, provenance_of, write_description
 from animat.training.group import Group, save_policies, untrained_policies
@@ -25,47 +25,47 @@ from animat.training.specification import Training
 @final
 @dataclass(frozen=True)
 class TrainGroup(StudyTask):
-    """Train some policies of a condition on a robot, going on from where a killed run stopped."""
+    """Train some policies of an arm on a robot, going on from where a killed run stopped."""
 
     sizes = ("algorithm",)
 
-    body: Body
-    condition: StudyCondition
+    spec: RobotSpec
+    arm: Arm
     members: tuple[int, ...]
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        timeline = timeline_for(self.condition, folder)
-        training = training_of(self.study, self.body, self.condition)
+        timeline = timeline_for(self.arm, folder)
+        training = training_of(self.study, self.spec, self.arm)
         manifest = describe(training, timeline)
-        out = policies_folder(folder, self.body, self.condition)
+        out = policies_folder(folder, self.spec, self.arm)
         group = Group(training, self.members, timeline, manifest["fingerprint"], provenance_of(manifest))
-        checkpoint = folder / UNFINISHED / self.body.name / self.condition.slug / f"p{self.members[0]}.npz"
-        if self.condition.trained:
+        checkpoint = folder / UNFINISHED / self.spec.name / self.arm.slug / f"p{self.members[0]}.npz"
+        if self.arm.trained:
             files = train_into(out, group, checkpoint, progress)
         else:
             files = save_policies(group, untrained_policies(group), out)
         return [*files, write_description(out, manifest)]
 
 
-def training_of(study: Study, body: Body, condition: StudyCondition) -> Training:
-    """What a condition means for the trainer."""
-    through_neurons = condition.through_neurons
+def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:
+    """What an arm means for the trainer."""
+    through_neurons = arm.through_neurons
     return Training(
-        robot=body.robot(),
-        mapping=mapping_named(condition.mapping) if through_neurons else None,
+        robot=spec.robot(),
+        mapping=mapping_named(arm.mapping) if through_neurons else None,
         policies=study.policies,
-        iterations=body.trained_for,
-        # Tests of ranks take the policies of two conditions for independent: none starts as another one does.
-        seed=draw_seed("training", study.seed, body.name, condition.slug),
-        shadowing=condition.shadowing,
+        iterations=spec.trained_for,
+        # Tests of ranks take the policies of two arms for independent: none starts as another one does.
+        seed=draw_seed("training", study.seed, spec.name, arm.slug),
+        shadowing=arm.shadowing,
         duration_min=study.training_min,
-        percentiles=condition.percentiles,
-        delivery=condition.delivery,
-        commands=None if through_neurons else body.robot().baseline_commands,
+        percentiles=arm.percentiles,
+        delivery=arm.delivery,
+        commands=None if through_neurons else spec.robot().baseline_commands,
         algorithm=SAC(**study.algorithm),  # type: ignore[arg-type]
     )
 
 
-def timeline_for(condition: StudyCondition, folder: Path) -> SimulatorTimeline | None:
-    """The study's simulators, for a condition that has neurons."""
-    return load_timeline(folder / TIMELINE) if condition.through_neurons else None
+def timeline_for(arm: Arm, folder: Path) -> SimulatorTimeline | None:
+    """The study's simulators, for an arm that has neurons."""
+    return load_timeline(folder / TIMELINE) if arm.through_neurons else None

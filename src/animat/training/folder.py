@@ -20,8 +20,9 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.group import Group, split_groups
+from animat.training.settings import FORMER
 from animat.training.specification import Training
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 MANIFEST = "training.json"
 _NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
@@ -59,7 +60,7 @@ def describe(training: Training, timeline: SimulatorTimeline | None, sources: Se
     # By way of JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    fingerprint = fingerprint_of(manifest, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    fingerprint = fingerprint_of(_by_former_names(manifest), *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # Names of files are told but do not decide: the same recordings in another place are the same.
     return manifest | {"sources": list(sources), "fingerprint": fingerprint}
 
@@ -99,7 +100,7 @@ def is_finished(training: Training, folder: Path) -> bool:
 
 def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
     """Make a folder this training's."""
-    with written_whole(folder / MANIFEST) as beside:
+    with atomic_write(folder / MANIFEST) as beside:
         beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
     return folder / MANIFEST
 
@@ -121,12 +122,28 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
 def _description_in(folder: Path) -> dict[str, Any] | None:
     """What a folder says it holds; None if it is free."""
     if (found := description_in(folder / MANIFEST, "training")) is not None:
-        return found
+        return _renamed(found, FORMER, ("a presentation", "a trial"))
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     return None
+
+
+def _by_former_names(manifest: dict[str, Any]) -> dict[str, Any]:
+    """A description as fingerprints are made of it: those of before are of the same bytes, and their folders go on."""
+    return _renamed(manifest, {today: former for former, today in FORMER.items()}, ("a trial", "a presentation"))
+
+
+def _renamed(manifest: dict[str, Any], names: dict[str, str], pulses: tuple[str, str]) -> dict[str, Any]:
+    """A description with other names for the settings of the algorithm, and for what the pulses are counted by."""
+    training, simulators = manifest.get("training"), manifest.get("simulators")
+    if isinstance(training, dict) and isinstance(training.get("algorithm"), dict):
+        algorithm = {names.get(name, name): value for name, value in training["algorithm"].items()}
+        manifest = {**manifest, "training": {**training, "algorithm": algorithm}}
+    if isinstance(simulators, dict) and isinstance(presented := simulators.get("presentation"), str):
+        manifest = {**manifest, "simulators": {**simulators, "presentation": presented.replace(*pulses)}}
+    return manifest
 
 
 def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:

@@ -26,7 +26,7 @@ from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.wrappers import EpisodeLimit
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
@@ -190,7 +190,7 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
 def _write_checkpoint(path: Path, fingerprint: str, done: int, learners: Learner, curve: np.ndarray) -> None:
     leaves = jax.tree.leaves(learners._replace(key=jax.random.key_data(learners.key)))
     arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    with written_whole(path) as beside, beside.open("wb") as file:
+    with atomic_write(path) as beside, beside.open("wb") as file:
         np.savez(file, fingerprint=np.array(fingerprint), done=np.array(done), curve=curve, **arrays)
 
 

@@ -32,7 +32,7 @@ from animat.robots.registry import REGISTRY as ROBOTS
 from animat.robots.registry import robot_from_dict, robot_to_dict
 from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 FORMAT = "animat-policy-1"
 HIDDEN_ACTIVATION = "relu"
@@ -107,7 +107,7 @@ class Policy:
                 f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
             )
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
-        widths = [len(self.robot.quantities) + self.neural_observation, *(bias.size for bias in self.biases)]
+        widths = [len(self.robot.observation_spec) + self.neural_observation, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
             raise InvalidArgument(
@@ -142,7 +142,7 @@ class Policy:
 
     @property
     def percentiles(self) -> str:
-        """In training, the mapping's percentiles were `"moving"` with the simulator, or those of the `"first"` held."""
+        """In training, the mapping's percentiles were `"moving"` with the simulator, or fixed by the `"first"` one."""
         return str(self._trained.get("percentiles", "moving"))
 
     @property
@@ -251,7 +251,7 @@ class Policy:
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
         data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
-        with written_whole(path) as beside:
+        with atomic_write(path) as beside:
             beside.write_bytes(data)
 
     @staticmethod

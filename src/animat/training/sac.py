@@ -173,7 +173,7 @@ def discrete_losses(
     actor_loss = jnp.mean(jnp.sum(pi * (alpha * log_pi - fixed(jnp.min(q, axis=0))), axis=-1))
 
     entropy = fixed(-jnp.sum(pi * log_pi, axis=-1))
-    alpha_loss = trained.log_alpha * jnp.mean(entropy - settings.entropy_share * math.log(q.shape[-1]))
+    alpha_loss = trained.log_alpha * jnp.mean(entropy - settings.target_entropy_ratio * math.log(q.shape[-1]))
     return critic_loss, actor_loss, alpha_loss
 
 
@@ -212,13 +212,13 @@ def continuous_losses(
 def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
     """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
-    n, n_actions, hidden = len(environment.quantities), environment.n_actions, settings.hidden
+    n, n_actions, hidden = len(environment.observation_spec), environment.n_actions, settings.hidden
     n_drawn = environment.n_drawn
     inputs, values, outputs = (n + 1 + n_drawn, 1, 2 * n_drawn) if n_actions is None else (n + 1, n_actions, n_actions)
     actor, critics = initial_networks(
         weight_key, ((n, hidden, hidden, outputs), ()), ((inputs, hidden, hidden, values), (2,))
     )
-    trained = Trained(actor, critics, jnp.float32(math.log(settings.first_alpha)))
+    trained = Trained(actor, critics, jnp.float32(math.log(settings.initial_alpha)))
     return Learner(
         trained=trained,
         deployed=actor,
@@ -255,7 +255,7 @@ def train_chunk(
     # The uniforms that a round acts with and learns with: one block, drawn at once.
     acting = (settings.environments, environment.n_drawn + environment.noise_size)
     blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
-    learning = (settings.updates, blocks, settings.batch)
+    learning = (settings.gradient_steps, blocks, settings.batch)
     n_acting = math.prod(acting)
 
     def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
@@ -340,11 +340,11 @@ def _learn(
     settings: SAC,
     learner: Learner,
     available: Int[Array, ""],
-    uniforms: Float[Array, "updates blocks batch"],
+    uniforms: Float[Array, "gradient_steps blocks batch"],
 ) -> Learner:
-    """`settings.updates` gradient steps on transitions drawn from the replay."""
+    """`settings.gradient_steps` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
-    n, n_drawn = len(environment.quantities) + 1, environment.n_drawn
+    n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
     is_continuous = environment.n_actions is None
 
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
@@ -361,7 +361,7 @@ def _learn(
         gradient = jax.grad(losses)(trained, targets, batch, noise)
         steps, optimiser = adam.update(gradient, optimiser)
         trained = optax.apply_updates(trained, steps)
-        targets = jax.tree.map(lambda t, c: t + settings.follow * (c - t), targets, trained.critics)
+        targets = jax.tree.map(lambda t, c: t + settings.tau * (c - t), targets, trained.critics)
         return (trained, targets, optimiser), None
 
     (trained, targets, optimiser), _ = jax.lax.scan(
@@ -376,7 +376,7 @@ def _average(settings: SAC, deployed: Network, actor: Network, index: Int[Array,
     The last actor of a training is as good as its last few updates were lucky; the average is not. With k the
     averaging and t the rounds done: average += (k + 1) / (t + k) (actor - average), so that the first is taken whole.
     """
-    rate = (settings.averaging + 1.0) / (index + 1.0 + settings.averaging)
+    rate = (settings.averaging_exponent + 1.0) / (index + 1.0 + settings.averaging_exponent)
     moved: Network = jax.tree.map(lambda average, new: average + rate * (new - average), deployed, actor)
     return moved
 

@@ -12,6 +12,14 @@ from animat.records import Number, Positive, Share, Whole, record
 MOST_POLICIES = 1_000
 MOST_ITERATIONS = 2_000_000_000
 """Iterations are counted in 32 bits, with room for a last round of all environments."""
+FORMER = {
+    "updates": "gradient_steps",
+    "follow": "tau",
+    "averaging": "averaging_exponent",
+    "first_alpha": "initial_alpha",
+    "entropy_share": "target_entropy_ratio",
+}
+"""What files of before call settings."""
 
 
 @record
@@ -20,17 +28,18 @@ class SAC:
 
     Attributes:
         environments: episodes run side by side by one policy.
-        updates: gradient updates after each step of all of them; updates / environments is the replay ratio.
-        batch: transitions in one update.
+        gradient_steps: after each step of all of them; gradient_steps / environments is the replay ratio.
+        batch: transitions in one gradient step.
         replay: transitions remembered; the oldest are forgotten first.
         hidden: width of each of the two hidden layers of actor and critics.
         learning_rate: of Adam, for actor, critics and alpha.
         discount: gamma.
-        follow: share of the critics that the target critics take over at each update (tau).
+        tau: share of the critics that the target critics take over at each gradient step.
         reward_scale: rewards are multiplied by it inside the learner only.
-        averaging: the deployed actor is an average over about the last 1 / (averaging + 1) of its training so far.
-        first_alpha: weight of the entropy bonus at the start.
-        entropy_share: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
+        averaging_exponent: of polynomial-decay averaging; the deployed actor is an average over about the last
+            1 / (averaging_exponent + 1) of its training so far.
+        initial_alpha: weight of the entropy bonus at the start.
+        target_entropy_ratio: the entropy that discrete actions keep, as a share of the largest possible, log(actions).
         entropy_nats: the entropy that a continuous action keeps, for each of its commands.
 
     Raises:
@@ -40,18 +49,18 @@ class SAC:
 
     # With the most of each, a group of five policies takes some gigabytes.
     environments: Annotated[Whole, Field(ge=1, le=65_536)] = 32
-    updates: Annotated[Whole, Field(ge=1, le=1_024)] = 4
+    gradient_steps: Annotated[Whole, Field(ge=1, le=1_024)] = 4
     batch: Annotated[Whole, Field(ge=1, le=16_384)] = 64
     # As float32 numbers no more.
     replay: Annotated[Whole, Field(ge=1, le=2**23)] = 131_072
     hidden: Annotated[Whole, Field(ge=1, le=1_024)] = 64
     learning_rate: Positive = 1e-3
     discount: Share = 0.99
-    follow: Share = 0.005
+    tau: Share = 0.005
     reward_scale: Positive = 0.1
-    averaging: Annotated[Whole, Field(ge=1, le=1_000_000)] = 3
-    first_alpha: Positive = 0.1
-    entropy_share: Share = 0.1
+    averaging_exponent: Annotated[Whole, Field(ge=1, le=1_000_000)] = 3
+    initial_alpha: Positive = 0.1
+    target_entropy_ratio: Share = 0.1
     entropy_nats: Number = -1.0
 
     def __post_init__(self) -> None:

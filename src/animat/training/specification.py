@@ -63,7 +63,7 @@ class Training:
         shadowing: whether simulators are refreshed during training; if not, the first one is used throughout.
         duration_min: minutes of the culture's clock that the whole training stands for (the paper: 60); None: as long
             as the recordings that it is trained on (`SimulatorTimeline.span_min`).
-        percentiles: `"moving"` with the simulator in use, or those of the `"first"` recording held.
+        percentiles: `"moving"` with the simulator in use, or fixed by the `"first"` recording.
         delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random whatever it chose.
         neural_observation: whether policies see what the neurons remember, too (`animat.wrappers.NeuralObservation`);
             no closed loop runs such policies; they are evaluated on simulators.

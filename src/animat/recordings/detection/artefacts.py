@@ -5,7 +5,7 @@ Around a stimulus, three things are done to each channel, in this order:
 1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse the trace is a straight line, and nothing is looked for.
 2. *Saturation*: a channel whose amplifier saturates, as those near a stimulated electrode do, is blanked on until it
    comes out of it: at the rail if that is known, else while the trace does not move for 0.4 ms on end and is far from
-   where it was. A spike's trough in coarse steps stands still for a shorter time.
+   where it was. A spike's negative peak in coarse steps stands still for a shorter time.
 3. *Recovery*: what decays afterwards is fitted by a exp(-t / tau) + b, tau from some 0.2 to 16 ms, and the
    exponential is taken away; what is far off the fit (spikes) hardly counts in it. Nothing is blanked.
 

@@ -13,10 +13,10 @@ from jaxtyping import Float32, Float64, Int64
 
 from animat.progress import Progress, Silent
 from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
+from animat.recordings.detection.negative_peaks import find_negative_peaks
 from animat.recordings.detection.noise import median_noise_uv
 from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
 from animat.recordings.detection.settings import Detection
-from animat.recordings.detection.troughs import find_troughs
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
 
@@ -32,7 +32,7 @@ class FoundSpikes:
     """Spikes that were found, in the order of time.
 
     Attributes:
-        time_s: at their troughs, on the recording's clock, shape (spikes,).
+        time_s: at their negative peaks, on the recording's clock, shape (spikes,).
         channel: row of the channel table, shape (spikes,).
         noise_uv: standard deviation of each channel's noise, shape (channels,).
         findings: what was noticed.
@@ -54,8 +54,9 @@ def find_spikes(
 ) -> FoundSpikes:
     """Find spikes in raw traces.
 
-    A spike is a trough of the band-passed trace deeper than `threshold` standard deviations of its channel's noise, the
-    deepest within the dead time on both sides (`find_troughs`), outside what is blanked around stimuli (`artefacts`).
+    A spike is a negative peak of the band-passed trace deeper than `threshold` standard deviations of its channel's
+    noise, the deepest within the dead time on both sides (`find_negative_peaks`), outside what is blanked around
+    stimuli (`artefacts`).
 
     Args:
         traces: where the voltage is.
@@ -85,7 +86,7 @@ def find_spikes(
 
 
 def depths_uv(noise_uv: Float32[np.ndarray, " channels"], threshold: float) -> Float32[np.ndarray, " channels"]:
-    """The depth that a trough must have on each channel; infinite on dead ones."""
+    """The depth that a negative peak must have on each channel; infinite on dead ones."""
     depth_uv = np.asarray(threshold * noise_uv, dtype=np.float32)
     depth_uv[is_dead(noise_uv)] = np.inf
     return depth_uv
@@ -199,7 +200,7 @@ def _of_block(
     filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
     if cleaned.is_blank is not None:
         filtered[cleaned.is_blank] = 0.0
-    row, sample = find_troughs(
+    row, sample = find_negative_peaks(
         filtered, depth_uv[columns], apart, piece.margin, piece.margin + piece.stop - piece.start
     )
     saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]

@@ -18,8 +18,8 @@ class Detection:
 
     Attributes:
         band_hz: pass band of the zero-phase filter; None where the traces are filtered already.
-        threshold: depth of a trough that is a spike, in standard deviations of the channel's noise.
-        dead_time_ms: of two troughs within it, the deeper one is the spike.
+        threshold: depth of a negative peak that is a spike, in standard deviations of the channel's noise.
+        dead_time_ms: of two negative peaks within it, the deeper one is the spike.
         blank_ms: from before to after each stimulus in which nothing is looked for; 1.5 ms after by default, so that
             the response window from 2 ms on stays whole.
         saturation_uv: at which an amplifier saturates; None: where the trace is flat, far from where it was.

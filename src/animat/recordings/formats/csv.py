@@ -70,11 +70,11 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
-        sentence = (
+        message = (
             f"{path.name} has {len(columns['spike_time_s']):,} spikes but no stimuli beside it, so there are no "
             f"responses to learn from: {looked_for} was looked for; name the file of stimuli so"
         )
-        findings.append(Finding("no-stimuli", "refuse", sentence))
+        findings.append(Finding("no-stimuli", "refuse", message))
     else:
         stimulus_columns, stimulus_findings = _columns(read_text_table(stimuli, "stimulus_time_s"), STIMULUS_COLUMNS)
         columns |= stimulus_columns

@@ -243,8 +243,8 @@ class _Found:
     def _seconds(self, frame: Column) -> Column:
         return np.asarray((frame.astype(np.int64) - int(self.first_frame or 0)) / self.rate_hz)
 
-    def _note(self, name: str, sentence: str, severity: Any, value: float | None = None) -> None:
-        self.findings.append(Finding(name, severity, sentence, value))
+    def _note(self, name: str, message: str, severity: Any, value: float | None = None) -> None:
+        self.findings.append(Finding(name, severity, message, value))
 
 
 def _new(file: Hdf5File, part: str | None) -> _Found:

@@ -37,7 +37,7 @@ from animat.recordings.told import from_words
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
-from animat.writing import written_whole
+from animat.writing import atomic_write
 
 WHAT = "NWB recording"
 LARGEST_VALUES = 10_000_000
@@ -81,7 +81,7 @@ def write_nwb(
             f"got {first_s:g} to {last_s:g} s"
         )
     tree = nwb_file(recording, of_channels)
-    with written_whole(path) as beside, beside.open("r+b", buffering=0) as raw:
+    with atomic_write(path) as beside, beside.open("r+b", buffering=0) as raw:
         disk = _Disk(raw)
         try:
             with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w") as nwb_io:

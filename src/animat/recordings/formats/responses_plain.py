@@ -186,8 +186,8 @@ def _long(table: TextTable) -> _Read:
     values = np.zeros(len(trials) * len(labels))
     values[cells] = numbers
     if missing := len(values) - len(distinct):
-        sentence = f"{missing:,} of {len(values):,} pairs of a stimulus and a channel have no line: taken for 0"
-        table.findings.append(Finding("pairs-missing", "note", sentence, float(missing)))
+        message = f"{missing:,} of {len(values):,} pairs of a stimulus and a channel have no line: taken for 0"
+        table.findings.append(Finding("pairs-missing", "note", message, float(missing)))
     used = {place, channel, trial}
     return values.reshape(len(trials), len(labels)), kind, labels, first[order], stimulus_of, used
 

@@ -110,9 +110,9 @@ class TextTable:
         self._note_once("decimal-commas", f"{name} of {self.path.name} has decimal commas, read as points")
         return np.array([cell.replace(",", ".") or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
 
-    def _note_once(self, name: str, sentence: str) -> None:
-        if not any(finding.sentence == sentence for finding in self.findings):
-            self.findings.append(Finding(name, "note", sentence))
+    def _note_once(self, name: str, message: str) -> None:
+        if not any(finding.message == message for finding in self.findings):
+            self.findings.append(Finding(name, "note", message))
 
 
 def read_text_table(path: Path, bare: str | None = None) -> TextTable:

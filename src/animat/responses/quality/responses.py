@@ -322,7 +322,7 @@ def _difference(responses: Responses) -> Iterator[Finding]:
             "little-difference",
             "warning",
             f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
-            "a robot can hardly be steered: --limit cartpole computes how far; stimulate in ways that differ more",
+            "a robot can hardly be steered: --optimum cartpole computes how far; stimulate in ways that differ more",
             spread,
         )
     else:

@@ -13,56 +13,56 @@ from animat.progress import Part, Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
-from animat.studies.places import limits_file
-from animat.studies.results import Limit, read_typed, write_typed
+from animat.studies.places import optima_file
+from animat.studies.results import StudyOptimum, read_typed, write_typed
 from animat.studies.simulating import read_series
-from animat.studies.specification import Body, Study, StudyCondition
+from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 
 ROUGH = 0.5
-"""Steps of the grid along each axis where every recording has its limit, as a part of those elsewhere."""
+"""Steps of the grid along each axis where every recording has its optimum, as a part of those elsewhere."""
 COARSER = 0.8
-"""Steps of the grid of redrawn responses along each axis, at most, as a part of the limit's."""
+"""Steps of the grid of bootstrapped responses along each axis, at most, as a part of the optimum's."""
 
 
-def kinds_of(study: Study) -> list[StudyCondition]:
-    """One condition for each mapping and way to hold percentiles, delivered as chosen: each has a limit of its own."""
-    kinds: dict[tuple[str, str], StudyCondition] = {}
-    for condition in study.conditions:
-        limit = StudyCondition("limit", mapping=condition.mapping, percentiles=condition.percentiles)
-        kinds.setdefault((condition.mapping, condition.percentiles), limit)
+def kinds_of(study: Study) -> list[Arm]:
+    """One arm for each mapping and way to hold percentiles, delivered as chosen: each has its own optimum."""
+    kinds: dict[tuple[str, str], Arm] = {}
+    for arm in study.arms:
+        optimum = Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles)
+        kinds.setdefault((arm.mapping, arm.percentiles), optimum)
     return list(kinds.values())
 
 
-def rough_kinds(study: Study) -> list[StudyCondition]:
-    """Of `kinds_of`, those whose limit is computed at every recording; of mappings without steps that is long."""
+def rough_kinds(study: Study) -> list[Arm]:
+    """Of `kinds_of`, those whose optimum is computed at every recording; of mappings without steps that is long."""
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
 
-def limits_of_all(folder: Path, robot: str, what: str = "limits") -> list[Limit]:
-    """The limits of all conditions; what policies could do with fewer is none of theirs."""
-    return [limit for limit in read_limits(folder, robot, what) if limit.left_out is None]
+def optima_of_all(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
+    """The optima of all conditions; what policies could do with fewer is none of theirs."""
+    return [optimum for optimum in read_optima(folder, robot, what) if optimum.left_out is None]
 
 
-def read_limits(folder: Path, robot: str, what: str = "limits") -> tuple[Limit, ...]:
-    """The limits as the job left them."""
-    return read_typed(limits_file(folder, robot, what), tuple[Limit, ...])
+def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOptimum, ...]:
+    """The optima as the job left them."""
+    return read_typed(optima_file(folder, robot, what), tuple[StudyOptimum, ...])
 
 
 def left_out(study: Study) -> list[str]:
     """What its robots cannot do, and the study is without: a sentence each."""
-    sentences: list[str] = []
-    for robot in dict.fromkeys(body.robot() for body in study.robots):
+    messages: list[str] = []
+    for robot in dict.fromkeys(spec.robot() for spec in study.robots):
         lacks = lacking(robot)
         if (why_not := no_grid(robot)) is not None:
             lacks.setdefault("value_grid", f"no optimal return: {why_not}")
-        sentences += lacks.values()
-    return sentences
+        messages += lacks.values()
+    return messages
 
 
 @final
 @dataclass(frozen=True)
-class FindLimits(StudyTask):
+class FindOptima(StudyTask):
     """The optimal return on a robot for every mapping of the study, of conditions with enough responses.
 
     Of a robot without a grid the table is empty.
@@ -72,19 +72,19 @@ class FindLimits(StudyTask):
             at the minutes that anything is evaluated at.
     """
 
-    sizes = ("limit_resolution", "limit_episodes")
+    sizes = ("optimum_resolution", "optimum_episodes")
 
-    body: Body
+    spec: RobotSpec
     over_time: bool = False
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        file = limits_file(folder, self.body.name, "over-time" if self.over_time else "limits")
-        if no_grid(self.body.robot()) is not None:
+        file = optima_file(folder, self.spec.name, "over-time" if self.over_time else "optima")
+        if no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
         study, timeline = as_recorded(self.study, folder)
         first, last = first_minute(timeline), last_minute(timeline)
-        kinds, minutes = kinds_of(study), study.limit_minutes(first, last)
-        resolution, episodes = self.body.limit_resolution or study.limit_resolution, study.limit_episodes
+        kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
+        resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:
             kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
             resolution, episodes = min(ROUGH, resolution), 0
@@ -96,14 +96,14 @@ class FindLimits(StudyTask):
             series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
             timeline = replace(timeline, responses=tuple(series))
         for i, (kind, at) in enumerate(asked):
-            environment = setting_of(study, self.body, kind, timeline).environment
+            environment = setting_of(study, self.spec, kind, timeline).environment
             if timeline is None or not isinstance(environment, Animat):
                 cases[i] = environment, None
                 continue
             responses = timeline.responses[timeline.row_at(at)]
             left_out[i] = few_of(responses)
             if len(left_out[i]) < len(responses.conditions):
-                of = Counted.of(environment, timeline, at, are_held=kind.percentiles == "first")
+                of = Counted.of(environment, timeline, at, are_fixed=kind.percentiles == "first")
                 counted[i], cases[i] = of, (of.environment, of.simulator)
         # Cases side by side all have as many actions as the one with the most, and as many commands as all together: a
         # continuous one has many, and over time there are many cases.
@@ -122,28 +122,28 @@ class FindLimits(StudyTask):
         for done, (i, of) in enumerate(known.items(), len(cases) + 1):
             found[i] = of.known(found[i], resolution=COARSER * resolution, seed=study.seed)
             progress.update(done, steps, "how well it is known")
-        limits = []
+        optima = []
         for i, (kind, at) in enumerate(asked):
             few = "; ".join(left_out.get(i, ())) or None
-            limits.append(
-                Limit(self.body.name, kind.mapping, kind.percentiles, at, **_known(found.get(i)), left_out=few)
+            optima.append(
+                StudyOptimum(self.spec.name, kind.mapping, kind.percentiles, at, **_known(found.get(i)), left_out=few)
             )
-        return [write_typed(file, limits)]
+        return [write_typed(file, optima)]
 
 
-def _compared(study: Study, first: float, last: float) -> list[tuple[StudyCondition, float]]:
-    """Threshold mappings at the minutes that conditions of theirs are evaluated at: whose limits have an interval."""
+def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]]:
+    """Threshold mappings at the minutes that arms of theirs are evaluated at: whose optima have an interval."""
     return [
         (kind, at)
         for kind in rough_kinds(study)
-        for condition in study.conditions
-        if (condition.mapping, condition.percentiles) == (kind.mapping, kind.percentiles)
-        for at in study.minutes_of(condition, first, last)
+        for arm in study.arms
+        if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles)
+        for at in study.minutes_of(arm, first, last)
     ]
 
 
 def _known(optimum: Optimum | None) -> dict[str, Any]:
-    """The fields of a limit from the best return to the nodes; None where no condition has enough responses."""
+    """The fields of an optimum from the best return to the nodes; None where no condition has enough responses."""
     told = {} if optimum is None else optimum.to_dict()
     interval = None if optimum is None else optimum.interval
     names = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")

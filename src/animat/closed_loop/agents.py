@@ -57,7 +57,7 @@ class Greedy:
 
 
 @dataclass(frozen=True)
-class HandMadeRule:
+class HeuristicController:
     """The condition whose mean command is the nearest to the one that the robot's `heuristic` gives.
 
     Attributes:
@@ -70,7 +70,7 @@ class HandMadeRule:
 
     def __post_init__(self) -> None:
         # Now: what JAX compiles for a first call would come late in a loop.
-        self.act(np.zeros(len(self.robot.quantities)), np.random.default_rng())
+        self.act(np.zeros(len(self.robot.observation_spec)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
         """The nearest."""
@@ -90,7 +90,7 @@ class InTurn:
     by_name: Mapping[str, Controller]
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The first one's choice; the loop takes each at its turn (`Contender.acting`)."""
+        """The first one's choice; the loop takes each at its turn (`Agent.acting`)."""
         return self.acting(0).act(observation, rng)
 
     def acting(self, turn: int) -> Controller:
@@ -100,7 +100,7 @@ class InTurn:
 
 
 @dataclass(frozen=True, eq=False)
-class Contender:
+class Agent:
     """Someone who acts in some of a session's episodes.
 
     Attributes:
@@ -109,8 +109,8 @@ class Contender:
         controller: who chooses.
         delivery: `"chosen"`: the culture gets what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
             `"silent"`: no pulse, and what the culture fires by itself is read where the response would be.
-        calibrates: whether its responses count where percentiles follow the culture; one condition presented over
-            and over is answered otherwise than between others. What leads in to its episodes always counts.
+        calibrates: whether its responses count for adaptive thresholds; one condition presented over
+            and over is answered otherwise than between others. The warm-up of its episodes always counts.
     """
 
     name: str
@@ -120,13 +120,13 @@ class Contender:
     calibrates: bool = True
 
     def acting(self, turn: int) -> Controller:
-        """Who chooses in the contender's episode number `turn`, counted from 0."""
+        """Who chooses in the agent's episode number `turn`, counted from 0."""
         return self.controller.acting(turn) if isinstance(self.controller, InTurn) else self.controller
 
 
-def random_control(n_conditions: int) -> Contender:
+def random_control(n_conditions: int) -> Agent:
     """The control that chooses any condition."""
-    return Contender("random", "any condition, equally likely", AnyCondition(n_conditions))
+    return Agent("random", "any condition, equally likely", AnyCondition(n_conditions))
 
 
 def controls(
@@ -135,7 +135,7 @@ def controls(
     *,
     means: Sequence[Any] | None,
     policies: Mapping[str, Controller] | None = None,
-) -> list[Contender]:
+) -> list[Agent]:
     """The controls of the study.
 
     Args:
@@ -147,17 +147,17 @@ def controls(
     """
     found = [random_control(len(labels))]
     for i, label in enumerate(labels):
-        found.append(Contender(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
+        found.append(Agent(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
     if policies:
         who = InTurn(dict(policies))
-        found.append(Contender("silent", "no pulse; the culture's own activity is read", who, "silent"))
-        found.append(Contender("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
+        found.append(Agent("silent", "no pulse; the culture's own activity is read", who, "silent"))
+        found.append(Agent("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
     if means is not None:
         found.append(
-            Contender(
-                "made by hand",
+            Agent(
+                "heuristic",
                 "no learning: the stimulus nearest to the command of the robot's heuristic",
-                HandMadeRule(robot, tuple(means)),
+                HeuristicController(robot, tuple(means)),
             )
         )
     return found
@@ -166,11 +166,11 @@ def controls(
 def interleaved(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
     """Whose turn each episode is, in random order and spread evenly: whatever drifts in the culture hits all alike.
 
-    The session is cut into as many equal parts as a contender has episodes, and one of them is in each part. Where all
+    The session is cut into as many equal parts as an agent has episodes, and one of them is in each part. Where all
     have as many, round follows round of all of them.
 
     Args:
-        episodes: of each contender.
+        episodes: of each agent.
         rng: of the places within the parts.
     """
     places = [(part + rng.random()) / n for n in episodes for part in range(n)]

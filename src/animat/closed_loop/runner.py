@@ -25,7 +25,7 @@ class Moved(NamedTuple):
     observation: Float64[np.ndarray, " observations"]
 
 
-class Body:
+class RobotRunner:
     """A robot with its state; its step is compiled once, before the first one, and takes some 30 us.
 
     Args:

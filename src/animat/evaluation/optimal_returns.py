@@ -19,7 +19,7 @@ from animat.robots.base import Robot
 
 
 @dataclass(frozen=True)
-class Prospect:
+class OptimalReturn:
     """What could be had through one mapping.
 
     Attributes:
@@ -45,7 +45,7 @@ class Prospect:
         return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}"
 
 
-def prospects(
+def optimal_returns(
     responses: Responses,
     robot: Robot[Any],
     mappings: Sequence[Mapping] = (Thresholds(1), Thresholds(9)),
@@ -54,7 +54,7 @@ def prospects(
     episodes: int = 1000,
     resamples: int = RESAMPLES,
     seed: int = 1,
-) -> tuple[Prospect, ...]:
+) -> tuple[OptimalReturn, ...]:
     """What the culture of one recording could do at a robot's task, through some mappings.
 
     Args:
@@ -62,9 +62,9 @@ def prospects(
             than 30 non-burst responses are left out, also for the random stimuli.
         robot: with its task.
         mappings: from responses to commands.
-        resolution: of the limit's grid (`best_returns`); the default moves the cartpole's limits by 0.8 at most.
-        episodes: of random stimuli, and of the limit's controller.
-        resamples: of the responses, for the limit's interval (`with_intervals`).
+        resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by 0.8 at most.
+        episodes: of random stimuli, and of the optimum's controller.
+        resamples: of the responses, for the optimum's interval (`with_intervals`).
         seed: decides every random draw.
 
     Raises:
@@ -88,5 +88,5 @@ def prospects(
         returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns
         error = float(returns.std(ddof=1) / np.sqrt(returns.size))
         told = replace(of_mapping, left_out=left_out)
-        found.append(Prospect(robot.name, mapping.name, float(returns.mean()), error, told))
+        found.append(OptimalReturn(robot.name, mapping.name, float(returns.mean()), error, told))
     return tuple(found)

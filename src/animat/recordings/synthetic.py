@@ -1,4 +1,4 @@
-"""Made-up recordings of known truth, to start without a laboratory and to test against. Not a model of neurons.
+"""Synthetic recordings of known truth, to start without a laboratory and to test against. Not a model of neurons.
 
 Nothing here responds to anything: each stimulus's response x is drawn from a gamma distribution that belongs to its
 frequency, and spikes are then placed so that x is found again. There is no memory, no network, no effect of the order
@@ -41,10 +41,13 @@ SAMPLING_RATE_HZ = 20_000.0
 STIMULATION_ELECTRODES = 32
 PATTERN_ELECTRODES = 5
 PATTERN_SPACING_UM = 100.0
+SOURCE = "synthetic, by animat.recordings.synthetic: known truth, not a model of neurons"
+FORMER_SOURCE = "made up by animat.recordings.made_up: known truth, not a model of neurons"
+"""As files of before have it."""
 
 
 @dataclass(frozen=True)
-class MadeUpCulture:
+class SyntheticCulture:
     """A culture that answers each stimulus with a number drawn from a known distribution.
 
     A stimulus of frequency i is answered by x ~ Gamma(shape, m_i / shape) Hz per channel, with
@@ -96,7 +99,7 @@ class MadeUpCulture:
         _expect(0 <= self.background_hz <= 1000, "background_hz", "0 to 1,000 Hz", self.background_hz)
 
     def record(self, start_min: float = 0.0) -> Recording:
-        """One recording by the paper's protocol: blocked, one pulse a presentation (method of the paper, section 2).
+        """One recording by the paper's protocol: blocked, one pulse a trial (method of the paper, section 2).
 
         Args:
             start_min: its start on the culture's clock in minutes, 0 or more.
@@ -140,7 +143,7 @@ class MadeUpCulture:
     def provenance(self) -> dict[str, str]:
         """What a recording of this culture says about its origin: every setting, hence the truth."""
         settings = {field.name: str(getattr(self, field.name)) for field in fields(self)}
-        return {"source": "made up by animat.recordings.made_up: known truth, not a model of neurons", **settings}
+        return {"source": SOURCE, **settings}
 
     def _electrodes(self) -> tuple[Channels, Int64[np.ndarray, "patterns electrodes"]]:
         """The recording channels, and the electrodes of each pattern; the same in all recordings."""
@@ -212,8 +215,8 @@ class MadeUpCulture:
         return spike_s[is_free], channel[is_free]
 
 
-def make_up_recording(seed: int, *, start_min: float = 0.0, **settings: Any) -> Recording:
-    """One recording of a made-up culture; `settings` are the attributes of `MadeUpCulture`.
+def synthetic_recording(seed: int, *, start_min: float = 0.0, **settings: Any) -> Recording:
+    """One recording of a synthetic culture; `settings` are the attributes of `SyntheticCulture`.
 
     Args:
         seed: the same seed is the same culture; with the same `start_min`, the same recording.
@@ -223,10 +226,10 @@ def make_up_recording(seed: int, *, start_min: float = 0.0, **settings: Any) -> 
     Raises:
         InvalidArgument: naming the setting, what was expected and what came.
     """
-    return MadeUpCulture(seed, **settings).record(start_min)
+    return SyntheticCulture(seed, **settings).record(start_min)
 
 
-def write_made_up_series(
+def write_synthetic_series(
     seed: int,
     folder: str | os.PathLike[str],
     *,
@@ -235,7 +238,7 @@ def write_made_up_series(
     progress: Progress | None = None,
     **settings: Any,
 ) -> list[Path]:
-    """Write the recordings of a made-up culture over time, one NWB file each, `recording_0000_min.nwb` and so on.
+    """Write the recordings of a synthetic culture over time, one NWB file each, `recording_0000_min.nwb` and so on.
 
     A file is complete or absent; files that are there already are kept, so an interrupted series goes on where it
     stopped.
@@ -246,7 +249,7 @@ def write_made_up_series(
         sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
         progress: told after each recording.
-        settings: attributes of `MadeUpCulture`.
+        settings: attributes of `SyntheticCulture`.
 
     Returns:
         The files, in the order of time.
@@ -258,7 +261,7 @@ def write_made_up_series(
     _expect(sessions >= 1, "sessions", "at least 1 recording", sessions)
     _expect(interval_min > 0, "interval_min", "more than 0 minutes", interval_min)
     _expect(sessions * interval_min <= 366 * 24 * 60, "sessions, interval_min", "recordings within a year", sessions)
-    culture = MadeUpCulture(seed, **settings)
+    culture = SyntheticCulture(seed, **settings)
     progress = progress or Silent()
     files = []
     for session in range(sessions):
@@ -266,9 +269,12 @@ def write_made_up_series(
         file = Path(folder) / recording_name(start_min)
         if file.exists():
             there = read_recording(file)
-            if dict(there.provenance) != culture.provenance or there.start_min != start_min:
+            told = dict(there.provenance)
+            if told.get("source") == FORMER_SOURCE:
+                told["source"] = SOURCE
+            if told != culture.provenance or there.start_min != start_min:
                 raise Mismatch(
-                    f"{file}: expected a recording of the same made-up culture at {start_min:g} min, got another; "
+                    f"{file}: expected a recording of the same synthetic culture at {start_min:g} min, got another; "
                     "remove it, or choose another folder"
                 )
         else:

@@ -1,4 +1,4 @@
-"""A simulator of made-up responses with known truth, for a first try and for tests without any recording."""
+"""A simulator of synthetic responses with known truth, for a first try and for tests without any recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 LABELS = ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
 
 
-def made_up_simulator(
+def synthetic_simulator(
     means_hz: Sequence[float] = MEANS_HZ,
     *,
     shape: float = 6.0,

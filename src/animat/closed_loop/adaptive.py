@@ -1,4 +1,4 @@
-"""Percentiles that follow the culture: a mapping's thresholds are those of its newest responses, not of a past hour."""
+"""Adaptive thresholds: the percentiles of the culture's newest responses, not of a past hour."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from jaxtyping import Float32, Float64
 
 from animat.coding.mapping import N_PERCENTILES
 
-MOST_FOLLOWED = 100
-"""Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones follow late."""
+MOST_COUNTED = 100
+"""Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones adapt late."""
 
 
-class Following:
+class AdaptiveThresholds:
     """The newest responses of each condition, and the percentiles of all of them together.
 
     A culture drifts and tires: minutes after a recording its responses to all conditions are smaller, and more of them
@@ -24,12 +24,12 @@ class Following:
 
     Args:
         responses_hz: non-burst responses of each condition, in the order of time, shape (responses,), or (responses,
-            readouts). Where a condition has more than `MOST_FOLLOWED`, the newest count, of all conditions the same
+            readouts). Where a condition has more than `MOST_COUNTED`, the newest count, of all conditions the same
             part.
     """
 
     def __init__(self, responses_hz: Sequence[Float64[np.ndarray, "responses *readouts"]]) -> None:
-        part = min(1.0, MOST_FOLLOWED / max(len(each) for each in responses_hz))
+        part = min(1.0, MOST_COUNTED / max(len(each) for each in responses_hz))
         self._newest = [deque(each, maxlen=max(1, round(part * len(each)))) for each in responses_hz]
         self.seen = 0
 

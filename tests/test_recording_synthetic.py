@@ -1,7 +1,8 @@
-"""Made-up recordings: the truth that was put in is found. Oracles: the gamma's closed forms, scikit-image's Otsu."""
+"""Synthetic recordings: the truth that was put in is found. Oracles: the gamma's closed forms, scikit-image's Otsu."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ from scipy import stats
 from skimage.filters import threshold_otsu
 
 from animat.errors import InvalidArgument, Mismatch
-from animat.recordings.made_up import MadeUpCulture, make_up_recording, write_made_up_series
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
+from animat.recordings.synthetic import FORMER_SOURCE, SyntheticCulture, synthetic_recording, write_synthetic_series
 from animat.stimulation.protocol import Presentation
 
 MEANS_HZ = {5: 30.0, 10: 36.0, 20: 42.0, 40: 48.0, 80: 54.0}
@@ -32,7 +33,7 @@ def responses(recording: Recording) -> tuple[np.ndarray[Any, Any], np.ndarray[An
 
 @pytest.fixture(scope="module")
 def long() -> Recording:
-    return make_up_recording(0, patterns=2000)
+    return synthetic_recording(0, patterns=2000)
 
 
 def test_responses_have_the_distribution_that_was_put_in(long: Recording) -> None:
@@ -55,7 +56,7 @@ def test_otsu_finds_exactly_the_bursts(long: Recording) -> None:
 
 
 def test_the_protocol_is_the_papers() -> None:
-    recording = make_up_recording(1)
+    recording = synthetic_recording(1)
     assert recording.presentation == Presentation("blocked", 1)
     stimuli = recording.stimuli
     assert len(stimuli) == 500
@@ -76,7 +77,7 @@ def test_the_protocol_is_the_papers() -> None:
 
 
 def test_spikes_outside_the_window_come_at_the_background_rate() -> None:
-    quiet = make_up_recording(2, burst_share=0.0, means_hz=(0.0,) * 5, frequencies_hz=(1, 2, 3, 4, 5))
+    quiet = synthetic_recording(2, burst_share=0.0, means_hz=(0.0,) * 5, frequencies_hz=(1, 2, 3, 4, 5))
     since_s = (
         quiet.spike_times_s
         - quiet.stimuli.time_s[
@@ -89,32 +90,38 @@ def test_spikes_outside_the_window_come_at_the_background_rate() -> None:
 
 
 def test_the_same_seed_is_the_same_recording_and_the_culture_tires() -> None:
-    assert make_up_recording(5).equals(make_up_recording(5))
-    fresh, tired = make_up_recording(5), make_up_recording(5, start_min=600.0)
+    assert synthetic_recording(5).equals(synthetic_recording(5))
+    fresh, tired = synthetic_recording(5), synthetic_recording(5, start_min=600.0)
     assert not np.array_equal(fresh.spike_times_s, tired.spike_times_s)
     assert np.array_equal(fresh.channels.electrode, tired.channels.electrode)
-    assert not np.array_equal(fresh.channels.electrode, make_up_recording(6).channels.electrode)
+    assert not np.array_equal(fresh.channels.electrode, synthetic_recording(6).channels.electrode)
     mean_hz = [x[ratio < 0.6].mean() for x, ratio in map(responses, (fresh, tired))]
     assert mean_hz[1] / mean_hz[0] == pytest.approx(np.exp(-0.05 * 10), rel=0.1)
 
 
 def test_a_series_is_written_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     few = {"patterns": 5, "channels": 16}
-    files = write_made_up_series(1, tmp_path / "series", sessions=3, **few)
+    files = write_synthetic_series(1, tmp_path / "series", sessions=3, **few)
     assert [file.name for file in files] == [
         "recording_0000_min.nwb",
         "recording_0010_min.nwb",
         "recording_0020_min.nwb",
     ]
     assert [recording.start_min for recording in read_recordings(tmp_path / "series")] == [0.0, 10.0, 20.0]
-    assert read_recording(files[1]).equals(make_up_recording(1, start_min=10.0, **few))
+    assert read_recording(files[1]).equals(synthetic_recording(1, start_min=10.0, **few))
     files[1].unlink()
     kept = files[0].stat().st_mtime_ns
-    assert write_made_up_series(1, tmp_path / "series", sessions=3, **few) == files
+    assert write_synthetic_series(1, tmp_path / "series", sessions=3, **few) == files
     assert files[0].stat().st_mtime_ns == kept
     assert files[1].exists()
-    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected a recording of the same made-up culture"):
-        write_made_up_series(2, tmp_path / "series", sessions=3, **few)
+    # A series that is told by the former name of its source goes on too.
+    there = read_recording(files[0])
+    write_nwb(replace(there, provenance={**there.provenance, "source": FORMER_SOURCE}), files[0])
+    kept = files[0].stat().st_mtime_ns
+    assert write_synthetic_series(1, tmp_path / "series", sessions=3, **few) == files
+    assert files[0].stat().st_mtime_ns == kept
+    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected a recording of the same synthetic culture"):
+        write_synthetic_series(2, tmp_path / "series", sessions=3, **few)
 
 
 @pytest.mark.parametrize(
@@ -133,6 +140,6 @@ def test_a_series_is_written_and_goes_on_where_it_stopped(tmp_path: Path) -> Non
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidArgument, match=message):
-        MadeUpCulture(**({"seed": 0} | settings))
+        SyntheticCulture(**({"seed": 0} | settings))
     with pytest.raises(InvalidArgument, match="start_min: expected 0 minutes or more"):
-        make_up_recording(0, start_min=-1.0)
+        synthetic_recording(0, start_min=-1.0)

@@ -1,4 +1,4 @@
-"""Spikes as troughs: samples below a threshold that nothing around them is below."""
+"""Spikes as negative peaks: samples below a threshold that nothing around them is below."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 
-def find_troughs(
+def find_negative_peaks(
     voltage_uv: Float32[np.ndarray, "channels samples"],
     depth_uv: Float32[np.ndarray, " channels"],
     apart: int,
     first: int,
     last: int,
-) -> tuple[Int64[np.ndarray, " troughs"], Int64[np.ndarray, " troughs"]]:
-    """Rows and samples of the troughs.
+) -> tuple[Int64[np.ndarray, " peaks"], Int64[np.ndarray, " peaks"]]:
+    """Rows and samples of the negative peaks.
 
     A sample t is one if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples; of equal ones, the first.
 
     Args:
         voltage_uv: filtered, one row a channel.
-        depth_uv: that a trough must exceed on each channel; infinite where nothing is to be found.
+        depth_uv: that a negative peak must exceed on each channel; infinite where nothing is to be found.
         apart: half the width of the neighbourhood, in samples, at least 1.
-        first, last: look for troughs at samples from `first` on, below `last`.
+        first, last: look for negative peaks at samples from `first` on, below `last`.
     """
     inner = voltage_uv[:, first:last]
     # A few of all samples: the neighbourhood is looked at for these only.

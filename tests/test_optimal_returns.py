@@ -1,4 +1,4 @@
-"""What a culture could do before any training. Oracles: the limit itself, constants and random stimuli run apart."""
+"""What a culture could do before any training. Oracles: the optimum itself, constants and random stimuli run apart."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from animat.cli import main
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat
 from animat.errors import UnusableData
+from animat.evaluation.optimal_returns import optimal_returns
 from animat.evaluation.optimum import Optimum, best_return, rough_values
-from animat.evaluation.prospects import prospects
 from animat.evaluation.resampling import _rough, with_intervals
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.made_up import make_up_recording
 from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.extraction import extract_responses
@@ -36,9 +36,9 @@ ROBOT = Cartpole(episode_limit=60)
 
 
 @pytest.mark.oracle
-def test_it_is_the_limit_of_the_default_simulator_above_random_and_constant_stimuli() -> None:
-    responses = extract_responses(make_up_recording(1, patterns=40, channels=64))
-    (found,) = prospects(responses, ROBOT, [Thresholds(9)], resolution=0.25, resamples=0)
+def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_stimuli() -> None:
+    responses = extract_responses(synthetic_recording(1, patterns=40, channels=64))
+    (found,) = optimal_returns(responses, ROBOT, [Thresholds(9)], resolution=0.25, resamples=0)
     simulator = fit_histogram(responses)
     environment = Animat(ROBOT, Thresholds(9), 5)
     assert (found.robot, found.mapping) == ("cartpole", "9-thresholds")
@@ -53,17 +53,17 @@ def test_it_is_the_limit_of_the_default_simulator_above_random_and_constant_stim
 
 
 @pytest.mark.oracle
-def test_inspect_tells_the_limit(
+def test_inspect_tells_the_optimum(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rough = partial(prospects, resolution=0.25, episodes=20, resamples=4)
-    monkeypatch.setattr("animat.evaluation.prospects.prospects", rough)
-    write_nwb(make_up_recording(1, patterns=40, channels=64), tmp_path / "a.nwb")
-    assert main(["inspect", str(tmp_path / "a.nwb"), "--limit", "cartpole", "--json"]) == 0
+    rough = partial(optimal_returns, resolution=0.25, episodes=20, resamples=4)
+    monkeypatch.setattr("animat.evaluation.optimal_returns.optimal_returns", rough)
+    write_nwb(synthetic_recording(1, patterns=40, channels=64), tmp_path / "a.nwb")
+    assert main(["inspect", str(tmp_path / "a.nwb"), "--optimum", "cartpole", "--json"]) == 0
     said = capsys.readouterr().out.splitlines()
     (inspected,) = json.loads(said[-1])["recordings"]
-    assert [limit["mapping"] for limit in inspected["limits"]] == ["1-threshold", "9-thresholds"]
-    one = inspected["limits"][0]
+    assert [optimum["mapping"] for optimum in inspected["optima"]] == ["1-threshold", "9-thresholds"]
+    one = inspected["optima"][0]
     simulator = fit_histogram(extract_responses(read_recording(tmp_path / "a.nwb")))
     direct = best_return(Animat(Cartpole(), Thresholds(1), 5), simulator, resolution=0.25, episodes=0)
     assert one["best"]["value"] == pytest.approx(direct.value, abs=0.5)
@@ -72,17 +72,17 @@ def test_inspect_tells_the_limit(
     assert f"optimal return {one['best']['value']:.1f}" in told
 
 
-def test_where_there_is_no_limit_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_nwb(make_up_recording(1, patterns=5, channels=16), tmp_path / "a.nwb")
-    command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--limit", "navigation", "--json"]
+def test_where_there_is_no_optimum_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_nwb(synthetic_recording(1, patterns=5, channels=16), tmp_path / "a.nwb")
+    command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--optimum", "navigation", "--json"]
     assert main(command) == 1
     said = capsys.readouterr().out
     assert "navigation: no optimal return: " in said
-    assert json.loads(said.splitlines()[-1])["recordings"][0]["limits"] is None
+    assert json.loads(said.splitlines()[-1])["recordings"][0]["optima"] is None
 
 
 def test_a_robot_that_is_not_known_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["inspect", "a.nwb", "--limit", "submarine"]) != 0
+    assert main(["inspect", "a.nwb", "--optimum", "submarine"]) != 0
     assert "submarine" in capsys.readouterr().err
 
 
@@ -111,7 +111,7 @@ def answers(n: Sequence[int], seed: int, spread: Sequence[float] = SPREAD) -> Re
 
 def test_three_responses_promise_nothing() -> None:
     with pytest.raises(UnusableData, match="expected 30 non-burst responses or more to some condition, got 3 at most"):
-        prospects(answers([3] * 5, 1), SHORT)
+        optimal_returns(answers([3] * 5, 1), SHORT)
 
 
 @pytest.mark.oracle
@@ -119,7 +119,7 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     responses = answers([60, 60, 60, 60, 3], 2)
     # The three responses to 80 Hz are lucky: believed, they would make the best condition there is.
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
-    (found,) = prospects(lucky, SHORT, [Thresholds(1)], resolution=0.25, episodes=2, resamples=3)
+    (found,) = optimal_returns(lucky, SHORT, [Thresholds(1)], resolution=0.25, episodes=2, resamples=3)
     # Of the four others, at the median of all responses: that is the threshold that commands are made by.
     without = fit_histogram(lucky.only([0, 1, 2, 3]))
     held = replace(without, percentiles=jnp.asarray(np.percentile(lucky.rate_hz, np.arange(0, 101, 10)), jnp.float32))
@@ -133,8 +133,8 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     )
 
 
-def test_conditions_left_out_leave_the_others_and_their_past_alone() -> None:
-    source = extract_responses(make_up_recording(1, patterns=10, channels=16))
+def test_conditions_left_out_leave_the_others_and_their_history_alone() -> None:
+    source = extract_responses(synthetic_recording(1, patterns=10, channels=16))
     kept = source.only([3, 1])
     assert [c.label for c in kept.conditions] == [source.conditions[3].label, source.conditions[1].label]
     assert kept.rates_of(0).tolist() == source.rates_of(3).tolist()
@@ -156,13 +156,13 @@ def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None
         assert -100 <= known.interval.low <= best.value <= known.interval.high <= SHORT.episode_limit
 
 
-def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_redrawn() -> None:
+def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_bootstrapped() -> None:
     """That is what 95 % of 39 are: a value drawn anew falls outside of so many once in twenty."""
     environment, responses = Animat(SHORT, Thresholds(1), 5), answers([40] * 5, 3)
     best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
     (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25)
     rng = np.random.default_rng(1)
-    simulators = [fit_histogram(each) for each in (responses, *(responses.redrawn(rng) for _ in range(39)))]
+    simulators = [fit_histogram(each) for each in (responses, *(responses.bootstrapped(rng) for _ in range(39)))]
     grid = _rough(grid_for(SHORT), 0.25)
     values, _ = rough_values([(environment, each) for each in simulators], grid, 1)
     moved = values[1:] - values[0]

@@ -19,7 +19,7 @@ from animat.robots.capabilities import capability
 @final
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class HandMade(Actor):
+class HeuristicPolicy(Actor):
     """The action whose mean command is the nearest to the one that the robot's `heuristic` gives.
 
     Attributes:
@@ -50,12 +50,12 @@ class Heuristic(Actor):
 
 def _wanted(environment: Environment[Any], observation: Seen) -> Array:
     """The commands of the robot's `heuristic`, which sees the robot alone."""
-    of_robot = (observation * environment.scales)[:, : len(environment.robot.quantities)]
+    of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
     commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
     return commands
 
 
-def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) -> HandMade:
+def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
     """The rule for an environment and the neurons in it, as one actor for `roll_out`.
 
     Raises:
@@ -64,4 +64,4 @@ def hand_made(environment: Environment[Any], simulator: NeuronSimulator | None) 
     # It raises for a robot without one.
     capability(environment.robot, "heuristic")
     actions, means = mean_commands(environment, simulator)
-    return HandMade(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])
+    return HeuristicPolicy(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])
