@@ -76,6 +76,7 @@ class TestFake(CultureContract):
     window_ms=st.sampled_from([(2.0, 10.0), (0.0, 5.0), (3.15, 11.05)]),
     warm_up=st.integers(0, 2),
 )
+@pytest.mark.oracle
 def test_the_recording_of_a_session_gives_the_responses_that_the_loop_used(
     tmp_path_factory: pytest.TempPathFactory,
     seed: int,

@@ -584,6 +584,7 @@ def test_a_session_comes_back_whatever_its_files_are_like(
     assert_read_alike(tmp_path, loop_of())
 
 
+@pytest.mark.oracle
 def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again(
     few_bootstraps: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -68,6 +68,7 @@ print(read_recording(sys.argv[1]).equals(recording))
 """
 
 
+@pytest.mark.oracle
 def test_a_home_that_is_a_file_keeps_nothing_and_says_nothing(tmp_path: Path) -> None:
     home = tmp_path / "home"
     home.touch()

@@ -39,7 +39,7 @@ def damage(kind: str, seed: int, count: int, folder: Path) -> None:
 
 
 # Those that rigs write are read by the same library in the same process as one of ours.
-RIGS = ("other-nwb", "maxwell", "old-maxwell")
+RIGS = ("other-nwb", "maxwell", "old-maxwell", "cl1")
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.oracle] * (k in RIGS)) for k in KINDS])

@@ -385,6 +385,7 @@ def test_a_killed_run_says_what_stands_there_and_what_can_be_done_with_it(tmp_pa
     assert "got one with files" in said()
 
 
+@pytest.mark.oracle
 def test_a_training_that_fails_ends_the_run_with_its_recordings_kept(tmp_path: Path) -> None:
     impossible = Training(Navigation(), Thresholds(1), policies=1, iterations=600, algorithm=SMALL)
     with FakeCulture() as culture, pytest.MonkeyPatch.context() as patch:

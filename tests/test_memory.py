@@ -157,6 +157,7 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memo
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), MEMORIES)
+@pytest.mark.oracle
 def test_what_is_remembered_of_an_answer_is_what_the_recording_remembered_of_it(seed: int, memory: Memory) -> None:
     """Answered as it was recorded, a simulator comes through the histories that the recording came through."""
     rng = np.random.default_rng(seed)
@@ -386,6 +387,7 @@ def test_the_optimum_knows_what_the_neurons_remember(limit: int) -> None:
     assert abs(found.monte_carlo - worth[2, 0]) < 4 * found.standard_error + 1e-6
 
 
+@pytest.mark.oracle
 def test_cases_with_and_without_memory_have_the_optima_that_they_have_alone() -> None:
     environment = Animat(Stairs(), Thresholds(1), 2)
     cases = [(environment, coins(3, 6)), (environment, persistent()), (environment, coins(1, 2))]
@@ -445,6 +447,7 @@ def test_the_optimum_of_a_simulator_of_ones_own_that_remembers_is_refused() -> N
 @pytest.mark.parametrize(
     "mapping", [Thresholds(1), *(pytest.param(other, marks=pytest.mark.oracle) for other in (Thresholds(9), Linear()))]
 )
+@pytest.mark.oracle
 def test_where_nothing_is_remembered_commands_and_optimum_are_those_without_memory(mapping: Any) -> None:
     responses = independent(0)
     simulator, plain = fit_memory(responses), fit_empirical(responses)
@@ -505,6 +508,7 @@ def test_an_environment_without_neurons_has_its_optimum_whatever_simulator_is_be
     ]
 
 
+@pytest.mark.oracle
 def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
     simulator = fit_memory(chain(500, after_low=(0.1, 0.5), after_high=(0.3, 0.9)))
     environment = ShuffledDelivery(Animat(Stairs(), Thresholds(1), 2))

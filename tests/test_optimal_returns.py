@@ -156,6 +156,7 @@ def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None
         assert -100 <= known.interval.low <= best.value <= known.interval.high <= SHORT.episode_limit
 
 
+@pytest.mark.oracle
 def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_bootstrapped() -> None:
     """That is what 95 % of 39 are: a value drawn anew falls outside of so many once in twenty."""
     environment, responses = Animat(SHORT, Thresholds(1), 5), answers([40] * 5, 3)

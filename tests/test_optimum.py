@@ -231,6 +231,7 @@ def test_a_value_that_its_controller_does_not_get_is_told() -> None:
     assert "too rough" in below.message
 
 
+@pytest.mark.oracle
 def test_a_grid_too_rough_is_noticed() -> None:
     """Nine places for an arena in which the goal is a tenth of it."""
     grid = grid_for(Navigation()).scaled(0.12)

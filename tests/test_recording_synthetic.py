@@ -12,6 +12,7 @@ from scipy import stats
 from skimage.filters import threshold_otsu
 
 from animat.errors import InvalidArgument, Mismatch
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording

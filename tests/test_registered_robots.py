@@ -91,6 +91,7 @@ def written(folder: Path, *changes: tuple[str, str]) -> str:
     return f"my_changed{number}:Rover"
 
 
+@pytest.mark.oracle
 def test_a_robot_is_trained_in_workers_saved_loaded_and_evaluated(package: Path) -> None:
     training = Training(ROVER, "1-threshold", policies=2, iterations=480, algorithm=SMALL)
     trained = train(training, timeline_of(), package / "policies", workers=1)

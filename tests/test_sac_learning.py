@@ -228,6 +228,7 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     assert mistake.mean() < 0.15
 
 
+@pytest.mark.oracle
 def test_two_commands_each_follow_their_own() -> None:
     environment = WithoutNeurons(FollowerOfTwo(), None)
     learner, _ = trained_for(environment, replace(TRIVIAL, reward_scale=2.0), 1500)

@@ -32,6 +32,7 @@ def change(folder: Path, every: int) -> tuple[int, int]:
     return refused, gone_on
 
 
+@pytest.mark.oracle
 def test_a_state_that_was_changed_by_hand_is_refused_or_gone_on_from(tmp_path: Path) -> None:
     refused, gone_on = change(tmp_path, 7)
     assert refused > 100 and gone_on > 5

@@ -136,6 +136,7 @@ def kill(process: subprocess.Popen[bytes]) -> None:
     time.sleep(0.3)
 
 
+@pytest.mark.oracle
 def test_a_finished_folder_is_left_alone_and_said_to_be_so(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
     assert main(["study", str(TINY), "--out", str(finished), "--json"]) == 0
@@ -145,6 +146,7 @@ def test_a_finished_folder_is_left_alone_and_said_to_be_so(finished: Path, capsy
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.oracle
 def test_what_is_lost_or_damaged_is_made_again_by_workers(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -158,6 +160,7 @@ def test_what_is_lost_or_damaged_is_made_again_by_workers(
     assert files(folder) == files(finished)
 
 
+@pytest.mark.oracle
 def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) -> None:
     before = files(finished)
     with pytest.raises(Mismatch, match=r"another \(study\.policies: 2 there, 3 now\)"):
@@ -196,6 +199,7 @@ def test_nothing_of_another_s_folder_is_touched(tmp_path: Path) -> None:
     assert files(home) == before
 
 
+@pytest.mark.oracle
 def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "study"
     shutil.copytree(finished, folder)
@@ -209,12 +213,14 @@ def test_what_a_killed_run_was_writing_is_cleared_away_and_nothing_else(finished
     assert all((folder / name).exists() for name in kept)
 
 
+@pytest.mark.oracle
 def test_a_second_run_in_a_folder_at_work_is_refused(finished: Path) -> None:
     with exclusive_lock(finished), pytest.raises(Mismatch, match="another run is at work in this folder"):
         run_study(read_study(TINY), finished, base=TINY.parent)
     assert run_study(read_study(TINY), finished, base=TINY.parent).done_now == {}
 
 
+@pytest.mark.oracle
 def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +253,7 @@ def test_a_finished_folder_that_cannot_be_written_to_is_still_finished(
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.oracle
 def test_a_finished_read_only_folder_keeps_what_a_killed_run_left(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "archive"
     shutil.copytree(finished, folder)
@@ -283,6 +290,7 @@ def test_a_specification_can_be_corrected_before_anything_is_made(tmp_path: Path
 
 
 @pytest.mark.parametrize("damage", ["fewer spikes", "garbage", "gone"])
+@pytest.mark.oracle
 def test_a_recording_that_changed_is_recorded_again(finished: Path, tmp_path: Path, damage: str) -> None:
     folder = tmp_path / "study"
     shutil.copytree(finished, folder)
@@ -438,6 +446,7 @@ def episodes_in(folder: Path, **columns: str) -> list[dict[str, str]]:
 # --- the results ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.oracle
 def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
     (told,) = rows(finished / "tables/comparisons.csv")
     means = []
@@ -454,6 +463,7 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
     assert (float(told["paper_p"]), told["as_in_paper"]) == (PRINTED[told["comparison"], "navigation"].p, "cannot tell")
 
 
+@pytest.mark.oracle
 def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path) -> None:
     """From the episodes and the optima themselves, not from other columns of the table."""
     arm_of = {
@@ -488,6 +498,7 @@ def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path)
     assert {"random", "silent", "shuffled", "heuristic", "constant 80 Hz"} <= names
 
 
+@pytest.mark.oracle
 def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(finished: Path) -> None:
     for row in rows(finished / "tables/optima.csv"):
         assert row["left_out"] == ""
@@ -497,6 +508,7 @@ def test_optima_have_intervals_where_arms_are_evaluated_through_thresholds(finis
             assert float(row["low_95"]) <= float(row["best_return"]) <= float(row["high_95"])
 
 
+@pytest.mark.oracle
 def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
     trained, before = (
         Policy.load(finished / f"policies/navigation/{slug}/p0.safetensors")
@@ -515,6 +527,7 @@ def test_no_two_arms_start_from_the_same_networks() -> None:
     assert len({training_of(study, spec, arm).seed for spec, arm in pairs}) == len(pairs)
 
 
+@pytest.mark.oracle
 def test_simulators_are_kept_whole(finished: Path) -> None:
     timeline = load_timeline(finished / "simulators/timeline.safetensors")
     assert timeline.start_min.tolist() == [0.0, 140.0]
@@ -525,6 +538,7 @@ def test_simulators_are_kept_whole(finished: Path) -> None:
         load_timeline(finished.parent / "cut")
 
 
+@pytest.mark.oracle
 def test_the_example_of_the_page_runs(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -548,6 +562,7 @@ def test_the_example_of_the_page_runs(
 # --- the report -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.oracle
 def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     expected = [f"culture-{name}" for name in CULTURE] + [f"navigation-{name}" for name in ROBOT]
@@ -570,6 +585,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.oracle
 def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finished: Path) -> None:
     recordings = read_recordings(finished / "recordings")
     first, window_s = recordings[0], (0.002, 0.010)
@@ -613,6 +629,7 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
     assert stimulated == set(first.stimuli.electrodes.ravel().tolist()) - {-1}
 
 
+@pytest.mark.oracle
 def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path) -> None:
     curves: dict[tuple[str, str], list[float]] = defaultdict(list)
     for row in rows(finished / "tables/learning-curves.csv"):
@@ -641,6 +658,7 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
         assert int(row["policies"]) == len(means) == 2
 
 
+@pytest.mark.oracle
 def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     without_data = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", page)

@@ -261,6 +261,7 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
     assert note.rows[0][-1] == at_first.left_out
 
 
+@pytest.mark.oracle
 def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -160,6 +160,7 @@ class Interrupting:
         os.killpg(os.getpgrp(), signal.SIGINT)
 
 
+@pytest.mark.oracle
 def test_an_interrupt_from_the_keyboard_does_not_reach_the_workers(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(

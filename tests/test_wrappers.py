@@ -159,6 +159,7 @@ def test_who_sees_the_past_does_what_is_possible_with_neurons_that_remember() ->
         assert mean_return(STAIRS, blind) < 0.8
 
 
+@pytest.mark.oracle
 def test_a_policy_learns_to_go_by_the_past() -> None:
     settings = SAC(replay=16_384, hidden=32, reward_scale=1.0)
     reached = {}
