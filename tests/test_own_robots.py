@@ -20,7 +20,7 @@ from animat.closed_loop.agents import HeuristicController
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import Cartpole, Navigation, Quantity, Robot
@@ -248,3 +248,18 @@ def test_a_grid_that_fails_is_none_with_a_reason() -> None:
 
     said = "slider.value_grid: expected a Grid, got ZeroDivisionError: division by zero"
     assert no_grid(slider(value_grid=broken)) == said
+
+
+@dataclasses.dataclass(frozen=True)
+class LaterNaN(Slider):
+    """Pays by the root of what is left of ten steps: after these, nothing that is a number."""
+
+    name: ClassVar[str] = "later"
+
+    def advance(self, uniforms: Any, state: At, u: Any) -> tuple[At, Any, Any]:
+        return At(state.x_m + 0.1), jnp.sqrt(1.0 - state.x_m), jnp.bool_(False)
+
+
+def test_a_reward_that_is_no_number_later_is_named() -> None:
+    with pytest.raises(UnusableData, match="later: expected finite rewards and observations, got NaN or infinite ones"):
+        train(training(LaterNaN(), None), None, None)

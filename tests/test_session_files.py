@@ -86,6 +86,27 @@ def test_a_killed_session_is_recovered_to_the_bits_that_it_would_have_written(tm
     assert others.exists()
 
 
+def test_a_damaged_log_is_not_written_over_what_holds_more(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = ran(tmp_path / "session")
+    log = tmp_path / "session" / LOG_FILE
+    damaged = bytearray(log.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    log.write_bytes(damaged)
+    files = session.ticks_file, session.recording_file
+    before = [file.read_bytes() for file in files]
+    assert main(["recover", str(tmp_path / "session")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "which is damaged after" in line and "away to recover what the log has" in line
+    assert [file.read_bytes() for file in files] == before
+    for file in files:
+        file.unlink()
+    assert main(["recover", str(tmp_path / "session")]) == 0
+    assert "from where it is torn or damaged on, are lost" in capsys.readouterr().out
+    assert len(session.ticks_file.read_bytes()) < len(before[0])
+    # What was recovered is no less than what the log has: it is recovered again.
+    assert main(["recover", str(tmp_path / "session")]) == 0
+
+
 def test_a_table_that_cannot_be_written_on_the_way_is_made_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
+from animat.errors import UnusableData
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
@@ -126,6 +127,13 @@ def test_channels_that_fire_faster_than_neurons_can() -> None:
     rng = np.random.default_rng(0)
     spikes = [(t, c) for c in range(3) for t in rng.uniform(0, 2, 1000)]
     assert "the median channel fires at 500 Hz" in str(said(of_spikes(spikes, [1.0], 3, 2.0)))
+
+
+def test_recordings_of_two_simulated_cultures_are_not_one_series(tmp_path: Path) -> None:
+    one, other = (synthetic_recording(seed, patterns=20, channels=32, start_min=10.0 * seed) for seed in (1, 2))
+    with pytest.raises(UnusableData, match=r"got simulated ones of seeds 1, 2; .* --allow several-cultures"):
+        extract_series([one, other])
+    assert len(extract_series([one, other], allow=["several-cultures"])) == 2
 
 
 def test_training_on_milliseconds_is_refused_unless_allowed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

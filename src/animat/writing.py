@@ -93,7 +93,8 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
             expect_writable(folder)
         descriptors = [os.open(folder, os.O_RDONLY)]
     except OSError as error:
-        raise InvalidFile(f"{folder}: cannot be made or read: {error.strerror or error}") from error
+        what = "it is no folder" if folder.exists() and not folder.is_dir() else error.strerror or error
+        raise InvalidFile(f"{folder}: cannot be made or read: {what}; choose another --out") from error
     try:
         if _is_locked(folder, descriptors[0]):
             _expect_same(folder, descriptors[0])

@@ -138,6 +138,10 @@ def _parse(arguments: list[str]) -> Command:
         raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {arguments[0]!r}")
     if not arguments:
         raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; see animat --help")
+    if "" in arguments:
+        # Where a variable of the shell is not set; a path would be the working folder.
+        before = arguments[arguments.index("") - 1]
+        raise InvalidArgument(f"{before}: expected a value after it, got an empty text")
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, Mismatch
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
@@ -78,6 +78,7 @@ class Record:
         protocol = None if self.culture == "synthetic" else self._protocol()
         if protocol is not None and self.protocol is not None:
             _say_too_fast(protocol)
+        _expect_no_others(self.out)
         with Bar("recording") as progress:
             if self.culture == "synthetic":
                 files = self._synthetic(progress)
@@ -172,6 +173,16 @@ class Record:
         asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
         asked["places"] = None if self.places is None else read_places(self.places)
         return replace(usual, **{name: value for name, value in asked.items() if value is not None})
+
+
+def _expect_no_others(folder: Path) -> None:
+    """Raise for recordings in a folder that are of no series: they would be read as if they were of this one."""
+    if not folder.is_dir():
+        return
+    others = sorted(file.name for file in folder.glob("[!.]*.nwb") if not file.name.startswith("recording_"))
+    if others:
+        shown = f"{', '.join(others[:3])}{' ...' if len(others) > 3 else ''}"
+        raise Mismatch(f"{folder}: expected no recordings but those of this series, got {shown}; choose another --out")
 
 
 def _say_too_fast(protocol: Protocol) -> None:

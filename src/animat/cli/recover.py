@@ -33,5 +33,5 @@ class Recover:
         if told["unanswered_pulses"]:
             print(told_unanswered(session))
         if told["lost_bytes"]:
-            print(f"{told['lost_bytes']} bytes at the end of the log make no whole record and are lost")
+            print(f"{told['lost_bytes']} bytes of the log, from where it is torn or damaged on, are lost")
         return {"recording": str(session.recording_file), **told}

@@ -183,7 +183,7 @@ class Log:
     Attributes:
         header: the words of its first record.
         records: the others, in the order they were written.
-        lost_bytes: at the end, that make no whole record.
+        lost_bytes: from the first record on that is not whole.
     """
 
     header: dict[str, Any]

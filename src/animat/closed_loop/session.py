@@ -25,7 +25,7 @@ from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, Records, read_log
 from animat.closed_loop.outline import Episode, Outline
 from animat.closed_loop.tick import Ending, Tick
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.progress import Progress
 from animat.recordings.recording import Recording
 from animat.writing import clear_away, exclusive_lock, is_unfinished
@@ -242,17 +242,35 @@ def recover_session(path: str | os.PathLike[str], progress: Progress | None = No
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
-        Mismatch: if the session still runs.
+        Mismatch: if the session still runs, or its table has more ticks than are left in a damaged log.
     """
     # What is no session is told before its folder is held.
     with exclusive_lock(read_session(path).folder):
         session = read_session(path)
+        _expect_no_less(session)
         for leftover in session.folder.glob(".*"):
             # What the killed program was just writing.
             if is_unfinished(leftover) and leftover.name.startswith((f".{RECORDING_FILE}.", f".{TICKS_FILE}.")):
                 clear_away(leftover)
         session.write(progress)
     return session
+
+
+def _expect_no_less(session: Session) -> None:
+    """Raise where the table that is there has more ticks than a damaged log: it would be written over with less."""
+    if not session.log.lost_bytes or not session.ticks_file.exists():
+        return
+    try:
+        with session.ticks_file.open("rb") as table:
+            written = sum(1 for _ in table) - 1
+    except OSError as error:
+        raise InvalidFile(f"{session.ticks_file}: cannot be read: {error.strerror or error}") from error
+    if written > session.outline.ticks:
+        raise Mismatch(
+            f"{session.ticks_file}: expected no more ticks than the log has, which is damaged after "
+            f"{session.outline.ticks}, got {written}; move {RECORDING_FILE} and {TICKS_FILE} away to recover what the "
+            "log has"
+        )
 
 
 def told_unanswered(session: Session) -> str:

@@ -24,6 +24,7 @@ REFUSING = (
     "times-not-in-seconds",
     "more-stimuli-than-spikes",
     "simultaneous-stimuli",
+    "several-cultures",
 )
 """Names of the findings that make training pointless; a user may go on in spite of them."""
 
@@ -49,11 +50,18 @@ def extract_series(
             first one.
 
     Raises:
-        UnusableData: if a finding says that learning from a recording makes no sense, and is not in `allow`.
+        UnusableData: if a finding says that learning from a recording makes no sense, or simulated recordings are of
+            several seeds, and that is not in `allow`.
         InvalidArgument: for a name in `allow` of no finding that refuses, or readouts that the channels cannot have.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     check_allowed(allow)
+    seeds = {each.provenance["seed"] for each in recordings if "seed" in each.provenance}
+    if len(seeds) > 1 and "several-cultures" not in allow:
+        raise UnusableData(
+            f"recordings: expected those of one culture, got simulated ones of seeds {', '.join(sorted(seeds))}; "
+            "leave out all but one culture's (to allow it: --allow several-cultures)"
+        )
     series = []
     for recording in recordings:
         try:

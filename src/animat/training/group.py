@@ -16,7 +16,7 @@ import numpy as np
 
 from animat.compilation import FAST_TO_COMPILE
 from animat.environment import Environment
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, UnusableData
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
@@ -134,11 +134,21 @@ class SideBySide:
         """Train one chunk; returns the mean return of the episodes that ended in it, NaN for none.
 
         Chunks are numbered on from 0; one may go beyond those of the training.
+
+        Raises:
+            UnusableData: if what was learned is no longer a finite number.
         """
         first, last = self._group.training.chunk(index)
         self._learners, finished = self._chunk(self._learners, simulator, jnp.int32(first), jnp.int32(last))
         episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
         iterations = np.full(len(episodes), last * self._group.training.algorithm.environments)
+        # Before a checkpoint is written, from which no training would recover.
+        robot, deployed = self._group.training.robot, jax.tree.leaves(self._learners.deployed)
+        if not all(np.isfinite(leaf).all() for leaf in deployed):
+            raise UnusableData(
+                f"{robot.name}: expected finite rewards and observations, got NaN or infinite ones "
+                f"within {iterations[0]:,} iterations"
+            )
         with np.errstate(invalid="ignore"):
             self._curve.append(np.stack([iterations, episodes, returns / episodes], axis=1))
         return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")

@@ -58,6 +58,7 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     if abs(slope) <= CERTAIN * error:
         return
     large = abs(slope) > LARGE
+    is_mixed = responses.presentation is not None and responses.presentation.order == "mixed"
     yield Finding(
         "drift",
         "warning" if large else "note",
@@ -65,8 +66,8 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last "
         + ("(in the order of the rows)" if responses.time_s is None else f"(recording: {span_s / 60:.1f} min)")
         + (
-            ": one simulator stands for a culture that changes; record for a shorter time, wait until it has settled, "
-            "or present conditions mixed, so that drift is not taken for a difference"
+            ": one simulator stands for a culture that changes; record for a shorter time or wait until it has settled"
+            + ("" if is_mixed else ", or present conditions mixed, so that drift is not taken for a difference")
             if large
             else ""
         ),
