@@ -349,7 +349,7 @@ def test_pictures_show_the_robot_as_it_moves(id_: str) -> None:
 
 def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -> None:
     for number in range(3):
-        synthetic = synthetic_recording(number, start_min=30.0 * number, patterns=4, channels=16)
+        synthetic = synthetic_recording(1, start_min=30.0 * number, patterns=4, channels=16)
         write_nwb(synthetic, tmp_path / f"{number}.nwb")
     with pytest.warns(UserWarning) as told:
         gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path)
