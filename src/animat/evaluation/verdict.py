@@ -90,8 +90,8 @@ class Verdict:
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
             said.append(
-                f"{fewest.policies} episodes of the policies beside {fewest.control} of a control are too few to tell "
-                f"(p < {OUTPERFORMED_P:g}) whether the policies outperform {', '.join(few)}"
+                f"{_episodes(fewest.policies)} of the policies beside {fewest.control} of a control are too few to "
+                f"tell (p < {OUTPERFORMED_P:g}) whether the policies outperform {', '.join(few)}"
             )
         if not said:
             least = min(each.wins for each in self.controls.values())
@@ -100,3 +100,7 @@ class Verdict:
                 f"{100 * least:.0f} % of the pairs of episodes or more)"
             )
         return "; ".join(said)
+
+
+def _episodes(number: int) -> str:
+    return f"{number} episode{'' if number == 1 else 's'}"
