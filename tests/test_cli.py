@@ -356,6 +356,21 @@ BAD = {
     "a pipe": (pipe, ["inspect", "{folder}/pipe"], ["pipe: expected a file, got a device or a pipe"]),
     "a protocol that is a pipe": (pipe, ["record", "--protocol", "{folder}/pipe"], ["expected a file"]),
     "a name that is too long": (nothing, ["inspect", "a" * 5000], ["File name too long"]),
+    "an empty text for a folder": (
+        nothing,
+        ["record", "--culture", "synthetic", "--out", ""],
+        ["--out: expected a value after it, got an empty text"],
+    ),
+    "a folder of others' recordings": (
+        lambda folder, *_: (folder / "mine.nwb").write_text("x"),
+        ["record", "--culture", "synthetic", "--out", "{folder}"],
+        ["expected no recordings but those of this series, got mine.nwb; choose another --out"],
+    ),
+    "a file for a folder": (
+        lambda folder, *_: (folder / "taken").write_text("x"),
+        ["record", "--culture", "synthetic", "--out", "{folder}/taken"],
+        ["taken: cannot be made or read: it is no folder; choose another --out"],
+    ),
     "zero sessions": (
         nothing,
         ["record", "--culture", "synthetic", "--sessions", "0", "--out", "{folder}/r"],

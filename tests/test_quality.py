@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from animat.recordings.recording import Recording
 from animat.recordings.synthetic import SyntheticCulture
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
+from animat.stimulation.protocol import Order, Presentation
 from test_inspection import answering
 from test_responses import recording
 
@@ -138,6 +140,13 @@ def test_drift_within_a_recording(change: float, blocked: bool) -> None:
     # Over the time that a condition is presented for: in blocks of two, half of the recording.
     assert found.value == pytest.approx(change / 2 if blocked else change, abs=0.15)
     assert ("responses rise by" in found.message) == (change > 0)
+
+
+@pytest.mark.parametrize("order", ["blocked", "mixed"])
+def test_conditions_that_are_mixed_are_not_to_be_mixed(order: Order) -> None:
+    presented = replace(drifting(0.6, order == "blocked"), presentation=Presentation(order, 1))
+    found = findings(presented, burst_threshold=1.0)["drift"]
+    assert ("present conditions mixed" in found.message) == (order == "blocked")
 
 
 @pytest.mark.parametrize("seed", range(5))
