@@ -85,8 +85,8 @@ def test_wrappers_go_together_in_any_order() -> None:
         for i in range(2):
             state = environment.step(jax.random.key(i), state, jnp.int32(0), simulator)
             leaves += [environment.observe(state), *jax.tree.leaves(state)]
-        assert [quantity.name for quantity in environment.observation_spec] == ["step", "history"]
-        assert len(environment.scales) == len(leaves[0]) == 2
+        assert [quantity.name for quantity in environment.observation_spec] == ["step", "trace", "load"]
+        assert len(environment.scales) == len(leaves[0]) == 3
         seen.append([np.asarray(leaf).tolist() for leaf in leaves])
     assert all(each == seen[0] for each in seen)
 
@@ -125,7 +125,9 @@ def test_what_is_of_neurons_is_refused_without_them(wrapper: type[Wrapper[Any]])
 def contrary() -> MemorySimulator:
     """Heads in 0.2 and 0.8 of the tosses of two coins after tails, and in 0.8 and 0.2 after heads."""
     after = np.array([[0.0] * (10 - t) + [1.0] * t + [0.0] * t + [1.0] * (10 - t) for t in (2, 8)])
-    arrays = {"before": [[0.5] * 10 + [1.0] * 10] * 2, "after_hz": after, "left": 0.5 + after / 2}
+    before = np.array([[0.5] * 10 + [1.0] * 10] * 2)
+    histories = np.stack([before, np.full_like(before, 0.5)], axis=-1)
+    arrays = {"before": before, "histories": histories, "after_hz": after, "left": 0.5 + after / 2}
     return replace(persistent(), **{name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()})
 
 
@@ -144,7 +146,7 @@ class ByThePast(Actor):
     """The second coin after tails, the first one after heads."""
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        return (observation[:, -1] < 0.75).astype(jnp.int32)
+        return (observation[:, -2] < 0.75).astype(jnp.int32)
 
 
 def mean_return(environment: Environment[Any], actor: Actor) -> float:
@@ -188,7 +190,7 @@ def seeing(tmp_path_factory: pytest.TempPathFactory) -> Policy:
 
 def test_a_policy_knows_what_it_sees_and_is_evaluated_so(seeing: Policy, tmp_path: Path) -> None:
     assert seeing.neural_observation
-    assert seeing.weights[0].shape[0] == len(seeing.scales) == 5
+    assert seeing.weights[0].shape[0] == len(seeing.scales) == 6
     blind = trained(replace(SEEING, neural_observation=False), timeline_of(), tmp_path / "blind")["p0"]
     assert not blind.neural_observation
     tables = [evaluate({"p": policy}, timeline_of(), episodes=20) for policy in (seeing, blind)]

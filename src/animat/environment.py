@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from animat.coding.decoder import decoded, expect_fit, expect_one_command
 from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
-from animat.neurons.simulator import AT_FIRST, Answer, NeuronSimulator
+from animat.neurons.history import AT_FIRST
+from animat.neurons.simulator import Answer, NeuronSimulator
 from animat.robots.base import Quantity, Robot
 
 RobotState = TypeVar("RobotState")
@@ -46,7 +47,7 @@ class State(NamedTuple):
     Attributes:
         robot: the state of the robot.
         iteration: how many are done.
-        neurons: what they remember, in [0, 1], see `animat.neurons.simulator.Answer`.
+        neurons: what they remember, see `animat.neurons.simulator.Answer`.
         reward: in the task's own units.
         ended: whether the episode has.
         info: by name. `delivered`: the condition that reached the neurons (the action itself, where there are none).
@@ -56,7 +57,7 @@ class State(NamedTuple):
 
     robot: Any
     iteration: Int[Array, ""]
-    neurons: Number
+    neurons: Float[Array, "2"]
     reward: Number
     ended: Ended
     info: dict[str, Array]
@@ -103,7 +104,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         return State(
             self.robot.reset(key),
             jnp.int32(0),
-            jnp.float32(AT_FIRST),
+            jnp.array(AT_FIRST, jnp.float32),
             jnp.float32(0.0),
             Ended(jnp.bool_(False), jnp.bool_(False)),
             {"delivered": delivered, "rate_hz": rest, "command": rest},

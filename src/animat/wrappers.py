@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from animat.environment import Animat, Environment, RobotState, State, Uniforms
 from animat.errors import InvalidArgument
+from animat.neurons.history import HISTORY_SPEC
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Quantity, Robot
 
@@ -94,7 +95,7 @@ class ShuffledDelivery(Wrapper[RobotState]):
 class NeuralObservation(Wrapper[RobotState]):
     """Lets the policy see, after all else, what the neurons remember (`State.neurons`).
 
-    Of a simulator's history that is all that its next answer depends on; one without memory leaves it at 0.5.
+    Trace and load are all that a simulator's next answer depends on; one without memory leaves both at 0.5.
 
     Raises:
         InvalidArgument: around an environment without neurons.
@@ -105,10 +106,10 @@ class NeuralObservation(Wrapper[RobotState]):
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
-        return (*self.inside.observation_spec, Quantity("history", "1", 1.0, 0.0, 1.0))
+        return (*self.inside.observation_spec, *HISTORY_SPEC)
 
     def observe(self, state: State) -> Float[Array, " observations"]:
-        return jnp.append(self.inside.observe(state), state.neurons)
+        return jnp.concatenate([self.inside.observe(state), state.neurons])
 
 
 def _expect_neurons(wrapper: Wrapper[Any]) -> None:

@@ -178,9 +178,11 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
     for start_min in timeline.start_min.tolist():
         simulator = timeline.at(start_min)
         if isinstance(simulator, MemorySimulator):
-            decay, weight, reach = memory = simulator.memory
+            decay, weight, reach, load_s = memory = simulator.memory
             told = (
                 f"{decay:.2g} of the history state is left by each trial, which weighs {weight:.2g} beside its answer; "
                 f"one of the n^{reach:.2g} responses with the nearest history states is drawn"
             )
+            if load_s:
+                told += f"; how much was stimulated in the last {load_s:g} s tells too"
             yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

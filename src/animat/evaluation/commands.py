@@ -159,10 +159,14 @@ def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) 
     return CLASSES
 
 
-def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories"]) -> Int[Array, "*histories"]:
-    """Which class of histories each is remembered in: of the recording's own, equally many are in each."""
+def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"]) -> Int[Array, "*histories"]:
+    """Which class of histories each is remembered in, by its trace: of the recording's own, equally many are in each.
+
+    The load is not told apart: in each class there are the loads that were recorded with such traces.
+    """
     ends = np.arange(1, CLASSES) / CLASSES
-    return jnp.sum(jnp.asarray(history)[..., None] >= jnp.quantile(_recorded(simulator), ends), axis=-1)
+    traces = _recorded(simulator)[:, 0]
+    return jnp.sum(jnp.asarray(history)[..., :1] >= jnp.quantile(traces, ends), axis=-1)
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
@@ -201,13 +205,13 @@ def _is_shuffled(environment: Environment[Any]) -> bool:
     return isinstance(environment, Wrapper) and _is_shuffled(environment.inside)
 
 
-def _recorded(simulator: MemorySimulator) -> Float[Array, " responses"]:
-    """The histories of all recorded responses, rising."""
-    histories = jnp.sort(jnp.asarray(simulator.before).ravel())
-    return histories[: int(jnp.sum(jnp.isfinite(histories)))]
+def _recorded(simulator: MemorySimulator) -> Float[Array, "responses 2"]:
+    """The histories of all recorded responses, by rising trace."""
+    histories = jnp.asarray(simulator.histories)[jnp.isfinite(jnp.asarray(simulator.before))]
+    return histories[jnp.argsort(histories[:, 0])]
 
 
-def _histories(simulator: MemorySimulator) -> Float[Array, "classes histories"]:
+def _histories(simulator: MemorySimulator) -> Float[Array, "classes histories 2"]:
     """A few histories of each class, evenly spaced in rank among those that were recorded."""
     recorded = _recorded(simulator)
     ends = np.searchsorted(np.asarray(class_of(simulator, recorded)), np.arange(CLASSES + 1))
@@ -226,15 +230,16 @@ def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses
 
 @partial(jax.jit, static_argnums=0)
 def _answers(
-    environment: Animat[Any], simulator: MemorySimulator, history: Float[Array, "classes histories"]
-) -> tuple[Float[Array, "classes conditions draws"], Float[Array, "classes conditions draws"]]:
+    environment: Animat[Any], simulator: MemorySimulator, history: Float[Array, "classes histories 2"]
+) -> tuple[Float[Array, "classes conditions draws"], Float[Array, "classes conditions draws 2"]]:
     """The commands, and what is remembered then, at evenly spaced quantiles of each condition after each history."""
     uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
-
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
     conditions = jnp.arange(simulator.n_conditions)
-    x, then = (each.reshape(len(history), len(conditions), -1) for each in answers(conditions, uniforms, history))
+    answered = answers(conditions, uniforms, history)
+    shape = len(history), len(conditions), -1
+    x, then = answered.rate_hz.reshape(shape), answered.history.reshape(*shape, 2)
     return environment.mapping.command(x, simulator.percentiles), then
 
 

@@ -20,8 +20,9 @@ from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.statistics import Interval
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
+from animat.neurons.history import AT_FIRST
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import AT_FIRST, NeuronSimulator
+from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
@@ -309,7 +310,7 @@ class _Programme:
             )
             values, before = before, values
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
-        first = np.full(1, AT_FIRST)
+        first = np.array([AT_FIRST])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
         return self._interpolate(values.reshape(shape)[:, at_first], starts)
 
@@ -352,7 +353,7 @@ class _Programme:
                 break
         return returns
 
-    def _layer(self, case: int, history: Float[Any, " episodes"]) -> Int32[np.ndarray, " episodes"]:
+    def _layer(self, case: int, history: Float[Any, "episodes 2"]) -> Int32[np.ndarray, " episodes"]:
         """In which of a case's layers episodes are, by their history."""
         simulator = self._cases[case][1]
         if layers_of(*self._cases[case]) == 1 or not isinstance(simulator, MemorySimulator):

@@ -119,7 +119,7 @@ def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions dr
 
     def of_condition(condition: Int[Array, ""]) -> Float[Array, "draws *readouts"]:
         # What is padded is stood for by those that are there, over and over.
-        before = simulator.before[condition][rows % simulator.followers[condition]]
+        before = simulator.histories[condition][rows % simulator.followers[condition]]
         rate_hz = answer(condition, uniforms, before).rate_hz
         return rate_hz.reshape(-1, *rate_hz.shape[2:])
 

@@ -9,10 +9,12 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
 from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
+from animat.neurons.history import AT_FIRST
 from animat.responses.responses import Responses
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
@@ -25,21 +27,16 @@ PERCENTILES = tuple(range(0, 101, 10))
 """Which percentiles of the pooled non-burst responses a simulator carries: P0 (smallest), P10, ..., P100 (largest)."""
 
 
-AT_FIRST = 0.5
-"""The history state that an episode begins with: its warm-up was presented in random order, as in a recording."""
-
-
 class Answer(NamedTuple):
     """A response, and what is remembered after it.
 
     Attributes:
         rate_hz: x, Hz per channel; of several readouts one each, shape (readouts,).
-        history: state in [0, 1]: 0 after silence, larger the more the culture was driven and has answered of late (see
-            `animat.neurons.memory`).
+        history: the history state, trace and load (`animat.neurons.history`), as `animat.neurons.memory` makes it.
     """
 
     rate_hz: Float[Array, "*readouts"]
-    history: Float[Array, ""]
+    history: Float[Array, "2"]
 
 
 class NeuronSimulator(abc.ABC):
@@ -73,8 +70,8 @@ class NeuronSimulator(abc.ABC):
         Of several readouts, which have no order, any function of a uniform that has their joint law.
         """
 
-    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, ""]) -> Answer:
-        """What is answered to a condition, by a uniform in [0, 1), after a history state in [0, 1] (0: silence).
+    def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
+        """What is answered to a condition, by a uniform in [0, 1), after a history state (see `Answer`).
 
         A simulator without memory answers the same whatever was before, and leaves the history as it is.
         """
@@ -82,9 +79,9 @@ class NeuronSimulator(abc.ABC):
 
     @final
     def sample(
-        self, key: PRNGKeyArray, condition: Int[Array, ""], history: float | Array = AT_FIRST
+        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = AT_FIRST
     ) -> Float[Array, "*readouts"]:
-        """Draw one response x to a condition, in Hz per channel, after a history state in [0, 1]."""
+        """Draw one response x to a condition, in Hz per channel, after a history state (see `Answer`)."""
         return self.answer(condition, jax.random.uniform(key), jnp.asarray(history, jnp.float32)).rate_hz
 
 

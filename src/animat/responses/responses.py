@@ -27,6 +27,7 @@ class Presented:
         rate_hz: x of each, shape (presentations,).
         is_burst: whether the response was one, shape (presentations,).
         is_rested: whether there was no pulse in the second before it, shape (presentations,).
+        time_s: of the pulse that it was read after, shape (presentations,); None where it is not known.
     """
 
     __repr__ = briefly
@@ -35,9 +36,11 @@ class Presented:
     rate_hz: Float64[np.ndarray, " presentations"]
     is_burst: Bool[np.ndarray, " presentations"]
     is_rested: Bool[np.ndarray, " presentations"]
+    time_s: Float64[np.ndarray, " presentations"] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("condition", "rate_hz", "is_burst", "is_rested"):
+        known = () if self.time_s is None else ("time_s",)
+        for name in ("condition", "rate_hz", "is_burst", "is_rested", *known):
             array = np.array(getattr(self, name))
             if array.shape != (len(self.condition),):
                 raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {array.shape}")

@@ -13,8 +13,9 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
+from animat.neurons.history import AT_FIRST
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
@@ -140,9 +141,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         return SimulatorTimeline(
-            simulators=_KINDS[told["kind"]](
-                **{_FORMER.get(name, name): jnp.asarray(array) for name, array in load(data).items()}
-            ),
+            simulators=_simulators(told["kind"], load(data)),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),
@@ -153,6 +152,18 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         )
     except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:
         raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error
+
+
+def _simulators(kind: str, arrays: dict[str, np.ndarray]) -> NeuronSimulator:
+    """From a file's arrays; a memory of before had no load."""
+    arrays = {_FORMER.get(name, name): array for name, array in arrays.items()}
+    if kind == MemorySimulator.__name__ and "load_s" not in arrays:
+        before, decay = arrays["before"], arrays["decay"]
+        arrays["histories"] = np.stack([before, np.full_like(before, AT_FIRST[1])], axis=-1)
+        arrays["toward"] = np.tile(np.array([1.0, 0.0], np.float32), (*before.shape[:2], 1))
+        arrays["kept"] = np.ones(before.shape[:2], np.float32)
+        arrays["added"] = arrays["load_s"] = np.zeros_like(decay)
+    return _KINDS[kind](**{name: jnp.asarray(array) for name, array in arrays.items()})
 
 
 def _metadata(data: bytes) -> dict[str, str]:
