@@ -205,7 +205,7 @@ def test_the_load_is_what_was_presented_in_the_seconds_before() -> None:
 
 def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> None:
     times_known = [loaded(600, seed, slope=-60.0) for seed in range(10)]
-    assert all(fit_memory(each).memory.load_s == 2.0 for each in times_known)
+    assert all(fit_memory(each).memory.load_s == 1.0 for each in times_known)
     assert not any(
         fit_memory(replace(each, presented=replace(each.presentations[0], time_s=None))).memory.load_s
         for each in times_known

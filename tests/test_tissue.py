@@ -364,7 +364,7 @@ def test_excitation_is_scaled_down_by_spikes_and_up_by_silence() -> None:
     assert tissue._state.scaling[0] == pytest.approx(scaling, rel=1e-9)
     spike(tissue, n_e)  # an inhibitory neuron's spike scales nothing
     assert tissue._state.scaling[0] == pytest.approx(scaling, rel=1e-9)
-    later(tissue, 10 * 3600.0)
+    later(tissue, 20 * 3600.0)
     spike(tissue, 0)
     assert tissue._state.scaling[0] == pytest.approx(at_rest, rel=1e-4)
 

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from animat.environment import Animat, Environment, RobotState, State, Uniforms
 from animat.errors import InvalidArgument
-from animat.neurons.history import HISTORY_SPEC
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Quantity, Robot
 
@@ -106,7 +105,8 @@ class NeuralObservation(Wrapper[RobotState]):
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
-        return (*self.inside.observation_spec, *HISTORY_SPEC)
+        trace, load = Quantity("trace", "1", 1.0, 0.0, 1.0), Quantity("load", "1", 1.0, 0.0)
+        return (*self.inside.observation_spec, trace, load)
 
     def observe(self, state: State) -> Float[Array, " observations"]:
         return jnp.concatenate([self.inside.observe(state), state.neurons])

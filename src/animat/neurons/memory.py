@@ -49,8 +49,8 @@ NO_MEMORY = Memory(0.0, 0.0, 1.0)
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0)
 _EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
-_LOAD_S = 2.0
-"""Settled on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s this one told their closed loops' responses best."""
+_LOAD_S = 1.0
+"""Settled on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s this one told the responses in their closed loops best."""
 _UNLIKELY = 0.01
 """How often a load would explain as much by chance, at most."""
 _CERTAIN = 2.0
@@ -132,7 +132,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     rank, by the mean of its neighbours. Of twelve ways to make a trace the one with the smallest error is taken, and
     of its exponents the largest that is as good as the best, up to one standard error of the difference. Where nothing
     tells responses better than no history at all does, by two standard errors, there is no memory in the simulator
-    either. Where there is, and the times of the trials are known, a load of two seconds is taken too if it explains
+    either. Where there is, and the times of the trials are known, a load of one second is taken too if it explains
     ranks beyond the trace (p < 0.01, F test of linear regressions).
 
     Args:

@@ -22,7 +22,7 @@ from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
-from animat.neurons.history import HISTORY_SPEC
+from animat.neurons.history import AT_FIRST
 from animat.plain_file import expect_plain_file, is_folder
 from animat.records import Number, read_record
 from animat.responses.condition import Condition
@@ -108,7 +108,7 @@ class Policy:
                 f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
             )
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
-        seen = len(self.robot.observation_spec) + len(HISTORY_SPEC) * self.neural_observation
+        seen = len(self.robot.observation_spec) + len(AT_FIRST) * self.neural_observation
         widths = [seen, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):

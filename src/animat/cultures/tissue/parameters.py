@@ -7,7 +7,7 @@ from math import isfinite
 
 from animat.errors import InvalidArgument
 
-REVISION = 4
+REVISION = 5
 """Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
 before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
 another revision are then refused, in place of being gone on with as if they were of this tissue."""
@@ -71,7 +71,7 @@ class TissueParameters:
     hyperpolarisation_ms: float = 25000.0
     """[L] Its time constant: after a train the sodium pump hyperpolarises for about 20 s (Gulledge et al. 2013,
     doi 10.1523/JNEUROSCI.0220-13.2013)."""
-    adaptation_mv: float = 0.37
+    adaptation_mv: float = 0.27
     """[C] Added to the threshold by each spike."""
     adaptation_ms: float = 126.0
     """[C] Its time constant."""
@@ -85,11 +85,11 @@ class TissueParameters:
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
     nmda_saturation: float = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
-    e_to_e: ShortTerm = ShortTerm(0.12, 1050.0, 220.0)
+    e_to_e: ShortTerm = ShortTerm(0.12, 1090.0, 220.0)
     e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
     i_to_any: ShortTerm = ShortTerm(0.137, 665.0)
     """[C] within [L]: short-term plasticity."""
-    weight_ee: float = 0.5505
+    weight_ee: float = 0.56
     weight_ei: float = 0.9483
     weight_ie: float = 0.302
     weight_ii: float = 0.94
@@ -107,7 +107,7 @@ class TissueParameters:
     """[C] Sigma of the log-normal spread of out-degrees."""
     communities: int = 3
     """[C] Number of communities, each the neurons nearest to one of as many centres."""
-    between_share: float = 0.055
+    between_share: float = 0.06
     """[C] A connection between communities is this share as likely as one within, at the same distance."""
     delay_ms: float = 0.8
     """Delay of a synapse without distance."""
@@ -115,7 +115,7 @@ class TissueParameters:
     """[L] Speed of axons."""
 
     # Drive.
-    drive_mv: float = 9.47
+    drive_mv: float = 9.54
     drive_spread_mv: float = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
     community_drive_mv: float = 0.1
@@ -124,7 +124,7 @@ class TissueParameters:
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
     """[C] Its time constant."""
-    shared_noise_mv: float = 0.6
+    shared_noise_mv: float = 0.78
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
     shared_noise_ms: float = 575.0
     """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
@@ -148,7 +148,7 @@ class TissueParameters:
     """[C] Latency: this, conduction, and a share of the spread that is each neuron's own."""
     axon_jitter_ms: float = 0.16
     """[L] Standard deviation of the latency from pulse to pulse."""
-    availability_loss: float = 0.035
+    availability_loss: float = 0.037
     """[C] Share of a neuron's availability lost with each spike."""
     availability_s: float = 2.8
     """[C] Time constant of its recovery (Goldental et al. 2014: failures above a critical frequency)."""
@@ -157,11 +157,11 @@ class TissueParameters:
     """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
 
     # What changes over minutes and hours.
-    scaling_loss: float = 1.1e-4
+    scaling_loss: float = 5.5e-5
     """[C] Share of all excitatory weights lost with a spike of each excitatory neuron (homeostatic scaling)."""
-    scaling_min: float = 60.0
+    scaling_min: float = 120.0
     """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
-    scaling_at_hz: float = 0.52
+    scaling_at_hz: float = 0.62
     """[C] The excitatory neurons' mean rate that scaling holds: loss and recovery then balance at the full weights."""
     load_gain: float = 0.08
     """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
