@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
@@ -33,8 +31,7 @@ class Calibration:
 
     Attributes:
         simulator: of the recording.
-        bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been. Their
-            percentiles are of as many of them as adaptive thresholds count.
+        bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
         responses_hz: non-burst responses of each condition, in the order of time, shape (responses,); of several
             readouts (responses, readouts).
         burst_threshold: ratio of active channels above which its responses were bursts.
@@ -105,7 +102,7 @@ class Calibration:
         fit |= {"memory": memory, "room": room_for(series)}
         calibration = cls(
             simulator=simulator,
-            bootstraps=tuple(_drawn_anew(responses, rng, fit) for _ in range(BOOTSTRAPS)),
+            bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
@@ -129,11 +126,3 @@ class Calibration:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
         return replace(self, simulator=fixed(self.simulator), bootstraps=tuple(map(fixed, self.bootstraps)))
-
-
-def _drawn_anew(responses: Responses, rng: np.random.Generator, fit: dict[str, Any]) -> NeuronSimulator:
-    """The simulator of one bootstrap sample."""
-    drawn = responses.bootstrapped(rng)
-    # Adaptive thresholds are percentiles of fewer responses than the recording has, and vary the more for it.
-    newest = AdaptiveThresholds([drawn.read_of(i) for i in range(len(drawn.conditions))])
-    return replace(fit_simulator(drawn, **fit), percentiles=jnp.asarray(newest.percentiles()))  # type: ignore[type-var]
