@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from animat.errors import InvalidArgument, first_line, shown
+from animat.errors import InvalidArgument, did_you_mean, first_line, shown
 
 Thing = TypeVar("Thing")
 
@@ -100,6 +100,7 @@ class Registry(Generic[Thing]):
             if parameter not in known:
                 raise InvalidArgument(
                     f"{name}: expected parameters among {', '.join(known) or 'none'}, got {shown(parameter)}"
+                    f"{did_you_mean(parameter, known)}"
                 )
         try:
             return kind(**parameters)
@@ -123,8 +124,8 @@ class Registry(Generic[Thing]):
         kind = self._kind(name)
         if kind is None:
             raise InvalidArgument(
-                f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}; "
-                "one of your own is named by its module:Class"
+                f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}"
+                + (did_you_mean(str(name), self.names()) or "; one of your own is named by its module:Class")
             )
         return kind
 
