@@ -168,7 +168,8 @@ def _fired(recording: Recording) -> str | None:
             f"two spikes of a channel within {SHORT_S:g} s; times are in {_unit_of_spikes(interval_s)}"
         )
     stimulus_s = recording.stimuli.time_s
-    if len(stimulus_s) >= ENOUGH_STIMULI and not np.any(_spikes_soon_after(times_s, stimulus_s)):
+    soon_after = np.searchsorted(times_s, stimulus_s + SOON_S) - np.searchsorted(times_s, stimulus_s)
+    if len(stimulus_s) >= ENOUGH_STIMULI and not np.any(soon_after):
         return (
             f"times cannot be in seconds: {hours} without a spike within {1e3 * SOON_S:g} ms after any of "
             f"{len(stimulus_s):,} stimuli; are they in milliseconds, or spikes and stimuli in different units?"
@@ -186,12 +187,6 @@ def _unit_of_spikes(interval: Float64[np.ndarray, " intervals"]) -> str:
         if shortest < SHORTEST_IN_MICROSECONDS
         else "microseconds; divide them by 1,000,000"
     )
-
-
-def _spikes_soon_after(
-    spike_s: Float64[np.ndarray, " spikes"], stimulus_s: Float64[np.ndarray, " stimuli"]
-) -> Float64[np.ndarray, " stimuli"]:
-    return np.searchsorted(spike_s, stimulus_s + SOON_S) - np.searchsorted(spike_s, stimulus_s)
 
 
 def _apart(recording: Recording) -> str | None:

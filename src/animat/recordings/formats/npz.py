@@ -129,16 +129,13 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
 
 def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
     """Refuse what unpacks to far more than a recording of that size does."""
-    unpacked, limit = sum(entry.file_size for entry in archive.infolist()), unpacked_limit(path)
+    # Spikes compress to a fifth or so.
+    limit = UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
+    unpacked = sum(entry.file_size for entry in archive.infolist())
     if unpacked > limit:
         raise InvalidFile(
             f"{path}: unpacks to {unpacked:,} bytes, more than a recording of its size does ({limit:,}): it is damaged"
         )
-
-
-def unpacked_limit(path: Path) -> int:
-    """How many bytes a compressed recording may unpack to; spikes compress to a fifth or so."""
-    return UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
 
 
 def _array(archive: Mapping[str, Column], key: str) -> Column:
