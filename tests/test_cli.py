@@ -491,9 +491,16 @@ def test_inspect_refuses_its_options_before_the_files(
     [
         (["train", "cartpole", "--policies", "many"], 2, ["--policies", "many", "animat train --help"]),
         (["train", "unicycle"], 1, ["robot: expected one of cartpole, navigation, got 'unicycle'", "module:Class"]),
-        (["train", "cartpole", "--polices", "3"], 2, ["--polices"]),
+        (["train", "cartpole", "--polices", "3"], 2, ["animat: unknown option --polices; did you mean --policies?"]),
+        (["record", "--sesions=2"], 2, ["animat: unknown option --sesions=2; did you mean --sessions?"]),
+        (["record", "--zzz"], 2, ["animat: unknown option --zzz; see animat record --help"]),
+        (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
+        (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),
+        (["train", "cartpole", "pole"], 2, ["animat: unexpected argument 'pole'; see animat train --help"]),
+        (["train", "--robot", "pole"], 2, ["animat: robot: expected its value alone, got --robot before it; see"]),
+        (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
         (["train", "--window-ms", "2"], 2, ["animat: --window-ms: expected two numbers, got '2'; see animat train"]),
-        (["trian"], 2, ["trian", "train, evaluate"]),
+        (["trian"], 2, ["train, evaluate", "got 'trian'; did you mean train?"]),
         ([], 2, ["record, inspect"]),
     ],
 )

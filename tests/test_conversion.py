@@ -176,6 +176,13 @@ def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
+@pytest.mark.parametrize("name", ["x.csv", "x", "x.nwb.gz"])
+def test_what_is_written_is_called_nwb(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match=r"^--out: expected a name that ends in \.nwb, as NWB is written, got "):
+        convert_recording(rig_file("npz", tmp_path), tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
 def test_spikeinterface_is_asked_for_by_the_formats_name(tmp_path: Path) -> None:
     path = rig_file("maxwell", tmp_path)
     installed = True

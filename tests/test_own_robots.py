@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import pickle
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,7 +27,7 @@ from animat.execution.training import train
 from animat.robots import Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
 from animat.robots.grid import no_grid
-from animat.robots.registry import robot_named
+from animat.robots.registry import REGISTRY, register_robot, robot_named
 from animat.training.policy import load_policies
 from animat.training.specification import Training
 from test_training import SMALL, Kept, timeline_of
@@ -263,3 +264,15 @@ class LaterNaN(Slider):
 def test_a_reward_that_is_no_number_later_is_named() -> None:
     with pytest.raises(UnusableData, match="later: expected finite rewards and observations, got NaN or infinite ones"):
         train(training(LaterNaN(), None), None, None)
+
+
+def test_a_training_that_is_refused_leaves_nothing_in_the_way_of_the_next(tmp_path: Path) -> None:
+    register_robot(LaterNaN)
+    try:
+        for iterations in (480, 960):
+            refused = dataclasses.replace(training(LaterNaN(), None), iterations=iterations)
+            with ThreadPoolExecutor(1) as executor, pytest.raises(UnusableData, match="later: expected finite rewards"):
+                train(refused, None, tmp_path / "policies", executor=executor, checkpoint_s=0)
+            assert not (tmp_path / "policies").exists()
+    finally:
+        REGISTRY._registered.pop("later")

@@ -408,6 +408,10 @@ def test_times_of_three_decimals_are_read_where_one_cannot_be_thousands(millisec
 BAD_CSV = {
     "no known column": ("t,c\n1,2\n", None, "expected a column named spike_time_s or time_s or time, found t, c"),
     "no channel": ("time,c\n1,2\n", None, "expected a column named spike_channel or channel or unit, found time, c"),
+    "a misspelt time": ("tmie,channel\n1,2\n", None, "found tmie, channel; did you mean time\\?$"),
+    "a misspelt channel": ("time,Chanel\n1,2\n", None, "found time, Chanel; did you mean channel\\?$"),
+    "misspelt responses": ("trial,channel,cuont\n1,2,3\n", None, "trial, channel, cuont; did you mean count\\?$"),
+    "channels and times swapped": ("time,channel\n3,0.5\n", None, "line 2: .* or names, got 0.5: are the columns"),
     "a word for a time": (
         "time,channel\n1,2\nsoon,2\n",
         None,

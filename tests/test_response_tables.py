@@ -116,6 +116,19 @@ def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
     assert "6 spikes on 2 channels, from 0 min" in text
 
 
+def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
+    def warned(frequency_hz: list[float]) -> list[str]:
+        np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_frequency_hz=frequency_hz)
+        return [f.message for f in noticed(table_of(tmp_path / "a.npz")) if f.name == "other-frequencies"]
+
+    assert warned([0.2, 0.05, 0.0125]) == [
+        "all frequencies are below 1 Hz, 0.0125 to 0.2: if they are periods in seconds, write 1 divided by each, "
+        "5 to 80"
+    ]
+    # One low frequency is as likely as one period, and one of 1 Hz or more is none.
+    assert warned([0.2, 0.2, 0.2]) == warned([0.2, 0.5, 1.0]) == []
+
+
 def test_only_what_needs_spikes_refuses_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
     assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1

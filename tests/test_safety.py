@@ -261,10 +261,10 @@ WIDE = replace(SIMULATED_LIMITS, stimuli_per_s=10, stimuli_per_electrode_s=5, st
 @pytest.mark.parametrize(
     ("limit", "stimuli", "words"),
     [
-        ("amplitude", [one(Pulse((Phase(100, amplitude_mv=-401),)))], "at most 400 mV, got -401"),
+        ("amplitude", [one(Pulse((Phase(100, amplitude_mv=-401),)))], "-400 to 400 mV, got -401"),
         ("phase_us", [one(Pulse((Phase(20, amplitude_mv=-1),)))], "phases of 50 to 1000 us, got 20"),
-        ("charge_per_phase", [one(Pulse((Phase(1000, amplitude_mv=-300),)))], "at most 200 mV ms a phase, got -300"),
-        ("net_charge", [one(Pulse((Phase(500, amplitude_mv=-60),)))], "balance to 25 mV ms, got -30"),
+        ("charge_per_phase", [one(Pulse((Phase(1000, amplitude_mv=-300),)))], "-200 to 200 mV ms a phase, got -300"),
+        ("net_charge", [one(Pulse((Phase(500, amplitude_mv=-60),)))], "balance to within 25 mV ms, got -30"),
         ("kind", [one(Pulse((Phase(500, amplitude_ua=-1),)))], "expected voltage pulses, got a current pulse"),
         ("electrodes_at_once", [one(electrodes=())], "expected 1 to 32 electrodes, got 0"),
         ("sites", [one(electrodes=(99,))], "got electrode 99"),
@@ -293,7 +293,7 @@ def test_a_refusal_names_the_limit_the_value_and_that_nothing_happened(
 def test_the_papers_pulse_is_not_balanced_and_passes_only_where_limits_say_so() -> None:
     assert PUBLISHED_PULSE.net_charge == -20.0
     Guard(SIMULATED_LIMITS, SITES).admit([one(PUBLISHED_PULSE)], 0.0)
-    with pytest.raises(UnsafeStimulus, match="net_charge: expected phases that balance to 1 mV ms, got -20"):
+    with pytest.raises(UnsafeStimulus, match="net_charge: expected phases that balance to within 1 mV ms, got -20"):
         Guard(replace(SIMULATED_LIMITS, net_charge=1.0), SITES).admit([one(PUBLISHED_PULSE)], 0.0)
     assert BALANCED_PULSE.net_charge == 0.0
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copyreg
+import difflib
 import re
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -71,6 +73,12 @@ def shown(value: object, most: int = 80) -> str:
         # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
         text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"
     return text if len(text) <= most else f"{text[:most]}... ({len(text):,} characters)"
+
+
+def did_you_mean(word: str, among: Iterable[str]) -> str:
+    """The end of a message on a word that is none of those expected: the nearest of them, if any is near."""
+    near = difflib.get_close_matches(word, list(among), n=1, cutoff=0.7)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def first_line(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, Va
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, did_you_mean, shown
 
 T = TypeVar("T")
 
@@ -109,7 +109,9 @@ def _told(error: ValidationError, kind: Any, within: str = "") -> str:
         for part in loc[:-1]:
             kind = get_args(kind)[0] if isinstance(part, int) else kind.__pydantic_fields__[part].annotation
         place = f"in [{where.rpartition('.')[0]}]" if "." in where else "at the top"
-        return f"{_key(str(loc[-1]))}: no such setting {place}; expected some of {', '.join(kind.__pydantic_fields__)}"
+        known, given = kind.__pydantic_fields__, str(loc[-1])
+        expected = f"expected some of {', '.join(known)}{did_you_mean(given, known)}"
+        return f"{_key(given)}: no such setting {place}; {expected}"
     if mistake["type"] == "value_error":
         said = mistake["ctx"]["error"]
         # That of a record within this one begins with the field's name.

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from animat.errors import InvalidArgument, first_line, shown
+from animat.errors import InvalidArgument, did_you_mean, first_line, shown
 
 Thing = TypeVar("Thing")
 
@@ -100,6 +100,7 @@ class Registry(Generic[Thing]):
             if parameter not in known:
                 raise InvalidArgument(
                     f"{name}: expected parameters among {', '.join(known) or 'none'}, got {shown(parameter)}"
+                    f"{did_you_mean(parameter, known)}"
                 )
         try:
             return kind(**parameters)
@@ -123,8 +124,8 @@ class Registry(Generic[Thing]):
         kind = self._kind(name)
         if kind is None:
             raise InvalidArgument(
-                f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}; "
-                "one of your own is named by its module:Class"
+                f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}"
+                + (did_you_mean(str(name), self.names()) or "; one of your own is named by its module:Class")
             )
         return kind
 
@@ -174,7 +175,8 @@ class Registry(Generic[Thing]):
         noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
         if name in self._ours and self._ours[name] == thing:
             return
-        if self._registered.get(name) is not kind or self._again(thing) != thing:
+        is_registered = self._registered.get(name) is kind
+        if not is_registered or self.from_dict(json.loads(json.dumps(self.to_dict(thing)))) != thing:
             raise InvalidArgument(
                 f"{noun}: expected one that is registered, as a policy's file names its {noun}, got {kind.__name__}, "
                 f"which is not: write @animat.register_{noun} above its class, or {_IN_MEMORY}"
@@ -185,9 +187,6 @@ class Registry(Generic[Thing]):
                 f"{noun}: expected a class at the top of a file, which worker processes can import, got {place}: put "
                 f"it into a file, or {_IN_MEMORY}"
             )
-
-    def _again(self, thing: Thing) -> Thing:
-        return self.from_dict(json.loads(json.dumps(self.to_dict(thing))))
 
     def _kind(self, name: Any) -> type[Thing] | None:
         if not isinstance(name, str):

@@ -10,7 +10,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, get_args
 
 import tyro
@@ -36,7 +36,7 @@ from animat.cli.run import Run
 from animat.cli.study import StudyFile
 from animat.cli.train import Train
 from animat.ctrl_c import heard_everywhere
-from animat.errors import AnimatError, InvalidArgument, out_of_memory
+from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 
 Command = (
     Annotated[Record, subcommand("record")]
@@ -52,8 +52,7 @@ Command = (
     | Annotated[Robots, subcommand("robots")]
 )
 
-COMMANDS = tuple(command.__metadata__[0].name for command in get_args(Command))
-
+COMMANDS = {command.__metadata__[0].name: command.__origin__ for command in get_args(Command)}
 
 _LESS: dict[type, str] = {
     Evaluate: "ask for fewer episodes (--episodes {episodes})",
@@ -134,34 +133,61 @@ def _run(given: list[str]) -> int:
 
 def _parse(arguments: list[str]) -> Command:
     """Read the command line; usage errors come in one line, not in a box."""
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {arguments[0]!r}")
     if not arguments:
         raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; see animat --help")
+    name = arguments[0]
+    if name not in COMMANDS and name != "-h" and not name.startswith("--"):
+        near = did_you_mean(name, COMMANDS)
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {name!r}{near}")
     if "" in arguments:
         # Where a variable of the shell is not set; a path would be the working folder.
         before = arguments[arguments.index("") - 1]
         raise InvalidArgument(f"{before}: expected a value after it, got an empty text")
+    fields = dataclasses.fields(COMMANDS[name]) if name in COMMANDS else ()
+    options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
+    see = f"; see animat {name} --help" if name in COMMANDS else "; see animat --help"
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(
+            command, unknown = tyro.cli(
                 Command,
                 prog="animat",
                 description="Drive a robot with a living neuronal culture.",
                 args=arguments,
                 config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
                 registry=_options(),
+                return_unknown_args=True,
             )
     except SystemExit as stop:
         if not stop.code:
             raise
+        given = itertools.takewhile(lambda argument: argument != "--", arguments)
+        _expect_known([each for each in given if each[:2] == "--" and _plain(each) not in options], options, see)
+        for option, value in itertools.pairwise([*arguments, "--"]):
+            if value.startswith("--") and not isinstance(options.get(option.replace("_", "-"), False), bool):
+                raise InvalidArgument(f"{option}: expected a value after it, got none{see}") from None
         # A box with a title; where the terminal has no such letters, lines of dashes, one of them under the title.
         lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()[1:]]
         parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
         what = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
-        told = what.removeprefix("Error parsing ")
-        raise InvalidArgument(f"{told}; see animat {arguments[0]} --help") from None
+        raise InvalidArgument(f"{what.removeprefix('Error parsing ')}{see}") from None
+    _expect_known(unknown, options, see)
+    return command
+
+
+def _plain(option: str) -> str:
+    """An option as help has it: without the value that it may end with, with dashes."""
+    return option.partition("=")[0].replace("_", "-")
+
+
+def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) -> None:
+    for given in unknown[:1]:
+        option = _plain(given)
+        if option in options:
+            raise InvalidArgument(f"{option[2:]}: expected its value alone, got {given} before it{see}") from None
+        if given.startswith("-"):
+            raise InvalidArgument(f"unknown option {given}{did_you_mean(option, options) or see}") from None
+        raise InvalidArgument(f"unexpected argument {given!r}{see}") from None
 
 
 def _options() -> ConstructorRegistry:

@@ -44,7 +44,9 @@ def held(device: Path, holder: str) -> Iterator[bool]:
                 # In a folder that all can write to, another user could point it at one of ours.
                 raise DeviceFailed(f"{device.name}: expected a folder to hold it by, got the link {device}: remove it")
             stack.enter_context(exclusive_lock(device))
-            _share(device)
+            if device.stat().st_uid == os.geteuid():
+                # Other users of the machine may hold it later; they can remove nothing of ours.
+                device.chmod(0o1777)
         except (InvalidFile, OSError) as error:
             raise DeviceFailed(
                 f"{device.name}: expected a folder to hold it by that every user can write to, got {device}: "
@@ -56,12 +58,6 @@ def held(device: Path, holder: str) -> Iterator[bool]:
                 "this program or another: close it there first"
             ) from error
         yield _last(device, holder) != holder
-
-
-def _share(device: Path) -> None:
-    """Let other users of the machine hold it later; they can remove nothing of ours."""
-    if device.stat().st_uid == os.geteuid():
-        device.chmod(0o1777)
 
 
 def _last(device: Path, holder: str) -> str:

@@ -119,14 +119,10 @@ def is_multiple(value: float, step: float) -> bool:
     return step == 0 or (value > 0 and abs(value / step - round(value / step)) < 1e-9)
 
 
-def _lies_within(ours: tuple[float, float], device: tuple[float, float]) -> bool:
-    return device[0] <= ours[0] and ours[1] <= device[1]
-
-
 _IS_AS_TIGHT: dict[str, Callable[[Any, Any], bool]] = {
     "kind": operator.eq,
     "amplitude": operator.le,
-    "phase_us": _lies_within,
+    "phase_us": lambda ours, device: device[0] <= ours[0] and ours[1] <= device[1],
     "charge_per_phase": operator.le,
     "net_charge": operator.le,
     "net_charge_per_session": operator.le,

@@ -191,8 +191,9 @@ class Guard:
             if not abs(left) <= most:
                 raise UnsafeStimulus(
                     "net_charge_per_session",
-                    f"expected pulses of a session that leave at most {most:g} {self.limits.units[1]} on an electrode, "
-                    f"got {left:g} on electrode {electrode}: use a balanced pulse, or begin a new session after a rest",
+                    f"expected pulses of a session that leave -{most:g} to {most:g} {self.limits.units[1]} on an "
+                    f"electrode, got {left:g} on electrode {electrode}: use a balanced pulse, or begin a new session "
+                    "after a rest",
                 )
 
     def _check_pulse(self, pulse: Pulse) -> float:
@@ -231,8 +232,8 @@ class Guard:
             if not abs(phase.amplitude) <= limits.amplitude:
                 raise UnsafeStimulus(
                     "amplitude",
-                    f"expected at most {limits.amplitude:g} {limits.units[0]}, got {phase.amplitude:g}{is_rounded}: "
-                    "lower it",
+                    f"expected -{limits.amplitude:g} to {limits.amplitude:g} {limits.units[0]}, got {phase.amplitude:g}"
+                    f"{is_rounded}: lower it",
                 )
         if limits.alternates:
             for before, after in pairwise(pulse.phases):
@@ -248,13 +249,13 @@ class Guard:
             if not abs(phase.charge) <= limits.charge_per_phase:
                 raise UnsafeStimulus(
                     "charge_per_phase",
-                    f"expected at most {limits.charge_per_phase:g} {charge_unit} a phase, got {phase.charge:g}"
-                    f"{is_rounded}: lower the amplitude or shorten the phase",
+                    f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} a phase, got "
+                    f"{phase.charge:g}{is_rounded}: lower the amplitude or shorten the phase",
                 )
         if not abs(pulse.net_charge) <= limits.net_charge:
             raise UnsafeStimulus(
                 "net_charge",
-                f"expected phases that balance to {limits.net_charge:g} {charge_unit}, got {pulse.net_charge:g} "
+                f"expected phases that balance to within {limits.net_charge:g} {charge_unit}, got {pulse.net_charge:g} "
                 f"({pulse}{is_rounded}): give the phases equal and opposite charge",
             )
 

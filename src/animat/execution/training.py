@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import final
 
 from animat.coding.decoder import expect_fit
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnusableData
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.neurons.timeline import SimulatorTimeline
@@ -61,6 +61,7 @@ def train(
             the robot's commands, for fewer workers than one or any beside an executor, or as `expect_trainable` does.
         Mismatch: if the folder holds another training, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
+        UnusableData: if what was learned is no longer a finite number; nothing of it is left in the folder.
         AnimatError: if a process that trains ends before its time.
     """
     if (timeline is None) != (training.mapping is None):
@@ -91,7 +92,14 @@ def train(
         ]
         if left:
             jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
-            jobs.run(workers=workers, executor=executor, progress=progress)
+            try:
+                jobs.run(workers=workers, executor=executor, progress=progress)
+            except UnusableData:
+                # What the robot gave was no number: whoever corrects it begins anew.
+                shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+                if not any(folder.glob("p*.safetensors")):
+                    (folder / MANIFEST).unlink()
+                raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)

@@ -267,7 +267,10 @@ class _Run:
         self.keep_state()
         try:
             series = [*self.used, *extract_series([recording])]
-            timeline = self._fit(series)
+            # All are fitted again, so that they have one shape.
+            timeline = fit_timeline(series, kind=self._kind)
+            if self._training.percentiles == "first":
+                timeline = timeline.with_first_percentiles()
         except (UnusableData, Mismatch) as error:
             self.write("unusable", file=file.name, message=str(error))
             return None
@@ -285,11 +288,6 @@ class _Run:
         """Write what a virtual culture is now beside its recordings, where `animat run` looks for it."""
         if isinstance(self._culture, VirtualCulture):
             self._culture.save_state(self.folder / RECORDINGS / STATE_FILE)
-
-    def _fit(self, series: Sequence[Responses]) -> SimulatorTimeline:
-        # All are fitted again, so that they have one shape.
-        timeline = fit_timeline(series, kind=self._kind)
-        return timeline.with_first_percentiles() if self._training.percentiles == "first" else timeline
 
     def _note(self, swaps: Sequence[dict[str, Any]]) -> None:
         for swap in swaps:

@@ -109,12 +109,14 @@ def convert_recording(
 
     Raises:
         InvalidFile: if the file cannot be read, or the new one not be written.
-        InvalidArgument: for a choice that the format does not offer, or an `out` that exists.
+        InvalidArgument: for a choice that the format does not offer, or an `out` that exists or does not end in .nwb.
     """
     path, out = Path(path), Path(out)
     if out.exists():
         # It may be the recording itself, or its stimuli; whatever it is, somebody made it.
         raise InvalidArgument(f"--out: expected a name that is not taken, got {out}, which exists; choose another")
+    if out.suffix != ".nwb":
+        raise InvalidArgument(f"--out: expected a name that ends in .nwb, as NWB is written, got {out}")
     if reader is not None and (stimuli is not None or part is not None):
         raise InvalidArgument(f"stimuli, part: expected none for traces read with a reader, got {stimuli or part!r}")
     if reader is None and detection is not None and stimuli_path is not None:

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
+from animat.errors import did_you_mean
+
 Severity = Literal["note", "warning", "refuse"]
 
 
@@ -39,9 +41,10 @@ class Finding:
         return cls(**{"message" if name == "sentence" else name: value for name, value in data.items()})
 
 
-def left_out_of(what: str, names: Sequence[str], file: str = "") -> Finding:
-    """The finding on keys or columns of a file that nobody knows."""
-    message = f"{what}{f' of {file}' if file else ''} that are not known were left out: {', '.join(names)}"
+def left_out_of(what: str, names: Sequence[str], file: str = "", missing: Sequence[str] = ()) -> Finding:
+    """The finding on keys or columns of a file that nobody knows, each with the missing one that it is near to."""
+    told = ", ".join(f"{name} ({near[2:]})" if (near := did_you_mean(name, missing)) else name for name in names)
+    message = f"{what}{f' of {file}' if file else ''} that are not known were left out: {told}"
     return Finding(f"{what}-left-out", "note", message, float(len(names)))
 
 

@@ -10,7 +10,7 @@ from animat.recordings.channel_quality import channel_findings
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
-from animat.recordings.time_quality import time_findings
+from animat.recordings.time_quality import frequency_findings, time_findings
 from animat.tables import UNKNOWN
 
 MANY_STIMULI = 100
@@ -21,7 +21,7 @@ STIMULI_A_SPIKE = 10.0
 def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     """All findings about a recording: those noted when its file was read, then those seen in its data.
 
-    Of a table of responses, which has no spikes to look at, only the former.
+    Of a table of responses, which has no spikes to look at, the former and its frequencies (`other-frequencies`).
 
     Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
     (`animat.recordings.channel_quality`), times that cannot be in seconds (`animat.recordings.time_quality`), more
@@ -29,7 +29,7 @@ def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
     """
     if isinstance(recording, ResponseTable):
-        return recording.findings
+        return (*recording.findings, *frequency_findings(recording.stimuli, has_times=recording.has_times))
     known = {finding.name for finding in recording.findings}
     return (*recording.findings, *(finding for finding in _in_data(recording) if finding.name not in known))
 

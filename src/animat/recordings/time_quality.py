@@ -51,8 +51,28 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
         yield Finding(NAME, "refuse", reason)
     elif stated is not None:
         yield stated
-    elif (contradicted := _contradicted(recording.stimuli)) is not None:
-        yield contradicted
+    else:
+        yield from frequency_findings(recording.stimuli)
+
+
+def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[Finding]:
+    """A finding on frequencies that belie the stimuli's times, or that look like periods where there are no times.
+
+    Args:
+        stimuli: with any frequencies.
+        has_times: whether their times are known.
+    """
+    if has_times:
+        yield from _contradicted(stimuli)
+        return
+    stated_hz = np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)])
+    if len(stated_hz) > 1 and stated_hz[-1] < 1:
+        yield Finding(
+            CONTRADICTED,
+            "warning",
+            f"all frequencies are below 1 Hz, {stated_hz[0]:g} to {stated_hz[-1]:g}: if they are periods in seconds, "
+            f"write 1 divided by each, {1 / stated_hz[-1]:g} to {1 / stated_hz[0]:g}",
+        )
 
 
 def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
@@ -80,24 +100,30 @@ def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
     return None
 
 
-def _contradicted(stimuli: Stimuli) -> Finding | None:
+def _contradicted(stimuli: Stimuli) -> Iterator[Finding]:
     """Stimuli that come sooner than their stated frequency lets them."""
-    interval_s, sooner = np.diff(stimuli.time_s), []
+    intervals_s, sooner = np.diff(stimuli.time_s), []
     # A pulse may be said to be at the frequency of the interval before it, or of the one after it.
     for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
-        known = ~np.isnan(frequency_hz) & (interval_s > 0)
-        of = {f: (interval_s * f)[known & (frequency_hz == f)] for f in np.unique(frequency_hz[known])}
+        known = ~np.isnan(frequency_hz) & (intervals_s > 0)
+        of = {f: (intervals_s * f)[known & (frequency_hz == f)] for f in np.unique(frequency_hz[known])}
         medians = [(float(np.median(m)), float(f)) for f, m in of.items() if len(m) >= ENOUGH_STIMULI]
         sooner.append(min(medians, default=(1.0, 0.0)))
     least, stated_hz = max(sooner)
     if least > 1 / APART:
-        return None
-    return Finding(
+        return
+    interval_s = least / stated_hz
+    is_period = abs(interval_s / stated_hz - 1) < AGREE
+    remedy = (
+        f"these are periods in seconds: write 1 divided by each, here {1 / stated_hz:g}"
+        if is_period
+        else "correct the frequencies, or sort the stimuli by their times (--conditions interval:5,10)"
+    )
+    yield Finding(
         CONTRADICTED,
         "warning",
-        f"stimuli that are said to come at {stated_hz:g} Hz are {least / stated_hz:.3g} s apart (median), not "
-        f"{1 / stated_hz:.3g} s: correct the frequencies, or sort the stimuli by their times (--conditions "
-        "interval:5,10)",
+        f"stimuli that are said to come at {stated_hz:g} Hz are {interval_s:.3g} s apart (median), not "
+        f"{1 / stated_hz:.3g} s: {remedy}",
         least,
     )
 
@@ -142,7 +168,8 @@ def _fired(recording: Recording) -> str | None:
             f"two spikes of a channel within {SHORT_S:g} s; times are in {_unit_of_spikes(interval_s)}"
         )
     stimulus_s = recording.stimuli.time_s
-    if len(stimulus_s) >= ENOUGH_STIMULI and not np.any(_spikes_soon_after(times_s, stimulus_s)):
+    soon_after = np.searchsorted(times_s, stimulus_s + SOON_S) - np.searchsorted(times_s, stimulus_s)
+    if len(stimulus_s) >= ENOUGH_STIMULI and not np.any(soon_after):
         return (
             f"times cannot be in seconds: {hours} without a spike within {1e3 * SOON_S:g} ms after any of "
             f"{len(stimulus_s):,} stimuli; are they in milliseconds, or spikes and stimuli in different units?"
@@ -160,12 +187,6 @@ def _unit_of_spikes(interval: Float64[np.ndarray, " intervals"]) -> str:
         if shortest < SHORTEST_IN_MICROSECONDS
         else "microseconds; divide them by 1,000,000"
     )
-
-
-def _spikes_soon_after(
-    spike_s: Float64[np.ndarray, " spikes"], stimulus_s: Float64[np.ndarray, " stimuli"]
-) -> Float64[np.ndarray, " stimuli"]:
-    return np.searchsorted(spike_s, stimulus_s + SOON_S) - np.searchsorted(spike_s, stimulus_s)
 
 
 def _apart(recording: Recording) -> str | None:

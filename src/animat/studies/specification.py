@@ -16,7 +16,7 @@ from animat.errors import InvalidArgument, shown
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.registry import is_ours, place_of
 from animat.robots.base import MOST_AT_ONCE, Robot
-from animat.robots.registry import robot_named
+from animat.robots.registry import REGISTRY, robot_named
 from animat.studies.source import LISTED, Source
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
@@ -104,15 +104,23 @@ class RobotSpec:
     kind: str = ""
 
     def __post_init__(self) -> None:
-        robot = self.robot()
+        key = "kind" if self.kind else "name"
+        try:
+            kind = REGISTRY.class_named(self.kind or self.name)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"{key}: {error}") from error
+        try:
+            robot = self.robot()
+        except InvalidArgument as error:
+            raise InvalidArgument(f"parameters: {error}") from error
         if self.name == "culture":
             raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
         if robot.n_commands > 1:
-            told = f"expected one command, as a study reads all channels as one, got {robot.n_commands}"
-            raise InvalidArgument(f"{robot.name}: {told}: train it with animat train --readouts")
+            told = f"expected a robot of one command, as a study reads all channels as one, got {robot.n_commands}"
+            raise InvalidArgument(f"{key}: {told} of {robot.name}: train it with animat train --readouts")
         if not is_ours(robot):
             # Workers know it by that.
-            object.__setattr__(self, "kind", place_of(type(robot)))
+            object.__setattr__(self, "kind", place_of(kind))
 
     def robot(self) -> Robot[Any]:
         """The robot itself."""

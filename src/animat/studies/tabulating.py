@@ -91,7 +91,12 @@ class Tabulate(StudyTask):
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
-            files.append(write_table(table_file(folder, "controllability"), head, _controllability(timeline)))
+            rows = (
+                (at_min, *told)
+                for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True)
+                for told in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True)
+            )
+            files.append(write_table(table_file(folder, "controllability"), head, rows))
         with atomic_write(table_file(folder, "episodes")) as beside:
             table.to_csv(beside, index=False, lineterminator="\n")
         return [*files, table_file(folder, "episodes")]
@@ -115,12 +120,6 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
             yield replace(told, message=f"{where}: {told.message}")
     for message in left_out(study):
         yield Finding(LEFT_OUT, "note", message)
-
-
-def _controllability(timeline: SimulatorTimeline) -> Iterator[tuple[Any, ...]]:
-    for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True):
-        for told in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True):
-            yield at_min, *told
 
 
 class References:

@@ -48,6 +48,10 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
+    for name in ("robots", "arms", "comparisons"):
+        if isinstance(table := data.get(name), dict):
+            wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")
+            raise InvalidFile(f"{path}: {name}: expected [[{name}]] for each, and its name in it, got {wrote}")
     try:
         return read_record(Study, _in_todays_words(data))
     except InvalidArgument as error:

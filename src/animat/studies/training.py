@@ -9,7 +9,6 @@ from typing import final
 from animat.coding.mapping import mapping_named
 from animat.execution.task import UNFINISHED
 from animat.execution.training import train_into
-from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.studies.draws import draw_seed
 from animat.studies.places import TIMELINE, policies_folder
@@ -34,7 +33,7 @@ class TrainGroup(StudyTask):
     members: tuple[int, ...]
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        timeline = timeline_for(self.arm, folder)
+        timeline = load_timeline(folder / TIMELINE) if self.arm.through_neurons else None
         training = training_of(self.study, self.spec, self.arm)
         manifest = describe(training, timeline)
         out = policies_folder(folder, self.spec, self.arm)
@@ -64,8 +63,3 @@ def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:
         commands=None if through_neurons else spec.robot().baseline_commands,
         algorithm=SAC(**study.algorithm),  # type: ignore[arg-type]
     )
-
-
-def timeline_for(arm: Arm, folder: Path) -> SimulatorTimeline | None:
-    """The study's simulators, for an arm that has neurons."""
-    return load_timeline(folder / TIMELINE) if arm.through_neurons else None

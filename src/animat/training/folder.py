@@ -59,8 +59,10 @@ def describe(training: Training, timeline: SimulatorTimeline | None, sources: Se
     }
     # By way of JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))
+    # By former names: fingerprints of before are of the same bytes, and their folders go on.
+    former = _renamed(manifest, {today: former for former, today in FORMER.items()}, ("a trial", "a presentation"))
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    fingerprint = fingerprint_of(_by_former_names(manifest), *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    fingerprint = fingerprint_of(former, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # Names of files are told but do not decide: the same recordings in another place are the same.
     return manifest | {"sources": list(sources), "fingerprint": fingerprint}
 
@@ -128,11 +130,6 @@ def _description_in(folder: Path) -> dict[str, Any] | None:
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     return None
-
-
-def _by_former_names(manifest: dict[str, Any]) -> dict[str, Any]:
-    """A description as fingerprints are made of it: those of before are of the same bytes, and their folders go on."""
-    return _renamed(manifest, {today: former for former, today in FORMER.items()}, ("a trial", "a presentation"))
 
 
 def _renamed(manifest: dict[str, Any], names: dict[str, str], pulses: tuple[str, str]) -> dict[str, Any]:

@@ -168,7 +168,11 @@ class SideBySide:
 
     def keep(self, checkpoint: Path) -> None:
         """Write a checkpoint."""
-        _write_checkpoint(checkpoint, self._group.fingerprint, len(self._curve), self._learners, np.stack(self._curve))
+        leaves = jax.tree.leaves(self._learners._replace(key=jax.random.key_data(self._learners.key)))
+        arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+        arrays |= {"fingerprint": np.array(self._group.fingerprint), "done": np.array(len(self._curve))}
+        with atomic_write(checkpoint) as beside, beside.open("wb") as file:
+            np.savez(file, curve=np.stack(self._curve), **arrays)
 
     def resume(self, checkpoint: Path) -> int:
         """Go on from a checkpoint; returns how many chunks are done."""
@@ -197,13 +201,6 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
     )
 
 
-def _write_checkpoint(path: Path, fingerprint: str, done: int, learners: Learner, curve: np.ndarray) -> None:
-    leaves = jax.tree.leaves(learners._replace(key=jax.random.key_data(learners.key)))
-    arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    with atomic_write(path) as beside, beside.open("wb") as file:
-        np.savez(file, fingerprint=np.array(fingerprint), done=np.array(done), curve=curve, **arrays)
-
-
 def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, Learner, np.ndarray]:
     like = like._replace(key=jax.random.key_data(like.key))
     leaves, structure = jax.tree.flatten(like)
@@ -211,7 +208,8 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
         # Opened here, as numpy leaves a file open that it cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             # Before anything is read of it: an archive of some kilobytes can unpack to any size.
-            unpacked, most = sum(member.file_size for member in file.zip.infolist()), 2 * _bytes_of(leaves) + 2**22
+            unpacked = sum(member.file_size for member in file.zip.infolist())
+            most = 2 * sum(leaf.nbytes for leaf in leaves) + 2**22
             if unpacked > most:
                 raise InvalidFile(
                     f"{path}: expected a checkpoint of at most {most:,} bytes, got {unpacked:,}; remove it"
@@ -235,10 +233,6 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
         ) from error
     learners = jax.tree.unflatten(structure, read)
     return done, learners._replace(key=jax.random.wrap_key_data(learners.key)), curve
-
-
-def _bytes_of(leaves: list[Any]) -> int:
-    return sum(leaf.nbytes for leaf in leaves)
 
 
 def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:

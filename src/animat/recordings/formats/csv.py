@@ -15,13 +15,13 @@ Other columns are left out, which is noted. There is no table of channels: those
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_of
 from animat.recordings.formats.stimulus_text import padded
@@ -114,14 +114,17 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
         if found is not None:
             place[name] = found
         elif name in REQUIRED:
+            # Of a table of responses by its other columns, one of these may be misspelt.
+            others = ("channel", "count", "rate_hz") if name == "spike_time_s" else ()
             raise InvalidFile(
                 f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {_listed(table)}"
-                f"{_advice(table, name)}"
+                f"{_advice(table, name) or nearest(table, (*names, *others))}"
             )
     columns = {name: plain_column(table, i, name) for name, i in place.items()}
     left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
     if left_out:
-        table.findings.append(left_out_of("columns", left_out, table.path.name))
+        missing = [each for name, names in known.items() if name not in place for each in names]
+        table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
     return columns, table.findings
 
 
@@ -149,6 +152,12 @@ def _advice(table: TextTable, missing: str) -> str:
     return ""
 
 
+def nearest(table: TextTable, missing: Sequence[str]) -> str:
+    """The end of a message on columns of which one is missing: the name that one of the table's others is near to."""
+    heads = [folded(name) for name in table.header]
+    return next(filter(None, (did_you_mean(head, missing) for head in heads if head not in missing)), "")
+
+
 def plain_column(table: TextTable, place: int, name: str) -> Column:
     """One column of spikes or stimuli under its name in `PlainColumns`: numbers, or text where it may be names.
 
@@ -170,9 +179,14 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
         missing = "expected a channel for each spike"
         raise table.wrong(cells.index(""), f"{name}: {missing}, got {cells.count('')} without one, here the first")
     try:
-        return np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+        numbers = np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
     except ValueError:
         return np.array(cells, dtype=np.str_)
+    if name == "spike_channel" and np.any(wrong := numbers % 1 > 0):
+        row = int(np.flatnonzero(wrong)[0])
+        swapped = "are the columns of times and channels swapped?"
+        raise table.wrong(row, f"{name}: expected whole numbers or names, got {cells[row]}: {swapped}")
+    return numbers
 
 
 def _electrodes(table: TextTable, place: int) -> Column:

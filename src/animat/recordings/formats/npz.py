@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, UnusableData
+from animat.errors import InvalidFile, UnusableData, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import left_out_of
 from animat.recordings.formats.hdf5 import first_line
@@ -68,6 +68,7 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
         found = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
         raise InvalidFile(
             f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {found}"
+            + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
         )
     provenance = {"source": path.name, "format": "NPZ"}
     if columns.pop("sorted_units", False):
@@ -75,7 +76,7 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
         columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
-    findings = (left_out_of("keys", left_out),) if left_out else ()
+    findings = (left_out_of("keys", left_out, missing=[key for key in KEYS if key not in columns]),) if left_out else ()
     return PlainColumns(**columns).to_recording(provenance, findings)
 
 
@@ -128,16 +129,13 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
 
 def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
     """Refuse what unpacks to far more than a recording of that size does."""
-    unpacked, limit = sum(entry.file_size for entry in archive.infolist()), unpacked_limit(path)
+    # Spikes compress to a fifth or so.
+    limit = UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
+    unpacked = sum(entry.file_size for entry in archive.infolist())
     if unpacked > limit:
         raise InvalidFile(
             f"{path}: unpacks to {unpacked:,} bytes, more than a recording of its size does ({limit:,}): it is damaged"
         )
-
-
-def unpacked_limit(path: Path) -> int:
-    """How many bytes a compressed recording may unpack to; spikes compress to a fifth or so."""
-    return UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
 
 
 def _array(archive: Mapping[str, Column], key: str) -> Column:

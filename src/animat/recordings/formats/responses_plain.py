@@ -23,7 +23,7 @@ from jaxtyping import Float64, Int64
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_of
-from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, plain_column
+from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import load_columns
 from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
 from animat.recordings.response_table import Kind, ResponseTable
@@ -131,7 +131,8 @@ def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
         columns["start_min"] = single["start_min"]
     left_out = [name for i, name in enumerate(table.header) if i not in used]
     if left_out:
-        table.findings.append(left_out_of("columns", left_out, table.path.name))
+        missing = [each for name, names in TABLE_COLUMNS.items() if name not in columns for each in names]
+        table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
     return _table(values, kind, labels, columns, window_ms, provenance, table.findings)
@@ -168,6 +169,7 @@ def _long(table: TextTable) -> _Read:
         raise InvalidFile(
             f"{table.path}, line 1: expected trial (or stimulus_time_s), channel, and count or rate_hz, found "
             + ", ".join(table.header[:12])
+            + nearest(table, (TRIAL, *TABLE_COLUMNS["stimulus_time_s"], "channel", *KINDS))
         )
     (kind, place), channel = next(iter(there.items())), table.place(("channel",))
     assert channel is not None
