@@ -74,11 +74,13 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
             of = self.spikes[(self.spikes[:, 0] >= start) & (self.spikes[:, 0] < stop)]
             return of[:, 0], of[:, 1]
 
+    # Not known before it is open; what is seen until then is forgotten.
+    amplifier = np.full(len(virtual.channels), -1)
     with pytest.MonkeyPatch.context() as patch:
         rig = stand_in_maxlab.install(patch)
         with MaxOneCulture(virtual.selection, stream=Answering(rig), settle=False) as culture:
             number = {int(e): int(a) for e, a in zip(culture.channels.electrode, culture.channels.label, strict=True)}
-            amplifier = np.array([number.get(int(e), -1) for e in virtual.channels.electrode])
+            amplifier[:] = [number.get(int(e), -1) for e in virtual.channels.electrode]
             yield culture
 
 
