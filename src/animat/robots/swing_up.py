@@ -73,6 +73,8 @@ class SwingUp(Robot[SwingUpState]):
     name: ClassVar[str] = "swing-up"
     noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 500_000
+    # Full power either way swings highest, and is what random commands come near to swinging it up with.
+    baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
         most_rad = self.step_s * (self.speed_limit_rad_per_s + self.step_s * (self._gravity_per_s2 + self._push_per_s2))
