@@ -490,7 +490,11 @@ def test_inspect_refuses_its_options_before_the_files(
     ("arguments", "status", "words"),
     [
         (["train", "cartpole", "--policies", "many"], 2, ["--policies", "many", "animat train --help"]),
-        (["train", "unicycle"], 1, ["robot: expected one of cartpole, navigation, got 'unicycle'", "module:Class"]),
+        (
+            ["train", "unicycle"],
+            1,
+            ["robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'unicycle'", "module:Class"],
+        ),
         (["train", "cartpole", "--polices", "3"], 2, ["animat: unknown option --polices; did you mean --policies?"]),
         (["record", "--sesions=2"], 2, ["animat: unknown option --sesions=2; did you mean --sessions?"]),
         (["record", "--zzz"], 2, ["animat: unknown option --zzz; see animat record --help"]),

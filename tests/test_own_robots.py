@@ -24,7 +24,7 @@ from animat.environment import Animat
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
 from animat.execution.training import train
-from animat.robots import Cartpole, Navigation, Quantity, Robot
+from animat.robots import ROBOTS, Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
 from animat.robots.grid import no_grid
 from animat.robots.registry import REGISTRY, register_robot, robot_named
@@ -95,7 +95,7 @@ def test_names_stand_for_robots_and_mappings() -> None:
     assert pickle.loads(pickle.dumps(named)) == named
     assert Training(Navigation(), None).mapping is None
     for arguments, words in (
-        (("cart", None), "robot: expected one of cartpole, navigation, got 'cart'"),
+        (("cart", None), "robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'cart'"),
         (("cartpole", "2-thresholds"), "mapping: expected one of 1-threshold"),
         ((7, None), "robot: expected a robot or the name of one, got 7"),
         ((Cartpole, None), "robot: expected a robot or the name of one, got <class"),
@@ -199,7 +199,7 @@ def test_a_method_that_is_missing_is_named() -> None:
 
 
 def test_robots_that_keep_to_the_contract_pass() -> None:
-    for robot in (Slider(), Cartpole(), Cartpole.as_printed(), Navigation(), Navigation.as_printed()):
+    for robot in (Slider(), Cartpole.as_printed(), Navigation.as_printed(), *map(robot_named, ROBOTS)):
         check_robot(robot)
     for mapping in (Thresholds(1), Thresholds(9), Linear(), Push()):
         check_mapping(mapping)

@@ -12,11 +12,22 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidArgument
-from animat.robots import ROBOTS, Cartpole, Navigation, Robot, robot_from_dict, robot_named, robot_to_dict
+from animat.robots import (
+    ROBOTS,
+    Cartpole,
+    Navigation,
+    Robot,
+    SwingUp,
+    TwoLinkArm,
+    Wheels,
+    robot_from_dict,
+    robot_named,
+    robot_to_dict,
+)
 
 VARIANTS = [
     *(robot_named(name) for name in ROBOTS),
-    *(ROBOTS[name].as_printed() for name in ROBOTS),  # type: ignore[attr-defined]
+    *(kind.as_printed() for kind in ROBOTS.values() if hasattr(kind, "as_printed")),
 ]
 
 
@@ -25,17 +36,23 @@ def robot(request: pytest.FixtureRequest) -> Robot:
     return request.param
 
 
+def commands_of(robot: Robot, u):
+    """Commands for every readout: of several, the same one or turned round in turns."""
+    u = jnp.asarray(u, jnp.float32)
+    return u if robot.n_commands == 1 else jnp.stack([u, -u] * robot.n_commands, -1)[..., : robot.n_commands]
+
+
 def play(robot: Robot, policy: str, episodes: int, iterations: int, seed: int = 0):
     """Observations, rewards and endings of many episodes, (iterations, episodes, ...), going on after an ending."""
     key_reset, key_u, key_steps = jax.random.split(jax.random.key(seed), 3)
-    shape = (iterations, episodes)
+    shape = (iterations, episodes) if robot.n_commands == 1 else (iterations, episodes, robot.n_commands)
     u = {
         "random": jax.random.uniform(key_u, shape, minval=-1.0, maxval=1.0),
         "thrown": jnp.where(jax.random.uniform(key_u, shape) < 0.5, -1.0, 1.0),
         "right": jnp.ones(shape),
         "left": -jnp.ones(shape),
     }[policy]
-    uniforms = jax.random.uniform(key_steps, (*shape, robot.noise_size))
+    uniforms = jax.random.uniform(key_steps, (iterations, episodes, robot.noise_size))
 
     def iterate(state, inputs):
         state, reward, terminated = jax.vmap(robot.advance)(inputs[0], state, inputs[1])
@@ -48,7 +65,7 @@ def play(robot: Robot, policy: str, episodes: int, iterations: int, seed: int = 
 def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
     state = robot.reset(jax.random.key(0))
     assert all(leaf.shape == () and leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(state))
-    after, reward, terminated = robot.step(jax.random.key(1), state, jnp.float32(0.3))
+    after, reward, terminated = robot.step(jax.random.key(1), state, commands_of(robot, 0.3))
     assert jax.tree.structure(after) == jax.tree.structure(state)
     assert [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(after)] == [((), jnp.float32)] * len(state)
     assert (reward.shape, reward.dtype) == ((), jnp.float32)
@@ -67,27 +84,29 @@ def test_observations_are_the_quantities_in_order(robot: Robot) -> None:
 
 def test_a_step_is_advance_with_uniforms_of_the_key(robot: Robot) -> None:
     key, state = jax.random.key(5), robot.reset(jax.random.key(0))
-    by_step = robot.step(key, state, jnp.float32(-0.5))
-    by_advance = robot.advance(jax.random.uniform(key, (robot.noise_size,)), state, jnp.float32(-0.5))
+    by_step = robot.step(key, state, commands_of(robot, -0.5))
+    by_advance = robot.advance(jax.random.uniform(key, (robot.noise_size,)), state, commands_of(robot, -0.5))
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), by_step, by_advance))
-    again = robot.step(key, state, jnp.float32(-0.5))
+    again = robot.step(key, state, commands_of(robot, -0.5))
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), by_step, again))
 
 
 def test_a_jitted_step_draws_no_random_numbers_in_advance(robot: Robot) -> None:
     state = robot.reset(jax.random.key(0))
-    traced = str(jax.make_jaxpr(robot.advance)(jnp.zeros(robot.noise_size), state, jnp.float32(0)))
+    traced = str(jax.make_jaxpr(robot.advance)(jnp.zeros(robot.noise_size), state, commands_of(robot, 0)))
     assert "random" not in traced and "threefry" not in traced
 
 
 def test_a_batch_steps_as_each_alone(robot: Robot) -> None:
-    u = jnp.linspace(-1, 1, 7)
+    u = commands_of(robot, jnp.linspace(-1, 1, 7))
     keys = jax.random.split(jax.random.key(3), 7)
     states = jax.vmap(robot.reset)(keys)
     together = jax.vmap(robot.step)(keys, states, u)
     for i in range(7):
         alone = robot.step(keys[i], jax.tree.map(lambda leaf, i=i: leaf[i], states), u[i])
-        np.testing.assert_allclose([leaf[i] for leaf in jax.tree.leaves(together)], jax.tree.leaves(alone), rtol=1e-6)
+        np.testing.assert_allclose(
+            [leaf[i] for leaf in jax.tree.leaves(together)], jax.tree.leaves(alone), rtol=1e-6, atol=1e-7
+        )
 
 
 @pytest.mark.parametrize("policy", ["random", "thrown", "right", "left"])
@@ -131,7 +150,7 @@ def test_parameters_may_be_static_under_jit(robot: Robot) -> None:
 @pytest.mark.parametrize(
     ("name", "parameters", "message"),
     [
-        ("unicycle", {}, "robot: expected one of cartpole, navigation, got 'unicycle'"),
+        ("unicycle", {}, "robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'unicycle'"),
         (3, {}, "robot: expected one of"),
         ("cartpole", {"mass": 1.0}, "cartpole: expected parameters among gravity_m_per_s2, .*, got 'mass'"),
         ("cartpole", {"pole_mass_kg": 0.0}, "cartpole: pole_mass_kg: expected at least 1e-09, got 0"),
@@ -143,6 +162,7 @@ def test_parameters_may_be_static_under_jit(robot: Robot) -> None:
         ("cartpole", {"force_n": None}, "cartpole: force_n: expected a number, got None"),
         ("navigation", {"turn_rad": 4.0}, "navigation: turn_rad: expected at most 3.14159"),
         ("navigation", {"goal_x_m": 1.2}, "navigation: goal_x_m: expected at most 1, got 1.2"),
+        ("wheels", {"step_s": 1.0}, "wheels: step_s: expected at most 0.269 at this speed, got 1"),
     ],
 )
 def test_bad_parameters_are_refused_with_what_was_expected(name, parameters, message) -> None:
@@ -157,7 +177,16 @@ def test_data_of_another_form_are_refused(data: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "robot", [Cartpole(episode_limit=12), Navigation(episode_limit=40), Cartpole(reward_upright=-1, episode_limit=12)]
+    "robot",
+    [
+        Cartpole(episode_limit=12),
+        Navigation(episode_limit=40),
+        Cartpole(reward_upright=-1, episode_limit=12),
+        SwingUp(episode_limit=40, upright_rad=2.8),
+        TwoLinkArm(episode_limit=40),
+        Wheels(episode_limit=40),
+        Wheels(episode_limit=40, reward_bump=1.0, reward_goal=-3.0),
+    ],
 )
 def test_no_return_is_outside_of_its_range(robot: Robot) -> None:
     low, high = robot.return_range
@@ -166,7 +195,7 @@ def test_no_return_is_outside_of_its_range(robot: Robot) -> None:
     state, total, going = jax.vmap(robot.reset)(keys), np.zeros(60), np.ones(60, bool)
     step = jax.jit(jax.vmap(lambda key, n, state, u: robot.step(jax.random.fold_in(key, n), state, u), (0, None, 0, 0)))
     for iteration in range(min(robot.episode_limit, 40)):
-        u = np.where(seeds % 3 == 0, 1.0, np.sin(seeds * iteration)).astype(np.float32)
+        u = commands_of(robot, np.where(seeds % 3 == 0, 1.0, np.sin(seeds * iteration)))
         state, reward, terminated = step(keys, iteration, state, u)
         total += np.where(going, reward, 0.0)
         going &= ~np.asarray(terminated)

@@ -742,7 +742,7 @@ COMPARED = (
         ("seed = true", "seed: expected a whole number, got True"),
         ("arms = []", "arms: expected at least one"),
         ("robots = 'cartpole'", "robots: expected a list"),
-        ("[[robots]]\nname = 'cart'", "robot: expected one of cartpole, navigation, got 'cart'"),
+        ("[[robots]]\nname = 'cart'", "robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'cart'"),
         ("[[robots]]\niterations = 3", "robots.name: expected to be given"),
         ("[[robots]]\nname = 'cartpole'\nparameters = { mass = 1 }", "parameters: cartpole: expected parameters"),
         ("[[robots]]\nname = 'cartpol'", "robots.name: robot: expected one of cartpole, navigation, got 'cartpol';"),

@@ -174,7 +174,7 @@ def test_a_policy_carries_its_readouts_through_its_file(
     evaluation = evaluate(policies, timeline, episodes=5)
     assert np.all(np.isfinite(evaluation.rows[0].episodes.returns))
     assert evaluation.rows[0].episodes.passed.shape[1:] == (5, 2)
-    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1"):
+    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of two-wheels, got 1"):
         replace(policies["p0"], readouts=ALL)
     other = replace(timeline, readouts=replace(timeline.readouts, names=("a", "b")))
     with pytest.raises(Mismatch, match=r"readouts: expected left, right, .*, got a, b"):
@@ -184,13 +184,17 @@ def test_a_policy_carries_its_readouts_through_its_file(
 def test_what_does_not_fit_is_refused_in_a_line(recording: Recording, timeline: SimulatorTimeline) -> None:
     training = Training(Wheels(), "1-threshold", policies=1, algorithm=SMALL)
     whole = fit_timeline(extract_series([recording], burst_threshold=0.95))
-    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1; halves"):
+    with pytest.raises(
+        InvalidArgument, match="readouts: expected 2, one for each command of two-wheels, got 1; halves"
+    ):
         train(training, whole, None)
     with pytest.raises(InvalidArgument, match="readouts: expected 1, one for each command of cartpole, got 2"):
         train(replace(training, robot=Cartpole()), timeline, None)
-    with pytest.raises(InvalidArgument, match="commands: expected none to pick from for wheels, which takes 2 at once"):
+    with pytest.raises(
+        InvalidArgument, match="commands: expected none to pick from for two-wheels, which takes 2 at once"
+    ):
         replace(training, mapping=None, commands=(-1.0, 1.0))
-    with pytest.raises(InvalidArgument, match="commands: expected none to pick from for wheels"):
+    with pytest.raises(InvalidArgument, match="commands: expected none to pick from for two-wheels"):
         WithoutNeurons(Wheels(), (-1.0, 1.0))
 
 
@@ -201,7 +205,7 @@ def baseline() -> dict[str, Policy]:
 
 
 def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy], tmp_path: Path) -> None:
-    REGISTRY._registered["wheels"] = Wheels
+    REGISTRY._registered["two-wheels"] = Wheels
     baseline["p0"].save(tmp_path / "p0.safetensors")
     policy = Policy.load(tmp_path / "p0.safetensors")
     assert policy.n_actions is None and policy.commands is None
@@ -293,7 +297,7 @@ def test_thresholds_adapt_to_every_readout_on_its_own() -> None:
 
 def test_it_is_a_gymnasium_environment(recording: Recording, timeline: SimulatorTimeline) -> None:
     place = f"{Wheels.__module__}:Wheels"
-    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of wheels, got 1"):
+    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of two-wheels, got 1"):
         gymnasium.make("animat:Animat/Robot-v0", robot=place)
     env = gymnasium.make("animat:Animat/Robot-v0", robot=place, simulator=timeline.at(0.0), mapping="linear")
     env.reset(seed=1)
@@ -342,7 +346,7 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
         [sys.executable, "two_wheels.py"], capture_output=True, text=True, env=environment, cwd=tmp_path
     )
     assert ran.returncode == 0, ran.stderr
-    assert "wheels, 9-thresholds" in ran.stdout and (tmp_path / "session" / "session.nwb").exists()
+    assert "two-wheels, 9-thresholds" in ran.stdout and (tmp_path / "session" / "session.nwb").exists()
 
 
 @pytest.mark.oracle
@@ -364,7 +368,7 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
         "episode_limit=8",
     ]
     assert main(["train", "my_wheels:Wheels", *few]) == 1
-    assert "expected 2, one for each command of wheels, got 1; halves make two" in capsys.readouterr().err
+    assert "expected 2, one for each command of two-wheels, got 1; halves make two" in capsys.readouterr().err
     assert main(["train", "my_wheels:Wheels", *few, "--readouts", "halves"]) == 0
     assert "5 Hz: left 0." in capsys.readouterr().out
     asked = ["--recordings", "recordings", "--episodes", "2"]

@@ -13,6 +13,6 @@ PAGE = (Path(__file__).parents[1] / "docs" / "robots.md").read_text()
 """Of one block, whatever stands in it."""
 
 Wheels: Any
-REGISTRY._registered.pop("wheels", None)
+REGISTRY._registered.pop("two-wheels", None)
 exec(compile(FILE, "two_wheels.py", "exec"), globals())
-REGISTRY._registered.pop("wheels")
+REGISTRY._registered.pop("two-wheels")

@@ -68,6 +68,9 @@ if TYPE_CHECKING:
     from animat.robots import Navigation as Navigation
     from animat.robots import Quantity as Quantity
     from animat.robots import Robot as Robot
+    from animat.robots import SwingUp as SwingUp
+    from animat.robots import TwoLinkArm as TwoLinkArm
+    from animat.robots import Wheels as Wheels
     from animat.robots import register_robot as register_robot
     from animat.robots import robot_named as robot_named
     from animat.stimulation.protocol import Presentation as Presentation
@@ -112,7 +115,17 @@ _WHERE = {
     "coding.encoder": ("Encoder",),
     "coding.decoder": ("Decoder",),
     "coding.mapping": ("Mapping", "Thresholds", "Linear", "register_mapping", "mapping_named"),
-    "robots": ("Robot", "Quantity", "Cartpole", "Navigation", "register_robot", "robot_named"),
+    "robots": (
+        "Robot",
+        "Quantity",
+        "Cartpole",
+        "Navigation",
+        "SwingUp",
+        "TwoLinkArm",
+        "Wheels",
+        "register_robot",
+        "robot_named",
+    ),
     "environment": ("Animat", "WithoutNeurons"),
     "wrappers": ("EpisodeLimit", "ShuffledDelivery", "NeuralObservation"),
     "training.settings": ("SAC",),

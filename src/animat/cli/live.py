@@ -25,7 +25,8 @@ class Live(Stimulating):
     """Parameter shadowing on one culture while it lives: record, train, refresh, then run in closed loop."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, or one of your own, such as my_package.robots:Rover"""
+    """The robot to drive: cartpole, navigation, swing-up, or one of your own, such as
+    my_package.robots:Rover"""
     mapping: str = "9-thresholds"
     """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
     my_package.mappings:Steep"""

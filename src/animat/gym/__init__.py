@@ -1,4 +1,7 @@
-"""Gymnasium environments: `Animat/Cartpole-v0`, `Animat/Navigation-v0` and `Animat/Robot-v0`, alone or as a vector.
+"""Gymnasium environments: `Animat/Cartpole-v0`, `Animat/Navigation-v0`, `Animat/SwingUp-v0` and `Animat/Robot-v0`.
+
+Each is there alone and as a vector. `Animat/Robot-v0` is for robots of several commands, whose readouts only
+recordings or a simulator tell, and for a user's own.
 
 `import animat` registers them; `gymnasium.make("animat:Animat/Cartpole-v0")` does both. What they accept is the
 signature of `animat.gym.setup.set_up`.
@@ -6,8 +9,12 @@ signature of `animat.gym.setup.set_up`.
 
 from __future__ import annotations
 
-IDS = {"Animat/Cartpole-v0": "cartpole", "Animat/Navigation-v0": "navigation"}
-"""The environments of a robot each."""
+IDS = {
+    "Animat/Cartpole-v0": "cartpole",
+    "Animat/Navigation-v0": "navigation",
+    "Animat/SwingUp-v0": "swing-up",
+}
+"""The environments of a robot each: of those with one command, which need no recordings."""
 
 ANY = "Animat/Robot-v0"
 """The environment that is told its robot."""

@@ -27,6 +27,7 @@ from animat.robots.drawing import (
     Canvas,
     Picture,
 )
+from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
 
 if TYPE_CHECKING:
@@ -143,16 +144,13 @@ class Navigation(Robot[NavigationState]):
         """One turn and one stride (see `Robot.advance` and the class)."""
         import jax.numpy as jnp
 
-        turned = state.heading_rad + self.turn_rad * u
-        heading = jnp.where(turned > math.pi, turned - 2 * math.pi, turned)
-        heading = jnp.where(turned <= -math.pi, turned + 2 * math.pi, heading)
+        heading = within_half_a_turn(state.heading_rad + self.turn_rad * u)
         x = jnp.clip(state.x_m + self.stride_m * jnp.cos(heading), 0.0, self.arena_width_m)
         y = jnp.clip(state.y_m + self.stride_m * jnp.sin(heading), 0.0, self.arena_height_m)
 
         distance = jnp.sqrt((x - self.goal_x_m) ** 2 + (y - self.goal_y_m) ** 2)
         terminated = distance <= self.goal_radius_m
-        # At the goal the distance may be zero; the larger of the two keeps R / d finite where it is not used.
-        cost = self.goal_radius_m / jnp.maximum(distance, self.goal_radius_m) - 1
+        cost = cost_of_distance(distance, self.goal_radius_m)
         reward = jnp.where(terminated, self.reward_goal, cost).astype(x.dtype)
         return NavigationState(x, y, heading), reward, terminated
 

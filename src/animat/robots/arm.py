@@ -1,0 +1,277 @@
+"""Arm: bring the tip of two links to a target that is somewhere else in each episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from animat.errors import InvalidArgument
+from animat.records import record
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
+from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
+from animat.robots.motion import cost_of_distance, runge_kutta
+from animat.robots.registry import register_robot
+
+if TYPE_CHECKING:
+    from jax import Array
+    from matplotlib.axes import Axes
+
+SUBSTEPS = 4
+"""Steps of the equations of motion in an iteration: damping settles a light link within a part of one."""
+
+STIFFEST = 2.5
+"""Rate times step, at most: the Runge-Kutta method of fourth order is stable up to 2.78."""
+
+PULL, BRAKE_S = 40.0, 1.0
+"""Of the heuristic: commands for a way as long as the arm, and for a joint's speed of 1 rad/s."""
+
+NEAREST, FARTHEST = 0.3, 0.95
+"""How far from the shoulder targets are drawn, as parts of the arm's length, within what the tip can reach."""
+
+
+class ArmState(NamedTuple):
+    """How the links stand and move, and where the target is: seen from above, x to the right, y down.
+
+    The shoulder is at (0, 0). Angles grow clockwise, as y points down, and go on past a turn: the shoulder's is 0 to
+    the right, the elbow's is 0 for a straight arm.
+    """
+
+    shoulder_rad: Float[Array, ""]
+    elbow_rad: Float[Array, ""]
+    shoulder_rad_per_s: Float[Array, ""]
+    elbow_rad_per_s: Float[Array, ""]
+    target_x_m: Float[Array, ""]
+    target_y_m: Float[Array, ""]
+
+
+@final
+@register_robot
+@record
+class TwoLinkArm(Robot[ArmState]):
+    """Two links on a table, a motor in each joint; 0 an iteration with the tip at the target, else towards -1.
+
+        M(q) q'' = torque_n_m u - damping_n_m_s q' - c(q, q')
+        M11 = m1 l1^2 / 3 + m2 (l1^2 + l2^2 / 3 + l1 l2 cos q2)
+        M12 = m2 (l2^2 / 3 + l1 l2 cos q2 / 2),   M22 = m2 l2^2 / 3
+        c   = m2 l1 l2 sin q2 / 2 (-2 q1' q2' - q2'^2, q1'^2)
+        reward = R / max(d, R) - 1
+
+    with q1 the shoulder's and q2 the elbow's angle, m and l the masses and lengths of uniform rods, d the distance
+    from tip to target after the movement and R the target's radius. Gravity has no part. An iteration is four steps of
+    the classical Runge-Kutta method, during which u does not change. An episode starts at rest with the elbow at a
+    right angle, and never ends by itself. Its target is drawn evenly over the area that is 0.3 to 0.95 of the arm's
+    length away from the shoulder, as far as the tip can come.
+
+    Attributes:
+        torque_n_m: of each motor at u = 1.
+        damping_n_m_s: of each joint.
+        target_radius_m: R.
+
+    Raises:
+        InvalidArgument: for a parameter that is not finite or has no meaning, links too different in length to reach
+            a target, or a step too long for the equations.
+
+    Source: any textbook of robotics, the manipulator with two revolute joints; the task is that of Gymnasium's
+    `Reacher-v5`, and of the drawing arm Meart (Bakkum et al. 2007).
+    """
+
+    upper_length_m: Size = 0.2
+    lower_length_m: Size = 0.2
+    upper_mass_kg: Size = 0.1
+    lower_mass_kg: Size = 0.1
+    torque_n_m: Amount = 0.01
+    damping_n_m_s: Amount = 0.005
+    target_radius_m: Size = 0.02
+    step_s: Size = 0.05
+    episode_limit: Iterations = 100
+
+    name: ClassVar[str] = "arm"
+    n_commands: ClassVar[int] = 2
+    noise_size: ClassVar[int] = 0
+    paper_iterations: ClassVar[int] = 500_000
+
+    def __post_init__(self) -> None:
+        nearest_m, farthest_m = self._target_distances_m
+        if nearest_m >= farthest_m:
+            raise InvalidArgument(
+                f"lower_length_m: expected links alike enough to reach a target, got {self.lower_length_m:g} m "
+                f"with an upper link of {self.upper_length_m:g} m"
+            )
+        least, _ = self._inertias_kg_m2
+        if self.damping_n_m_s * self.step_s > STIFFEST * SUBSTEPS * least:
+            raise InvalidArgument(
+                f"step_s: expected at most {STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light "
+                f"and joints so damped, got {self.step_s:g}"
+            )
+
+    @property
+    def return_range(self) -> tuple[float, float]:
+        """Of an episode as far from the target as can be, or always at it."""
+        arm_m = self.upper_length_m + self.lower_length_m
+        farthest_m = arm_m + self._target_distances_m[1]
+        return self.episode_limit * (min(1.0, self.target_radius_m / farthest_m) - 1), 0.0
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        """Cosines and sines of the joints, their velocities, the target, and the way to it; as in `Reacher-v5`."""
+        arm_m, target_m = self.upper_length_m + self.lower_length_m, self._target_distances_m[1]
+        fastest = self._fastest_rad_per_s
+        # As fast as the weakest of what limits it lets both joints turn together.
+        usual = min(self.torque_n_m / max(self.damping_n_m_s, 1e-9), fastest) or 1.0
+        parts = ("shoulder_cosine", "shoulder_sine", "elbow_cosine", "elbow_sine")
+        return (
+            *(Quantity(part, "1", 1.0, -1.0, 1.0) for part in parts),
+            Quantity("shoulder_velocity", "rad/s", usual, -fastest, fastest),
+            Quantity("elbow_velocity", "rad/s", usual, -fastest, fastest),
+            Quantity("target_x", "m", arm_m, -target_m, target_m),
+            Quantity("target_y", "m", arm_m, -target_m, target_m),
+            Quantity("to_target_x", "m", arm_m, -arm_m - target_m, arm_m + target_m),
+            Quantity("to_target_y", "m", arm_m, -arm_m - target_m, arm_m + target_m),
+        )
+
+    def reset(self, key: Array) -> ArmState:
+        """At rest, the upper link to the right and the elbow bent downwards; the target drawn."""
+        import jax
+        import jax.numpy as jnp
+
+        outwards, around = jax.random.uniform(key, (2,))
+        nearest_m, farthest_m = self._target_distances_m
+        distance_m = jnp.sqrt(nearest_m**2 + outwards * (farthest_m**2 - nearest_m**2))
+        direction = 2 * math.pi * around
+        zero = jnp.zeros((), jnp.float32)
+        x_m, y_m = distance_m * jnp.cos(direction), distance_m * jnp.sin(direction)
+        return ArmState(zero, jnp.float32(math.pi / 2), zero, zero, x_m, y_m)
+
+    def advance(
+        self, uniforms: Float[Array, " noise_size"], state: ArmState, u: Float[Array, " n_commands"]
+    ) -> tuple[ArmState, Float[Array, ""], Bool[Array, ""]]:
+        """The links move under the same torques throughout (see `Robot.advance` and the class)."""
+        import jax.numpy as jnp
+
+        m11, m12, m22, coupling = self._inertia
+        torques = self.torque_n_m * jnp.asarray(u)
+
+        def rates(moving: tuple[Array, ...]) -> tuple[Array, ...]:
+            _, q2, w1, w2 = moving
+            a11, a12 = m11 + 2 * coupling * jnp.cos(q2), m12 + coupling * jnp.cos(q2)
+            turning = coupling * jnp.sin(q2)
+            t1 = torques[0] - self.damping_n_m_s * w1 + turning * (2 * w1 + w2) * w2
+            t2 = torques[1] - self.damping_n_m_s * w2 - turning * w1**2
+            determinant = a11 * m22 - a12**2
+            return w1, w2, (m22 * t1 - a12 * t2) / determinant, (a11 * t2 - a12 * t1) / determinant
+
+        moving: tuple[Array, ...] = state[:4]
+        for _ in range(SUBSTEPS):
+            moving = runge_kutta(rates, moving, self.step_s / SUBSTEPS)
+        q1, q2, w1, w2 = moving
+        after = ArmState(q1, q2, w1, w2, *state[4:])
+        x_m, y_m = self._to_target(after)
+        reward = cost_of_distance(jnp.sqrt(x_m**2 + y_m**2), self.target_radius_m).astype(q1.dtype)
+        return after, reward, jnp.zeros((), bool)
+
+    def observe(self, state: ArmState) -> Float[Array, " observations"]:
+        """What `observation_spec` names, in its order."""
+        import jax.numpy as jnp
+
+        q1, q2, w1, w2, target_x_m, target_y_m = state
+        joints = (jnp.cos(q1), jnp.sin(q1), jnp.cos(q2), jnp.sin(q2))
+        return jnp.stack([*joints, w1, w2, target_x_m, target_y_m, *self._to_target(state)])
+
+    def heuristic(self, observation: Any) -> Any:
+        """The torques that a spring from tip to target would make, less a brake: J(q)^T e / l^2 stiffness - brake q'.
+
+        J is how the tip moves with the joints, e the way from tip to target, l the arm's length.
+        """
+        xp = observation.__array_namespace__()
+        cos1, sin1, cos2, sin2, w1, w2, _, _, x_m, y_m = observation
+        lower_x_m = self.lower_length_m * (cos1 * cos2 - sin1 * sin2)
+        lower_y_m = self.lower_length_m * (sin1 * cos2 + cos1 * sin2)
+        tip_x_m, tip_y_m = self.upper_length_m * cos1 + lower_x_m, self.upper_length_m * sin1 + lower_y_m
+        stiffness_per_m2 = PULL / (self.upper_length_m + self.lower_length_m) ** 2
+        pull = (tip_x_m * y_m - tip_y_m * x_m, lower_x_m * y_m - lower_y_m * x_m)
+        wanted = [stiffness_per_m2 * each - BRAKE_S * w for each, w in zip(pull, (w1, w2), strict=True)]
+        return xp.clip(xp.stack(wanted), -1.0, 1.0)
+
+    def draw(
+        self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
+    ) -> Picture:
+        """The links, the target and the way of the tip, seen from above (see `animat.robots.drawing`)."""
+        arm_m = self.upper_length_m + self.lower_length_m
+        half_m = 1.1 * arm_m
+        canvas = Canvas(height_px, height_px, (height_px / 2, height_px / 2), height_px / 2 / half_m)
+        target = (float(observation[6]), float(observation[7]))
+        canvas.disc(target, max(self.target_radius_m, 0.02 * arm_m), GOAL)
+        canvas.disc(target, 0.8 * max(self.target_radius_m, 0.02 * arm_m), GOAL_FILL)
+        tips = [(float(seen[6] - seen[8]), float(seen[7] - seen[9])) for seen in (*earlier, observation)]
+        canvas.stroke(tips, 0.012 * arm_m, TRAIL)
+        elbow = (self.upper_length_m * float(observation[0]), self.upper_length_m * float(observation[1]))
+        canvas.stroke([(0.0, 0.0), elbow, tips[-1]], 0.05 * arm_m, BODY)
+        for joint, u in (((0.0, 0.0), command[0]), (elbow, command[1])):
+            canvas.disc(joint, (0.03 + 0.02 * abs(float(u))) * arm_m, ACCENT if u else INK)
+        return canvas.picture()
+
+    def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
+        """How far the tip was from the target in each episode, over time."""
+        arrived = 0
+        for path in paths:
+            distance_m = np.hypot(path[:, 8], path[:, 9])
+            there = bool(distance_m[-1] <= self.target_radius_m)
+            arrived += there
+            time_s = np.arange(len(path)) * self.step_s
+            axes.plot(time_s, distance_m, color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
+        axes.axhline(self.target_radius_m, color=EDGE, linewidth=0.8, linestyle="--")
+        axes.set_xlim(0, self.episode_limit * self.step_s)
+        axes.set_ylim(bottom=0)
+        axes.set(xlabel=f"time (s); {arrived} of {len(paths)} end at the target", ylabel="tip to target (m)")
+
+    def _to_target(self, state: ArmState) -> tuple[Array, Array]:
+        import jax.numpy as jnp
+
+        both = state.shoulder_rad + state.elbow_rad
+        x_m = self.upper_length_m * jnp.cos(state.shoulder_rad) + self.lower_length_m * jnp.cos(both)
+        y_m = self.upper_length_m * jnp.sin(state.shoulder_rad) + self.lower_length_m * jnp.sin(both)
+        return state.target_x_m - x_m, state.target_y_m - y_m
+
+    @property
+    def _target_distances_m(self) -> tuple[float, float]:
+        """The nearest and the farthest that a target is from the shoulder."""
+        arm_m, hole_m = self.upper_length_m + self.lower_length_m, abs(self.upper_length_m - self.lower_length_m)
+        return max(NEAREST * arm_m, hole_m), FARTHEST * arm_m
+
+    @property
+    def _inertia(self) -> tuple[float, float, float, float]:
+        """M11, M12 and M22 of an elbow at a right angle (kg m^2), and the factor of cos q2 in M12, half that in M11."""
+        m1, m2, l1, l2 = self.upper_mass_kg, self.lower_mass_kg, self.upper_length_m, self.lower_length_m
+        alone = m2 * l2**2 / 3
+        return m1 * l1**2 / 3 + m2 * l1**2 + alone, alone, alone, m2 * l1 * l2 / 2
+
+    @property
+    def _inertias_kg_m2(self) -> tuple[float, float]:
+        """The least and the largest eigenvalue of M in any position: those of a straight arm.
+
+        Its trace is the largest there and its determinant the smallest.
+        """
+        m11, m12, m22, coupling = self._inertia
+        trace, determinant = m11 + 2 * coupling + m22, (m11 + 2 * coupling) * m22 - (m12 + coupling) ** 2
+        largest = (trace + math.sqrt(max(trace**2 - 4 * determinant, 0.0))) / 2
+        return determinant / largest, largest
+
+    @property
+    def _fastest_rad_per_s(self) -> float:
+        """What no joint's speed passes in an episode, whatever the commands; wide, but true.
+
+        With T the torque of a motor, b the damping and k < K the least and largest eigenvalue of M: both motors
+        together give at most sqrt(2) T |q'|, damping takes b |q'|^2, so the energy falls where |q'| > sqrt(2) T / b,
+        and is at most K T^2 / b^2. From rest, sqrt(energy) grows by at most T / sqrt(k) in a second. Either way
+        |q'|^2 <= 2 energy / k. 5 % more is for steps that are not infinitely small.
+        """
+        least, largest = self._inertias_kg_m2
+        by_time = math.sqrt(2) * self.torque_n_m * self.episode_limit * self.step_s / least
+        if not self.damping_n_m_s:
+            return 1.05 * by_time + 1e-6
+        by_damping = math.sqrt(2 * largest / least) * self.torque_n_m / self.damping_n_m_s
+        return 1.05 * min(by_time, by_damping) + 1e-6

@@ -1,0 +1,55 @@
+"""What several robots compute alike: angles, the equations of motion over a step, and what distance costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from jax import Array
+
+Numbers = TypeVar("Numbers")
+
+
+def within_half_a_turn(angle_rad: Float[Array, ""]) -> Float[Array, ""]:
+    """The same direction in (-pi, pi], of an angle in (-3 pi, 3 pi]."""
+    import jax.numpy as jnp
+
+    least = jnp.where(angle_rad > math.pi, angle_rad - 2 * math.pi, angle_rad)
+    return jnp.where(angle_rad <= -math.pi, angle_rad + 2 * math.pi, least)
+
+
+def cost_of_distance(distance_m: Float[Array, ""], radius_m: float) -> Float[Array, ""]:
+    """R / d - 1 with R the radius of a goal and d the distance to its centre: 0 within it, towards -1 far away."""
+    import jax.numpy as jnp
+
+    # At the goal the distance may be zero; the larger of the two keeps R / d finite there.
+    return radius_m / jnp.maximum(distance_m, radius_m) - 1
+
+
+def runge_kutta(rates: Callable[[Numbers], Numbers], state: Numbers, step_s: float) -> Numbers:
+    """The state a step later, by the classical Runge-Kutta method of fourth order.
+
+        y(t + h) = y + h/6 (k1 + 2 k2 + 2 k3 + k4),
+        k1 = f(y), k2 = f(y + h/2 k1), k3 = f(y + h/2 k2), k4 = f(y + h k3)
+
+    Args:
+        rates: f, how fast each number of a state changes, per second; commands do not change within a step.
+        state: y, a pytree.
+        step_s: h.
+    """
+    import jax
+
+    def after(rate: Numbers, share: float) -> Numbers:
+        moved: Numbers = jax.tree.map(lambda y, k: y + share * step_s * k, state, rate)
+        return moved
+
+    k1 = rates(state)
+    k2 = rates(after(k1, 0.5))
+    k3 = rates(after(k2, 0.5))
+    k4 = rates(after(k3, 1.0))
+    mean: Numbers = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+    return after(mean, 1.0)

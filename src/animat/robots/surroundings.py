@@ -1,0 +1,128 @@
+"""What stands around a robot that drives: straight walls and round obstacles, how far they are, and what is free."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from animat.records import Number
+from animat.robots.base import Size
+
+if TYPE_CHECKING:
+    from jax import Array
+
+Wall = tuple[Number, Number, Number, Number]
+"""From (x, y) to (x, y), in metres; it has no thickness."""
+
+Obstacle = tuple[Number, Number, Size]
+"""Centre x and y, and radius, in metres."""
+
+MOST_SHAPES = 200
+Walls = Annotated[tuple[Wall, ...], Field(max_length=MOST_SHAPES)]
+Obstacles = Annotated[tuple[Obstacle, ...], Field(max_length=MOST_SHAPES)]
+
+MOST_PLACES = 1_000_000
+
+
+class Surroundings(NamedTuple):
+    """Walls and obstacles."""
+
+    walls: tuple[Wall, ...]
+    obstacles: tuple[Obstacle, ...]
+
+    def clearance_m(self, x_m: Float[Array, "*places"], y_m: Float[Array, "*places"]) -> Float[Array, "*places"]:
+        """How far the nearest wall or the edge of the nearest obstacle is; below 0 within one, infinite for nothing.
+
+        Args:
+            x_m, y_m: of places, of numpy or JAX.
+        """
+        xp = x_m.__array_namespace__()
+        apart: Array = xp.full_like(x_m, math.inf)
+        for x1, y1, x2, y2 in self.walls:
+            along = ((x_m - x1) * (x2 - x1) + (y_m - y1) * (y2 - y1)) / max((x2 - x1) ** 2 + (y2 - y1) ** 2, 1e-18)
+            nearest = xp.clip(along, 0.0, 1.0)
+            apart = xp.minimum(apart, xp.hypot(x_m - x1 - nearest * (x2 - x1), y_m - y1 - nearest * (y2 - y1)))
+        for x, y, radius in self.obstacles:
+            apart = xp.minimum(apart, xp.hypot(x_m - x, y_m - y) - radius)
+        return apart
+
+    def along_rays_m(
+        self, x_m: Float[Array, ""], y_m: Float[Array, ""], directions_rad: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        """How far it is from a place to the first wall or obstacle in some directions; infinite for nothing.
+
+        A ray from p along the unit vector d meets the wall from a to b at t = (a - p) x (b - a) / d x (b - a), where
+        that is at least 0 and s = (a - p) x d / d x (b - a) lies in [0, 1]; and the circle about c with radius r at
+        t = h - sqrt(h^2 - |c - p|^2 + r^2) with h = (c - p) . d, at 0 from within.
+        """
+        import jax.numpy as jnp
+
+        dx, dy = jnp.cos(directions_rad), jnp.sin(directions_rad)
+        nearest = jnp.full(directions_rad.shape, math.inf, dx.dtype)
+        if self.walls:
+            x1, y1, x2, y2 = (jnp.asarray(of, dx.dtype)[:, None] for of in zip(*self.walls, strict=True))
+            cross = dx * (y2 - y1) - dy * (x2 - x1)
+            met = jnp.abs(cross) > 1e-9
+            cross = jnp.where(met, cross, 1.0)
+            t = ((x1 - x_m) * (y2 - y1) - (y1 - y_m) * (x2 - x1)) / cross
+            s = ((x1 - x_m) * dy - (y1 - y_m) * dx) / cross
+            # A ray into a corner must not slip between two walls.
+            met &= (t >= 0) & (s >= -1e-6) & (s <= 1 + 1e-6)
+            nearest = jnp.minimum(nearest, jnp.min(jnp.where(met, t, math.inf), axis=0))
+        if self.obstacles:
+            x, y, radius = (jnp.asarray(of, dx.dtype)[:, None] for of in zip(*self.obstacles, strict=True))
+            ahead = (x - x_m) * dx + (y - y_m) * dy
+            outside = (x - x_m) ** 2 + (y - y_m) ** 2 - radius**2
+            under = ahead**2 - outside
+            met = (under >= 0) & (ahead >= 0) & (outside > 0)
+            t = jnp.where(met, ahead - jnp.sqrt(jnp.maximum(under, 0.0)), math.inf)
+            nearest = jnp.minimum(nearest, jnp.min(jnp.where(outside <= 0, 0.0, t), axis=0))
+        return nearest
+
+    def box_m(self) -> tuple[float, float, float, float]:
+        """The least rectangle around all walls and obstacles: its left, top, right and bottom."""
+        points = [(x, y) for wall in self.walls for x, y in (wall[:2], wall[2:])]
+        points += [(x + sign * r, y + sign * r) for x, y, r in self.obstacles for sign in (-1, 1)]
+        xs, ys = zip(*points, strict=True)
+        return min(xs), min(ys), max(xs), max(ys)
+
+
+@lru_cache(maxsize=64)
+def places_within_reach(
+    around: Surroundings, start_m: tuple[float, float], room_m: float, spacing_m: float
+) -> Float[np.ndarray, "places 2"]:
+    """The places of a square lattice through the start to which a disc can be moved from there.
+
+    Args:
+        around: what stands there.
+        start_m: where the disc's centre is at first.
+        room_m: how near its centre may come to a wall or an obstacle.
+        spacing_m: between neighbours in the lattice, less than twice `room_m`, or it passes through walls; a disc
+            moves between a place and its four neighbours.
+
+    Returns:
+        x and y (m) of each, the start among them; none where the disc has no room at the start, or where there are
+        more than a million places to look at.
+    """
+    from scipy.ndimage import label
+
+    left, top, right, bottom = around.box_m() if around.walls or around.obstacles else (*start_m, *start_m)
+    steps = [
+        np.arange(math.floor((low - at) / spacing_m), math.ceil((high - at) / spacing_m) + 1)
+        for at, low, high in ((start_m[0], left, right), (start_m[1], top, bottom))
+    ]
+    if len(steps[0]) * len(steps[1]) > MOST_PLACES:
+        return np.zeros((0, 2))
+    x_m, y_m = np.meshgrid(*(at + spacing_m * of for at, of in zip(start_m, steps, strict=True)), indexing="ij")
+    regions, _ = label(around.clearance_m(x_m, y_m) >= room_m)
+    at_start = np.flatnonzero(steps[0] == 0), np.flatnonzero(steps[1] == 0)
+    if not (len(at_start[0]) and len(at_start[1])):
+        return np.zeros((0, 2))
+    own = int(regions[at_start[0][0], at_start[1][0]])
+    reached = (regions == own) & (own > 0)
+    return np.stack([x_m[reached], y_m[reached]], axis=1)

@@ -1,0 +1,224 @@
+"""Swing-up: bring a pendulum upright with a motor that is too weak to lift it, and keep it there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
+
+import numpy as np
+from jaxtyping import Bool, Float
+from pydantic import Field
+
+from animat.errors import InvalidArgument
+from animat.records import Number, record
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
+from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, Canvas, Picture
+from animat.robots.motion import runge_kutta, within_half_a_turn
+from animat.robots.registry import register_robot
+
+if TYPE_CHECKING:
+    from jax import Array
+    from matplotlib.axes import Axes
+
+    from animat.robots.grid import Grid
+
+
+SPARE = 0.07
+"""Of the heuristic: how much more energy than it takes to stand, as a part of the largest acceleration by gravity."""
+
+
+class SwingUpState(NamedTuple):
+    """Where the pendulum is: 0 is upright and pi is hanging, positive is clockwise; the angle is in (-pi, pi]."""
+
+    angle_rad: Float[Array, ""]
+    angular_velocity_rad_per_s: Float[Array, ""]
+
+
+@final
+@register_robot
+@record
+class SwingUp(Robot[SwingUpState]):
+    """A pendulum swung up by a motor too weak to lift it; +1 an iteration that ends near upright, else 0.
+
+        m l^2 / 3 a'' = m g l / 2 sin a + torque_n_m u
+
+    with m the mass and l the length of a uniform rod that turns about its end, and a its angle from upright. With the
+    default numbers that is a'' = 15 sin a + 6 u: the motor alone lifts the rod to 24 degrees from hanging. One step of
+    the classical Runge-Kutta method an iteration; the angular velocity is then clipped to `speed_limit_rad_per_s`, as
+    by a brake. An episode starts at rest, hanging, and never ends by itself.
+
+    Attributes:
+        speed_limit_rad_per_s: the largest angular velocity, to either side.
+        upright_rad: the angle from upright up to which an iteration is rewarded, to either side.
+        reward_upright: the reward of an iteration that ends there.
+
+    Raises:
+        InvalidArgument: for a parameter that is not finite or has no meaning, or a step in which the rod could make
+            a whole turn.
+
+    Source: the pendulum of Gymnasium (`Pendulum-v1`) with another reward.
+    """
+
+    gravity_m_per_s2: Amount = 10.0
+    mass_kg: Size = 1.0
+    length_m: Size = 1.0
+    torque_n_m: Amount = 2.0
+    speed_limit_rad_per_s: Size = 8.0
+    upright_rad: Annotated[Number, Field(ge=1e-9, le=math.pi)] = math.radians(30.0)
+    step_s: Size = 0.05
+    reward_upright: Number = 1.0
+    episode_limit: Iterations = 200
+
+    name: ClassVar[str] = "swing-up"
+    noise_size: ClassVar[int] = 0
+    paper_iterations: ClassVar[int] = 500_000
+    # Full power either way swings highest, and is what random commands come near to swinging it up with.
+    baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        most_rad = self.step_s * (self.speed_limit_rad_per_s + self.step_s * (self._gravity_per_s2 + self._push_per_s2))
+        if most_rad > 2 * math.pi:
+            raise InvalidArgument(
+                f"step_s: expected a step of less than a turn, got {most_rad / 2 / math.pi:.3g} turns"
+            )
+
+    @property
+    def return_range(self) -> tuple[float, float]:
+        """Of an episode that is never near upright, or always."""
+        all_of_it = self.episode_limit * self.reward_upright
+        return min(0.0, all_of_it), max(0.0, all_of_it)
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        """Cosine and sine of the angle, which have no jump at the bottom, and the angular velocity."""
+        fastest = self.speed_limit_rad_per_s
+        return (
+            Quantity("angle_cosine", "1", 1.0, -1.0, 1.0),
+            Quantity("angle_sine", "1", 1.0, -1.0, 1.0),
+            Quantity("angular_velocity", "rad/s", fastest, -fastest, fastest),
+        )
+
+    def reset(self, key: Array) -> SwingUpState:
+        """At rest, hanging; `key` is not used."""
+        import jax.numpy as jnp
+
+        return SwingUpState(jnp.float32(math.pi), jnp.zeros((), jnp.float32))
+
+    def advance(
+        self, uniforms: Float[Array, " noise_size"], state: SwingUpState, u: Float[Array, ""]
+    ) -> tuple[SwingUpState, Float[Array, ""], Bool[Array, ""]]:
+        """One step with the same torque throughout (see `Robot.advance` and the class)."""
+        import jax.numpy as jnp
+
+        def rates(state: SwingUpState) -> SwingUpState:
+            angle, angular_velocity = state
+            return SwingUpState(angular_velocity, self._gravity_per_s2 * jnp.sin(angle) + self._push_per_s2 * u)
+
+        angle, angular_velocity = runge_kutta(rates, state, self.step_s)
+        fastest = self.speed_limit_rad_per_s
+        after = SwingUpState(within_half_a_turn(angle), jnp.clip(angular_velocity, -fastest, fastest))
+        upright = jnp.abs(after.angle_rad) <= self.upright_rad
+        reward = jnp.where(upright, self.reward_upright, 0.0).astype(angle.dtype)
+        return after, reward, jnp.zeros((), bool)
+
+    def observe(self, state: SwingUpState) -> Float[Array, " observations"]:
+        """Cosine and sine of the angle from upright, and the angular velocity (rad/s)."""
+        import jax.numpy as jnp
+
+        return jnp.stack([jnp.cos(state.angle_rad), jnp.sin(state.angle_rad), state.angular_velocity_rad_per_s])
+
+    def caveats(self) -> tuple[str, ...]:
+        """Says so where the motor can lift the pendulum without a swing."""
+        if self._push_per_s2 < self._gravity_per_s2:
+            return ()
+        weakest_n_m = self.mass_kg * self.gravity_m_per_s2 * self.length_m / 2
+        return (
+            f"swing-up: with torque_n_m = {self.torque_n_m:g} the motor lifts the pendulum directly (from "
+            f"{weakest_n_m:g} N m on), so no swing is needed",
+        )
+
+    def heuristic(self, observation: Any) -> Any:
+        """Full power with the movement until the energy suffices to stand; near upright, against the fall.
+
+        The energy is w^2 / 2 + k (cos a - 1) with k the largest acceleration by gravity, 0 for a rod that stands. Near
+        upright the rod falls with a + w / sqrt(k); the motor catches it where that is less than what it can hold.
+        """
+        xp = observation.__array_namespace__()
+        cosine, sine, angular_velocity = observation
+        gravity = max(self._gravity_per_s2, 1e-9)
+        energy = angular_velocity**2 / 2 + gravity * (cosine - 1)
+        with_it = xp.where(angular_velocity >= 0, 1.0, -1.0)
+        # A little more than it takes to stand, as the last bit of the way would take for ever.
+        pumping = xp.where(energy < SPARE * gravity, with_it, -with_it)
+        falling = sine + angular_velocity / math.sqrt(gravity)
+        held = min(self._push_per_s2 / gravity, 1.0)
+        catching = xp.clip(-4 * falling, -1.0, 1.0)
+        return xp.where((cosine > 0) & (xp.abs(falling) < held), catching, pumping)
+
+    def value_grid(self) -> Grid:
+        """Angle by angular velocity, at every command of its own, as one may decide whether a step is rewarded.
+
+        Each of the two has a part in how the other one moves, and a grid wants a first coordinate that has none: it is
+        one that means nothing, with the fewest nodes.
+        """
+        import jax.numpy as jnp
+
+        from animat.robots.grid import TAPS, Axis, Grid
+
+        fastest = self.speed_limit_rad_per_s
+        return Grid(
+            Axis("nothing", "1", 0.0, 1.0, TAPS),
+            (
+                Axis("angle", "rad", -math.pi, math.pi, 180, periodic=True),
+                Axis("angular_velocity", "rad/s", -fastest, fastest, 121),
+            ),
+            lambda state: (jnp.zeros_like(state.angle_rad), *state),
+            lambda coordinates: SwingUpState(*coordinates[1:]),
+        )
+
+    def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
+        """The rod, where it is rewarded, and the command as an arc about the pivot (see `animat.robots.drawing`)."""
+        length = self.length_m
+        scale = height_px / (2.5 * length)
+        canvas = Canvas(height_px, height_px, (height_px / 2, height_px / 2), scale)
+
+        def at(angle: float, radius: float) -> tuple[float, float]:
+            return radius * math.sin(angle), -radius * math.cos(angle)
+
+        rewarded = np.linspace(-self.upright_rad, self.upright_rad, 40)
+        canvas.stroke([at(float(angle), 1.1 * length) for angle in rewarded], 0.03 * length, GOAL_FILL)
+        for end in (-self.upright_rad, self.upright_rad):
+            canvas.disc(at(end, 1.1 * length), 0.015 * length, GOAL)
+        tip = (length * float(observation[1]), -length * float(observation[0]))
+        canvas.stroke([(0.0, 0.0), tip], 0.08 * length, BODY)
+        canvas.disc((0.0, 0.0), 0.03 * length, INK)
+        if command:
+            arc = np.linspace(0.0, command * math.pi / 2, 20)
+            canvas.stroke([at(float(angle), 0.2 * length) for angle in arc], 0.03 * length, ACCENT)
+            canvas.disc(at(float(arc[-1]), 0.2 * length), 0.035 * length, ACCENT)
+        return canvas.picture()
+
+    def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
+        """How far from upright the pendulum was in each episode, over time."""
+        limit_deg = math.degrees(self.upright_rad)
+        stood = 0
+        for path in paths:
+            time_s, off_deg = np.arange(len(path)) * self.step_s, np.degrees(np.arccos(np.clip(path[:, 0], -1, 1)))
+            ends_upright = bool(off_deg[-1] <= limit_deg)
+            stood += ends_upright
+            axes.plot(time_s, off_deg, color=DONE if ends_upright else FAILED, linewidth=0.7, alpha=0.8)
+        axes.axhline(limit_deg, color=EDGE, linewidth=0.8, linestyle="--")
+        axes.set_xlim(0, self.episode_limit * self.step_s)
+        axes.set_ylim(0, 185)
+        axes.set(xlabel=f"time (s); {stood} of {len(paths)} end upright", ylabel="angle from upright (deg)")
+
+    @property
+    def _gravity_per_s2(self) -> float:
+        """The largest angular acceleration by gravity: 3 g / (2 l)."""
+        return 1.5 * self.gravity_m_per_s2 / self.length_m
+
+    @property
+    def _push_per_s2(self) -> float:
+        """That by the motor: 3 torque / (m l^2)."""
+        return 3 * self.torque_n_m / (self.mass_kg * self.length_m**2)
