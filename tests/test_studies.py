@@ -745,8 +745,14 @@ COMPARED = (
         ("[[robots]]\nname = 'cart'", "robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'cart'"),
         ("[[robots]]\niterations = 3", "robots.name: expected to be given"),
         ("[[robots]]\nname = 'cartpole'\nparameters = { mass = 1 }", "parameters: cartpole: expected parameters"),
-        ("[[robots]]\nname = 'cartpol'", "robots.name: robot: expected one of cartpole, navigation, got 'cartpol';"),
-        ("[[robots]]\nname = 'a'\nkind = 'b'", "robots.kind: robot: expected one of cartpole, navigation, got 'b';"),
+        (
+            "[[robots]]\nname = 'cartpol'",
+            "robots.name: robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'cartpol';",
+        ),
+        (
+            "[[robots]]\nname = 'a'\nkind = 'b'",
+            "robots.kind: robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'b';",
+        ),
         ("[robots.cartpole]\niterations = 3", "robots: expected [[robots]] for each, and its name in it, got [robots."),
         ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
         ("[[arms]]\nname = '10'", "which in a table would be a number"),
