@@ -224,6 +224,47 @@ def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> Non
     assert none >= 36
 
 
+def test_trials_further_apart_than_a_silence_have_a_load() -> None:
+    """At 0.5 Hz a trial comes after a silence each time, and a seventh of the load of one second is left."""
+    rng = np.random.default_rng(1)
+    condition = rng.integers(0, 2, 400)
+    since_s = np.array([2.0, 0.05])[condition]
+    x = 50.0 + 5.0 * condition + rng.normal(0, 5, 400)
+    every = Presented(condition, x, np.zeros(400, bool), since_s > 1.0, np.cumsum(since_s))
+    columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(400, 0.1), "is_burst": every.is_burst}
+    responses = replace(responses_of([1.0], [1.0]), presented=every, place=np.arange(400), **columns)
+    simulator = fit_memory(responses, memory=Memory(0.0, 0.0, 0.5, 1.0))
+    np.testing.assert_allclose(simulator.kept, np.exp([-2.0, -0.05]), rtol=1e-6)
+    # After a trial there is at least what it added, and at most what trials at 20 Hz add up to.
+    states = np.concatenate([np.asarray(simulator.histories)[c, : simulator.followers[c], 1] for c in (0, 1)])
+    added = float(simulator.added)
+    assert states.min() == 0.0 and np.sort(states)[1] >= 0.999 * added
+    assert states.max() <= 1.001 * added / (1 - np.exp(-0.05))
+
+
+def test_a_condition_of_few_responses_takes_nothing_from_the_others() -> None:
+    responses = loaded(900, 3, slope=-60.0)
+    rare = np.flatnonzero(responses.condition == 2)[4:]
+    kept = np.setdiff1d(np.arange(900), rare)
+    few = replace(
+        responses,
+        **{name: getattr(responses, name)[kept] for name in ("condition", "rate_hz", "active_ratio", "is_burst")},
+        place=kept,
+    )
+    simulator = fit_memory(few, memory=Memory(0.0, 0.0, 0.7, 2.0))
+    whole = fit_memory(responses, memory=Memory(0.0, 0.0, 0.7, 2.0))
+    # Of loads' units and ranks, which 300 responses less change a little.
+    slopes, expected = (np.asarray(each.toward)[:2, 1] for each in (simulator, whole))
+    np.testing.assert_allclose(slopes, expected, rtol=0.35)
+    assert np.all(np.isfinite(simulator.toward))
+
+
+def test_responses_that_are_all_the_same_have_no_slopes() -> None:
+    responses = loaded(300, 1, slope=0.0)
+    same = replace(responses, rate_hz=np.full(300, 7.0))
+    assert np.all(np.isfinite(fit_memory(same, memory=Memory(0.3, 0.5, 0.7, 2.0)).toward))
+
+
 @pytest.mark.parametrize("slope", [-60.0, 60.0])
 def test_runs_of_one_condition_are_answered_as_they_are(slope: float) -> None:
     """After ten of one frequency the culture answers otherwise than in random order: its simulator knows."""
@@ -690,6 +731,9 @@ def test_training_tells_what_is_remembered() -> None:
         f"memory at 0 min: {decay:.2g} of the history state is left by each trial, which weighs {weight:g} "
     )
     assert f"one of the n^{neighbour_exponent:.2g} responses" in first
+    assert "tells too" not in first
+    (told,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
+    assert told.endswith("; how much was stimulated in the last 1 s tells too")
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 

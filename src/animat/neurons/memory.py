@@ -51,6 +51,8 @@ _WEIGHTS = (0.0, 0.5, 1.0)
 _EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
 _LOAD_S = 1.0
 """Settled on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s this one told the responses in their closed loops best."""
+_FEWEST = 30
+"""Responses of which a condition has slopes of its own; of fewer it has those of all conditions."""
 _UNLIKELY = 0.01
 """How often a load would explain as much by chance, at most."""
 _CERTAIN = 2.0
@@ -151,8 +153,9 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     values = fit_empirical(responses, room=room)
     ranked = _Ranked(responses)
     memory = memory or _found(ranked)
-    trace, (load, kept, added) = ranked.traces(memory), ranked.loads(memory.load_s)
-    history = np.stack([trace, load], axis=-1)
+    trace, load = ranked.traces(memory), ranked.loads(memory.load_s)
+    memory = memory if load.added else memory._replace(load_s=0.0)
+    history, state = (np.stack([trace, each], axis=-1) for each in (load.at, load.after))
     shape = values.values_hz.shape[:2]
     before, after, left = np.full(shape, np.inf), np.zeros(values.values_hz.shape), np.zeros(shape)
     histories, toward = np.zeros((*shape, 2)), np.tile([1.0, 0.0], (shape[0], 1))
@@ -162,7 +165,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         at = history[rows] @ toward[condition]
         in_order = rows[np.argsort(at, kind="stable")]
         before[condition, : len(rows)] = np.sort(at)
-        histories[condition, : len(rows)] = history[in_order] / [1.0, max(kept[condition], 1e-9)]
+        histories[condition, : len(rows)] = state[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
         left[condition, : len(rows)] = _left(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
@@ -177,10 +180,26 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         jnp.asarray(followers, jnp.int32),
         jnp.asarray(np.rint(followers**memory.neighbour_exponent), jnp.int32),
         jnp.asarray(toward, jnp.float32),
-        jnp.asarray(kept, jnp.float32),
-        jnp.float32(added),
+        jnp.asarray(load.kept, jnp.float32),
+        jnp.float32(load.added),
         *(jnp.float32(each) for each in memory),
     )
+
+
+class _Loads(NamedTuple):
+    """The load of a recording.
+
+    Attributes:
+        at: each response, shape (responses,).
+        after: the trial before it, shape (responses,).
+        kept: the share that is left at a trial of each condition, shape (conditions,).
+        added: what a trial adds; 0: there is no load.
+    """
+
+    at: Float64[np.ndarray, " responses"]
+    after: Float64[np.ndarray, " responses"]
+    kept: Float64[np.ndarray, " conditions"]
+    added: float
 
 
 class _Ranked:
@@ -222,24 +241,27 @@ class _Ranked:
             trace = 0.5 if is_burst else memory.decay * trace + more
         return np.asarray(np.array(traces, np.float64)[self._place])
 
-    def loads(
-        self, load_s: float
-    ) -> tuple[Float64[np.ndarray, " responses"], Float64[np.ndarray, " conditions"], float]:
-        """The load at each response, the share of it that is left at a trial of each condition, and what one adds."""
+    def loads(self, load_s: float) -> _Loads:
+        """The load before each response."""
         presented = self._presented
         if not load_s or presented.time_s is None:
-            return np.full(len(self.rank), 0.5), np.ones(len(self.rows)), 0.0
+            half = np.full(len(self.rank), 0.5)
+            return _Loads(half, half, np.ones(len(self.rows)), 0.0)
         since_s = np.diff(presented.time_s, prepend=-np.inf)
-        load, loads = 0.0, []
+        left, lefts, loads = 0.0, [], []
         for kept in np.exp(-since_s / load_s).tolist():
-            loads.append(kept * load)
-            load = loads[-1] + 1
+            lefts.append(left)
+            loads.append(kept * left)
+            left = loads[-1] + 1
+        # Before the first trial of all, time has no length.
+        has_length = np.isfinite(since_s)
         usual_s = [
-            np.median(since_s[of] if (of := (presented.condition == c) & ~presented.is_rested).any() else np.inf)
+            np.median(since_s[of] if (of := (presented.condition == c) & has_length).any() else np.inf)
             for c in range(len(self.rows))
         ]
         added = 0.5 / max(float(np.mean(loads)), 1e-9)
-        return added * np.array(loads)[self._place], np.exp(-np.array(usual_s) / load_s), added
+        at, after = (added * np.array(each)[self._place] for each in (loads, lefts))
+        return _Loads(at, after, np.exp(-np.array(usual_s) / load_s), added)
 
 
 def _left(
@@ -284,15 +306,15 @@ def _has_load(ranked: _Ranked, memory: Memory) -> bool:
     """Whether a load explains ranks that the trace does not."""
     from scipy.stats import f
 
-    trace, (load, _, added) = ranked.traces(memory), ranked.loads(_LOAD_S)
-    if not added:
+    trace, load = ranked.traces(memory), ranked.loads(_LOAD_S)
+    if not load.added:
         return False
     # Of each condition on its own, so that its mean explains nothing.
     one = np.concatenate([np.eye(len(ranked.rows))[[c] * len(rows)] for c, rows in enumerate(ranked.rows)])
     every = np.concatenate(ranked.rows)
     without, with_load = (
         _squares_left(ranked.rank[every], np.concatenate([one * x[every, None] for x in given], axis=1))
-        for given in ([np.ones_like(trace), trace], [np.ones_like(trace), trace, load])
+        for given in ([np.ones_like(trace), trace], [np.ones_like(trace), trace, load.at])
     )
     more, left = len(ranked.rows), len(every) - 3 * len(ranked.rows)
     if left <= 0 or with_load <= 0:
@@ -323,9 +345,10 @@ def _slopes(
     common = np.linalg.lstsq(squares.sum(axis=0), products.sum(axis=0), rcond=None)[0]
     n = sum(map(len, ranks)) - len(ranks) - 2
     variance = sum(float(np.sum((y - x @ common) ** 2)) for y, x in centred) / max(n, 1)
-    known = [i for i, square in enumerate(squares) if np.linalg.matrix_rank(square) == 2]
     slopes = np.tile(common, (len(ranks), 1))
-    if len(known) < 2:
+    # The slopes of a few responses would tell more of chance than of how conditions differ.
+    known = [i for i, of in enumerate(squares) if len(ranks[i]) >= _FEWEST and np.linalg.matrix_rank(of) == 2]
+    if len(known) < 2 or variance <= 0:
         return slopes
     errors = variance * np.linalg.inv(squares[known])
     alone = np.stack([np.linalg.solve(squares[i], products[i]) for i in known])

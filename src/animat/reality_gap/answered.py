@@ -87,7 +87,8 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     at = at.astype(np.int64)
     x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
     before_s = np.concatenate([[-np.inf], read_s[:-1]])
-    every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), first_s - before_s > SILENCE_S)
+    is_rested = first_s - before_s > SILENCE_S
+    every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
     responses = Responses(
         condition=every.condition[at],
         rate_hz=every.rate_hz[at],
