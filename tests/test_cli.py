@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from animat.recordings.reading import read_recordings
 from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.series import extract_series
 from animat.robots import Cartpole
+from animat.training.policy import Policy
+from animat.training.settings import SAC
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -72,6 +75,14 @@ def test_what_training_reports_is_what_the_deployed_policies_get(
     assert reported["random"] == evaluated["rows"][1]["mean_return"]  # type: ignore[index]
     assert reported["recorded_at_min"] == evaluated["recorded_at_min"] == 10.0
     assert f"1 policy in {tmp_path}; mean return on the simulator at 10 min: {reported['returns']['p0']:.1f}" in printed  # type: ignore[index]
+
+
+def test_settings_of_the_algorithm_are_those_that_policies_are_trained_with(recordings: Path, tmp_path: Path) -> None:
+    few = ["--policies", "1", "--iterations", "640", "--sac", "discount=0.9", "hidden=8", "environments=16"]
+    assert main(["train", "cartpole", "--recordings", str(recordings), *few, "--out", str(tmp_path)]) == 0
+    told = json.loads((tmp_path / "training.json").read_text())["training"]["algorithm"]
+    assert told == asdict(SAC(discount=0.9, hidden=8, environments=16))
+    assert [w.shape for w in Policy.load(tmp_path / "p0.safetensors").weights] == [(4, 8), (8, 8), (8, 5)]
 
 
 def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_finished_one_is_told(
@@ -261,6 +272,20 @@ BAD = {
         ["bad.npz", "channels: expected at least one"],
     ),
     "parameter without a number": (nothing, [*TRAIN, "{recordings}", "--parameters", "force_n"], ["--parameters"]),
+    "a misspelt setting": (
+        nothing,
+        [*TRAIN, "{folder}/none", "--sac", "tau=0.01", "discuont=0.98"],
+        ["--sac", "'discuont'", "did you mean discount?"],
+    ),
+    "a setting of no name": (nothing, [*TRAIN, "{folder}/none", "--sac", "x=1"], ["--sac", "'x'", "learning_rate"]),
+    "a setting out of bounds": (nothing, [*TRAIN, "{folder}/none", "--sac", "discount=2"], ["--sac: discount", "1"]),
+    "a setting of another kind": (nothing, [*TRAIN, "{folder}/none", "--sac", "batch=1.5"], ["--sac: batch", "whole"]),
+    "a setting twice": (nothing, [*TRAIN, "{folder}/none", "--sac", "tau=0.1", "tau=0.2"], ["--sac", "tau once"]),
+    "a misspelt setting of a live run": (
+        nothing,
+        ["live", "cartpole", "--culture", "virtual", "--out", "{folder}/out", "--sac", "taus=0.01"],
+        ["--sac", "did you mean tau?"],
+    ),
     "a seed beyond 32 bits": (
         nothing,
         ["evaluate", "{policies}", "--recordings", "{recordings}", "--seed", "99999999999999999999"],

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.named_numbers import read_sac
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
 from animat.writing import exclusive_lock
@@ -53,6 +54,8 @@ class Live(Stimulating):
     simulator: Literal["histogram", "empirical", "memory"] | None = None
     """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
     histogram: the paper's; empirical: draw any measured value"""
+    sac: tuple[str, ...] = ()
+    """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
     seed: int = 1
@@ -95,6 +98,7 @@ class Live(Stimulating):
             iterations=robot.paper_iterations,
             seed=self.seed,
             percentiles=self.percentiles,
+            algorithm=read_sac(self.sac),
         )
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))

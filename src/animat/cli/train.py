@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import Fitting, say_findings
 from animat.errors import InvalidArgument, UnusableData
 from animat.writing import expect_writable
@@ -51,6 +52,8 @@ class Train(Fitting):
     """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
     parameters: tuple[str, ...] = ()
     """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
+    sac: tuple[str, ...] = ()
+    """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
     out: Path = Path("policies")
@@ -72,7 +75,7 @@ class Train(Fitting):
             raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
         if not self.out.is_dir():
             expect_writable(self.out)
-        robot = robot_named(self.robot, **_numbers("--parameters", self.parameters))
+        robot = robot_named(self.robot, **read_numbers("--parameters", self.parameters))
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
         readouts = read_readouts(self.readouts)
@@ -91,6 +94,7 @@ class Train(Fitting):
             percentiles=self.percentiles,
             delivery=self.delivery,
             commands=robot.baseline_commands if mapping == "none" else None,
+            algorithm=read_sac(self.sac),
         )
         from animat.execution.training import train
         from animat.training.folder import expect_folder_for, expect_trainable, is_finished
@@ -146,17 +150,6 @@ class Train(Fitting):
 _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
 """What works in a closed loop; `share`: of the paper's iterations, in per cent."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
-
-
-def _numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
-    numbers = {}
-    for pair in pairs:
-        name, _, value = pair.partition("=")
-        try:
-            numbers[name] = int(value) if value.lstrip("-").isdecimal() else float(value)
-        except ValueError:
-            raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
-    return numbers
 
 
 def _control(timeline: SimulatorTimeline) -> str:

@@ -1,0 +1,49 @@
+"""Options of numbers by name: `NAME=VALUE ...`, of robots and of the algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+from animat.errors import InvalidArgument, did_you_mean
+
+if TYPE_CHECKING:
+    from animat.training.settings import SAC
+
+
+def read_numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
+    """What was given as `NAME=NUMBER`, by name; whole numbers stay whole.
+
+    Raises:
+        InvalidArgument: for anything else, or a name that is given twice.
+    """
+    numbers: dict[str, float] = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        if name in numbers:
+            raise InvalidArgument(f"{option}: expected {name} once, got it twice")
+        try:
+            numbers[name] = int(value) if value.lstrip("-").isdecimal() else float(value)
+        except ValueError:
+            raise InvalidArgument(f"{option}: expected NAME=NUMBER, got {pair!r}") from None
+    return numbers
+
+
+def read_sac(pairs: Sequence[str]) -> SAC:
+    """The algorithm's settings, those given in place of its defaults.
+
+    Raises:
+        InvalidArgument: for a setting that there is none of, or a value that it may not have.
+    """
+    from animat.training.settings import SAC
+
+    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]  # type: ignore[arg-type]
+    for name in numbers:
+        if name not in known:
+            near = did_you_mean(name, known) or f"; there are {', '.join(known)}"
+            raise InvalidArgument(f"--sac: expected the name of a setting, got {name!r}{near}")
+    try:
+        return SAC(**numbers)  # type: ignore[arg-type]
+    except InvalidArgument as error:
+        raise InvalidArgument(f"--sac: {error}") from error
