@@ -47,6 +47,7 @@ STORY = (
     "live",
     "report",
     "studies",
+    "tuning",
     "gym",
     "cli",
 )
@@ -98,7 +99,7 @@ def modules_after(statement: str) -> set[str]:
     return set(ran.stdout.splitlines()[-1].split())
 
 
-HEAVY = {"jax", "jaxlib", "scipy", "matplotlib", "pynwb", "hdmf", "h5py", "numba", "pandas", "optax"}
+HEAVY = {"jax", "jaxlib", "scipy", "matplotlib", "pynwb", "hdmf", "h5py", "numba", "pandas", "optax", "optuna"}
 
 
 def test_importing_animat_imports_nothing_heavy() -> None:

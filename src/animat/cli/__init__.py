@@ -35,6 +35,7 @@ from animat.cli.robots import Robots
 from animat.cli.run import Run
 from animat.cli.study import StudyFile
 from animat.cli.train import Train
+from animat.cli.tune import TuneFile
 from animat.ctrl_c import heard_everywhere
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 
@@ -46,6 +47,7 @@ Command = (
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[StudyFile, subcommand("study")]
+    | Annotated[TuneFile, subcommand("tune")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Live, subcommand("live")]
     | Annotated[Recover, subcommand("recover")]
@@ -110,7 +112,9 @@ def _run(given: list[str]) -> int:
         return 1
     except KeyboardInterrupt as error:
         kept = "" if isinstance(command, Inspect | Convert | Evaluate) else "; what was finished is kept"
-        again = "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile) else ""
+        again = (
+            "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile) else ""
+        )
         print(f"animat: interrupted{kept}{again}", file=sys.stderr)
         _say_notes(error)
         return 130

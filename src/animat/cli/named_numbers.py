@@ -38,7 +38,7 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     """
     from animat.training.settings import SAC
 
-    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]  # type: ignore[arg-type]
+    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]
     for name in numbers:
         if name not in known:
             near = did_you_mean(name, known) or f"; there are {', '.join(known)}"

@@ -37,6 +37,15 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
     """
+    return study_from(read_toml(path), path)
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """A specification's file as plain data.
+
+    Raises:
+        InvalidFile: if it cannot be read, is no TOML or has nothing in it.
+    """
     text = read_plain_text(path, MOST_BYTES)
     try:
         data = tomllib.loads(text)
@@ -48,6 +57,15 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
+    return data
+
+
+def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
+    """The study of a file's plain data.
+
+    Raises:
+        InvalidFile: naming the file, the key, what was expected and what came.
+    """
     for name in ("robots", "arms", "comparisons"):
         if isinstance(table := data.get(name), dict):
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")

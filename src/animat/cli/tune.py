@@ -1,0 +1,66 @@
+"""The command that searches for settings of a study."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class TuneFile:
+    """Search for the best settings of a study with one robot and one arm. Goes on where it stopped."""
+
+    specification: Positional[Path]
+    """The study's TOML file; its table [tune] says what is searched"""
+    workers: int | None = None
+    """Processes, each on its own core; default: one a core"""
+    out: Path = Path("tuning")
+    """Folder for everything; the settings found are best.toml in it"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Search."""
+        from animat.lined_up import lined_up
+        from animat.progress import Bar
+        from animat.tuning.search import expect_optuna
+        from animat.tuning.specification import read_tuning
+
+        tuning = read_tuning(self.specification)
+        expect_optuna()
+        from animat.tuning.results import BEST, HISTORY, IMPORTANCE, settings_in_words
+        from animat.tuning.run import tune
+
+        for caveat in tuning.study.robots[0].robot().caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+        cores = len(os.sched_getaffinity(0))
+        if self.workers is not None and self.workers > cores:
+            print(f"warning: --workers: {self.workers} were asked for; there is one a core, {cores}", file=sys.stderr)
+        began = time.monotonic()
+        with Bar("tuning") as progress:
+            tuned = tune(tuning, self.out, base=self.specification.parent, workers=self.workers, progress=progress)
+        cells = []
+        for final in sorted(tuned.finals, key=lambda each: -each.mean):
+            error = "" if final.standard_error is None else f"{final.standard_error:.1f}"
+            name = "own settings" if final.trial == 0 else f"trial {final.trial}"
+            mean = "diverged" if final.returns is None else f"{final.mean:.1f}"
+            cells.append([name, mean, error, settings_in_words(final.settings)])
+        policies, episodes = tuning.study.policies, tuning.study.episodes
+        print(f"trained anew, {policies} policies of each in {episodes} fresh episodes each:")
+        print("\n".join(lined_up(["", "mean return", "s.e.", "settings"], cells)))
+        if tuned.importance:
+            shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
+            print(f"importance: {shares}")
+        else:
+            print("importance: too few trials to tell")
+        pictures = [HISTORY, *([IMPORTANCE] if tuned.importance else [])]
+        counted = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
+        print(f"{len(tuned.told)} trials ({counted}) in {time.monotonic() - began:.0f} s")
+        print(f"best settings: {self.out / BEST}; figures: {', '.join(str(self.out / name) for name in pictures)}")
+        return {"folder": str(tuned.folder), "best_toml": str(self.out / BEST), **tuned.to_dict()}

@@ -1,0 +1,66 @@
+"""The history of a search: what every trial got, and how far it was trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import TYPE_CHECKING
+
+from animat.report.style import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY, add_common_legend, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MARKERS = "ov^sDP"
+
+
+def draw_history(
+    trials: Sequence[tuple[int, Sequence[int], Sequence[float]]],
+    rungs: Sequence[int],
+    best: tuple[int, float, float | None],
+    own: tuple[float, float | None] | None,
+    title: str,
+) -> Figure:
+    """A point a trial at what it got last, by how far it was trained; the best of whole trainings so far; the finals.
+
+    Args:
+        trials: number, and of each rung that it reached the chunks done then and the mean return; none if it diverged
+            before.
+        rungs: chunks done at the end of each rung, the whole training the last.
+        best: trial that won, its mean return trained anew and the standard error of that.
+        own: the same of the settings that the search began with; None where these learned no finite number.
+        title: of the figure.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(7.0, 3.8)
+    axes = figure.subplots()
+    colours = (GREY, SKY, ORANGE, PURPLE, BLACK)[: len(rungs) - 1]
+    whole = []
+    for rung, (chunks, colour) in enumerate(zip(rungs, (*colours, BLUE), strict=True)):
+        ended = [(number, means[-1]) for number, done, means in trials if done and done[-1] == chunks]
+        is_whole = chunks == rungs[-1]
+        label = "trained whole" if is_whole else f"stopped at {100 * chunks / rungs[-1]:.0f} %"
+        if ended:
+            marker, size = _MARKERS[len(rungs) - 1 - rung], 6 if is_whole else 4
+            axes.plot(*zip(*ended, strict=True), marker, color=colour, markersize=size, label=label)
+        whole = ended
+    if whole:
+        so_far = list(accumulate((mean for _, mean in whole), max))
+        last = max(number for number, _, _ in trials)
+        x = [*(number for number, _ in whole), last]
+        axes.step(x, [*so_far, so_far[-1]], where="post", color=BLUE, linewidth=1.2, label="best trained whole so far")
+    diverged = [number for number, done, _ in trials if not done]
+    if diverged:
+        low = axes.get_ylim()[0]
+        axes.plot(diverged, [low] * len(diverged), "x", color=RED, label="diverged")
+    if own is not None:
+        axes.axhline(own[0], color=BLACK, linestyle="--", linewidth=1, label="own settings, anew")
+    number, mean, error = best
+    axes.errorbar(
+        [number], [mean], yerr=[error or 0.0], fmt="*", color=RED, markersize=11, capsize=3, label="best, anew"
+    )
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style_axes(axes, title, "trial", "mean return of an episode")
+    add_common_legend(figure, [axes], columns=3)
+    return figure

@@ -1,0 +1,250 @@
+"""Running a tuning: generation after generation of trials, each told in order, and the best of them trained anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from animat.coding.checking import check_mapping
+from animat.coding.mapping import mapping_named
+from animat.errors import InvalidFile, UnusableData
+from animat.execution.jobs import Job, Jobs, expect_workers
+from animat.execution.pinned import PinnedProcesses
+from animat.execution.task import UNFINISHED
+from animat.progress import Part, Progress, Silent
+from animat.robots.checking import check_robot
+from animat.studies.draws import draw_seed
+from animat.studies.folder import source_files, sums_of
+from animat.studies.places import RECEIPTS
+from animat.studies.plan import ITERATIONS_PER_S
+from animat.studies.recording import JOB, Record
+from animat.training.group import split_groups
+from animat.training.specification import CHUNKS
+from animat.tuning.folder import describe_tuning, held
+from animat.tuning.journal import Told, read_journal, write_journal
+from animat.tuning.results import Final, Tuned, write_results
+from animat.tuning.search import Search, expect_optuna, importance_of
+from animat.tuning.space import own_settings, with_settings
+from animat.tuning.specification import Tuning
+from animat.tuning.tasks import Fit, TrainTrials, Trial, returns_file, same_shapes, timeline_file
+
+FINALS = "finals"
+
+
+def tune(
+    tuning: Tuning,
+    folder: str | os.PathLike[str],
+    *,
+    base: str | os.PathLike[str] = ".",
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Tuned:
+    """Search for settings into a folder, or go on with a search.
+
+    Killed at any moment and called again, it goes on; the journal and the results end the same, byte for byte, with any
+    number of workers. For that, trials are decided `together` at a time, and told in the order of their numbers.
+
+    Args:
+        tuning: the specification.
+        folder: where everything goes; made if it is missing.
+        base: what the specification's names of files are relative to.
+        workers: processes, each on a core of its own; None: one a core. Not with an executor.
+        executor: where tasks are run, in view of the folder; it stays open. None: processes on this machine.
+        progress: told how far it is, and what runs.
+
+    Raises:
+        Mismatch: if the folder is another tuning's, its recordings have changed, or another run is at work in it.
+        InvalidFile: if a file cannot be read or written.
+        InvalidArgument: for fewer workers than one, or any beside an executor.
+        UnusableData: if no trial learned anything finite.
+        AnimatError: if Optuna is not installed, or a task failed; its message names it.
+    """
+    expect_optuna()
+    expect_workers(workers, executor)
+    folder, base, progress = Path(folder).absolute(), Path(base).absolute(), progress or Silent()
+    _expect_ours_to_keep_to_the_contract(tuning)
+    manifest = describe_tuning(tuning, sums_of(source_files(tuning.study, base), base))
+    with held(folder, manifest), _running_on(executor, workers) as at:
+        run = _Run(tuning, folder, manifest["fingerprint"], at, progress)
+        run.fit(base)
+        told = run.search()
+        finals = run.finals(told)
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        return write_results(folder, tuning, told, finals, importance_of(tuning.space, told))
+
+
+class _Run:
+    """A tuning while it runs: its jobs, part after part, on one executor."""
+
+    def __init__(self, tuning: Tuning, folder: Path, fingerprint: str, at: Executor, progress: Progress) -> None:
+        self._tuning, self._folder, self._fingerprint, self._at = tuning, folder, fingerprint, at
+        tune = tuning.tune
+        self._progress, self._done_s = progress, 0.0
+        self._total_s = 20 + self._cost_s(tune.policies * tune.trials, CHUNKS) * 0.4
+        self._total_s += self._cost_s(tuning.study.policies * (tune.finalists + 1), CHUNKS)
+
+    def fit(self, base: Path) -> None:
+        """Have the recordings, and simulators of every kind that is searched."""
+        study, space = self._tuning.study, self._tuning.space
+        if not study.needs_neurons:
+            return
+        own = own_settings(study)
+        variants = [
+            with_settings(study, {"simulator": kind, "conditions": conditions})
+            for kind in {own["simulator"]: None, **dict.fromkeys(_choices(space.get("simulator")))}
+            for conditions in {own["conditions"]: None, **dict.fromkeys(_choices(space.get("conditions")))}
+        ]
+        fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
+        self._do([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
+
+    def search(self) -> list[Told]:
+        """All trials, from the journal as far as it goes."""
+        tune, search, known = self._tuning.tune, Search(self._tuning), read_journal(self._folder)
+        told: list[Told] = []
+        for first in range(0, tune.trials, tune.together):
+            asked = search.ask(min(tune.together, tune.trials - first))
+            generation = [Trial(first + i, settings) for i, settings in enumerate(asked)]
+            found = known[first : first + len(asked)]
+            place = f"{UNFINISHED}/from-{first}"
+            if len(found) < len(asked):
+                found = self._generation(generation, place)
+                told += found
+                write_journal(self._folder, told)
+            elif [each.settings for each in found] != asked:
+                raise InvalidFile(
+                    f"{self._folder}: expected the journal of this tuning, got one with other settings in trials "
+                    f"{first} to {first + len(asked) - 1}; remove it, and its trials are made again"
+                )
+            else:
+                told += found
+                self._done_s += 0.4 * self._cost_s(tune.policies * len(asked), CHUNKS)
+            # What its trials had learned is of no more use.
+            shutil.rmtree(self._folder / place, ignore_errors=True)
+            search.tell(found)
+        return told
+
+    def _generation(self, trials: Sequence[Trial], place: str) -> list[Told]:
+        """Successive halving: all trials up to the first rung, the best of them up to the next, and so on."""
+        tune = self._tuning.tune
+        seeds = draw_seed("tuning", tune.seed, "training"), draw_seed("tuning", tune.seed, "episodes")
+        members, rungs = tuple(range(tune.policies)), tune.chunks
+        chunks: dict[int, list[int]] = {trial.number: [] for trial in trials}
+        returns: dict[int, list[tuple[float, ...]]] = {trial.number: [] for trial in trials}
+        diverged, racing = set(), list(trials)
+        for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
+            jobs = [
+                Job(
+                    f"rung-{rung + 1}/trials-{'+'.join(str(trial.number) for trial in group)}",
+                    TrainTrials(
+                        self._tuning.study, group, members, seeds, tune.episodes, (first, last), place, last < CHUNKS
+                    ),
+                    (),
+                    self._cost_s(len(group) * len(members), last - first),
+                )
+                for group in same_shapes(racing, tune.policies)
+            ]
+            names = (
+                f"trials {trials[0].number} to {trials[-1].number} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
+            )
+            self._do(jobs, f"{place}/jobs", sum(job.cost_s for job in jobs), names)
+            for trial in racing:
+                got = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
+                if got is None:
+                    diverged.add(trial.number)
+                else:
+                    chunks[trial.number].append(last)
+                    returns[trial.number].append(tuple(got))
+            racing = [trial for trial in racing if trial.number not in diverged]
+            if last < CHUNKS:
+                ranked = sorted(racing, key=lambda trial: (-sum(returns[trial.number][-1]), trial.number))
+                goes_on = {trial.number for trial in ranked[: -(-len(trials) // tune.keep ** (rung + 1))]}
+                # The study's own settings go the whole way, to compare with.
+                racing = [trial for trial in racing if trial.number in goes_on or trial.number == 0]
+        complete = {trial.number for trial in racing}
+        return [
+            Told(
+                trial.number,
+                trial.settings,
+                "diverged" if trial.number in diverged else "complete" if trial.number in complete else "stopped",
+                tuple(chunks[trial.number]),
+                tuple(returns[trial.number]),
+            )
+            for trial in trials
+        ]
+
+    def finals(self, told: Sequence[Told]) -> list[Final]:
+        """The study's own settings and the best trials, trained anew with the study's policies, in fresh episodes."""
+        tune, study = self._tuning.tune, self._tuning.study
+        complete = [each for each in told if each.state == "complete"]
+        if not complete:
+            raise UnusableData(
+                f"{self._folder}: expected a trial of finite returns, got none of {len(told)}: search among smaller "
+                "learning rates and reward scales"
+            )
+        ranked = sorted(complete, key=lambda each: (-each.means[-1], each.trial))
+        others = [each for each in ranked if each.trial != 0][: tune.finalists]
+        finalists = [Trial(0, told[0].settings), *(Trial(each.trial, each.settings) for each in others)]
+        seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
+        jobs = [
+            Job(
+                f"final/trial-{trial.number}/p{members[0]}",
+                TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS, False),
+                (),
+                self._cost_s(len(members), CHUNKS),
+            )
+            for trial in finalists
+            for members in split_groups(study.policies)
+        ]
+        self._do(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "the best and the study's own settings, anew")
+        finals = []
+        for trial in finalists:
+            returns: list[float] | None = []
+            for members in split_groups(study.policies):
+                got = json.loads(returns_file(self._folder / FINALS, trial, CHUNKS, members[0]).read_text())
+                returns = None if got is None or returns is None else returns + got
+            finals.append(Final(trial.number, trial.settings, None if returns is None else tuple(returns)))
+        if all(each.returns is None for each in finals):
+            raise UnusableData(f"{self._folder}: expected finite returns of the best trials, got none")
+        return finals
+
+    def _do(self, jobs: list[Job], receipts: str, cost_s: float, words: str) -> None:
+        left = Jobs(jobs, self._folder, self._folder / receipts, self._fingerprint)
+        if left.waiting:
+            part = Part(self._progress, self._done_s, cost_s, max(self._total_s, self._done_s + cost_s), words)
+            left.run(workers=None, executor=self._at, progress=part)
+        self._done_s += cost_s
+
+    def _cost_s(self, policies: int, chunks: int) -> float:
+        return policies * self._tuning.study.robots[0].trained_for * chunks / CHUNKS / ITERATIONS_PER_S
+
+
+def _choices(among: Any) -> tuple[Any, ...]:
+    return among if isinstance(among, tuple) else ()
+
+
+def _expect_ours_to_keep_to_the_contract(tuning: Tuning) -> None:
+    """Robots and mappings of one's own are looked at before there is a folder."""
+    spec = tuning.study.robots[0]
+    if ":" in spec.kind:
+        check_robot(spec.robot())
+    arm = tuning.study.arms[0]
+    for mapping in (arm.mapping, *_choices(tuning.space.get("mapping"))):
+        if ":" in mapping:
+            check_mapping(mapping_named(mapping))
+
+
+@contextmanager
+def _running_on(executor: Executor | None, workers: int | None) -> Iterator[Executor]:
+    """The executor that was lent, or processes of ours, which stay from one part of the work to the next."""
+    if executor is not None:
+        yield executor
+        return
+    with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours:
+        yield ours

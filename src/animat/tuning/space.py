@@ -1,0 +1,159 @@
+"""What is searched: settings by name, each in a range or among choices; and a study with settings put in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+from animat.coding.mapping import mapping_named
+from animat.errors import InvalidArgument, did_you_mean, shown
+from animat.records import Flag, Number, read_record, record
+from animat.studies.specification import Study
+from animat.training.settings import SAC
+
+NUMBERS = (
+    "learning_rate",
+    "discount",
+    "tau",
+    "reward_scale",
+    "initial_alpha",
+    "target_entropy_ratio",
+    "entropy_nats",
+)
+"""Settings of the algorithm that a compiled program takes as numbers: trials that differ in nothing else share one."""
+THROUGH_NEURONS = ("mapping", "simulator", "conditions")
+SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
+
+Value = float | int | str
+Settings = dict[str, Value]
+"""Settings by name: of the algorithm, and `mapping`, `simulator`, `conditions`."""
+
+
+@record
+class Range:
+    """Numbers from `low` to `high`; with `log` evenly in their logarithm. Whole ones for settings that are counts."""
+
+    low: Number
+    high: Number
+    log: Flag = False
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise InvalidArgument(f"high: expected more than low ({self.low:g}), got {self.high:g}")
+        if self.log and self.low <= 0:
+            raise InvalidArgument(f"low: expected more than 0 with log = true, got {self.low:g}")
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, int | float) and self.low <= value <= self.high
+
+
+Space = dict[str, Range | tuple[Value, ...]]
+
+USUAL: Space = {
+    "learning_rate": Range(1e-4, 1e-2, True),
+    "discount": Range(0.9, 0.999),
+    "tau": Range(1e-3, 5e-2, True),
+    "reward_scale": Range(0.02, 1.0, True),
+    "initial_alpha": Range(0.01, 1.0, True),
+    "target_entropy_ratio": Range(0.02, 0.5, True),
+    "mapping": ("1-threshold", "9-thresholds", "linear"),
+    "simulator": ("histogram", "empirical", "memory"),
+}
+"""Where nothing else is said; of each as far as it concerns the study, and widened to hold its own setting."""
+
+
+def usual_space(study: Study) -> Space:
+    """The usual search of a study with one robot and one arm."""
+    space: Space = {}
+    through = study.arms[0].through_neurons
+    usual: Space = dict(USUAL)
+    if not through and study.robots[0].robot().baseline_commands is None:
+        del usual["target_entropy_ratio"]
+        usual["entropy_nats"] = Range(-3.0, 0.5)
+    for name, among in usual.items():
+        if name in THROUGH_NEURONS and not through:
+            continue
+        own: Any = own_settings(study)[name]
+        if isinstance(among, Range):
+            # The logarithm of nothing is none: such a setting is searched evenly.
+            low, high, log = min(among.low, own), max(among.high, own), among.log and own > 0
+            space[name] = Range(low, high, log)
+        else:
+            space[name] = among if own in among else (own, *among)
+    return space
+
+
+def read_space(given: Mapping[str, Any], study: Study) -> Space:
+    """The search of a file's `[tune.search]`: tables `{ low, high, log }` and lists of choices, by name.
+
+    Raises:
+        InvalidArgument: for a setting that cannot be searched, a range or choices that are none, a value that the
+            setting may not have, or a search that does not hold the study's own setting, with which it begins.
+    """
+    if not given:
+        raise InvalidArgument("tune.search: expected at least one setting to search for, got none")
+    space: Space = {}
+    for name, among in given.items():
+        where = f"tune.search.{name}"
+        if name not in SEARCHABLE:
+            near = did_you_mean(name, SEARCHABLE) or f"; there are {', '.join(SEARCHABLE)}"
+            raise InvalidArgument(f"tune.search: expected names of settings, got {shown(name)}{near}")
+        if name in THROUGH_NEURONS and not study.arms[0].through_neurons:
+            raise InvalidArgument(f"{where}: expected none without neurons (mapping = 'none')")
+        if isinstance(among, dict):
+            if name in THROUGH_NEURONS:
+                raise InvalidArgument(f"{where}: expected a list of choices, got a range")
+            space[name] = read_record(Range, among, where)
+        elif isinstance(among, list) and len(among) > 1 and len({repr(each) for each in among}) == len(among):
+            space[name] = tuple(among)
+        else:
+            raise InvalidArgument(
+                f"{where}: expected a range {{ low = ..., high = ... }} or a list of two or more different choices, "
+                f"got {shown(among)}"
+            )
+        _expect_possible(study, name, space[name], where)
+        own = own_settings(study)[name]
+        if own not in space[name]:
+            raise InvalidArgument(
+                f"{where}: expected it to hold the study's own setting, {own!r}, which is tried first; got "
+                f"{shown(given[name])}"
+            )
+    return space
+
+
+def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], where: str) -> None:
+    """That the study could be run with every setting of the search: a range is possible where its ends are."""
+    for value in (among.low, among.high) if isinstance(among, Range) else among:
+        try:
+            if isinstance(value, float) and isinstance(own_settings(study)[name], int) and value.is_integer():
+                value = int(value)
+            if name == "mapping" and value == "none":
+                raise InvalidArgument("expected mappings, got 'none'; without neurons nothing else is comparable")
+            tried = with_settings(study, {name: value})
+            if name == "mapping":
+                mapping_named(tried.arms[0].mapping)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"{where}: {error}") from error
+
+
+def own_settings(study: Study) -> dict[str, Any]:
+    """What a study of one robot and one arm has for every setting that can be searched."""
+    algorithm = asdict(SAC(**study.algorithm))  # type: ignore[arg-type]
+    kind, conditions = study.simulators.kind, study.simulators.conditions
+    own: dict[str, Any] = {**algorithm, "mapping": study.arms[0].mapping, "simulator": kind, "conditions": conditions}
+    return own
+
+
+def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
+    """The study with settings in place of its own.
+
+    Raises:
+        InvalidArgument: for a value that a setting may not have.
+    """
+    changed: dict[str, Any] = dict(settings)
+    arm, simulators = study.arms[0], study.simulators
+    arm = replace(arm, mapping=changed.pop("mapping", arm.mapping))
+    kind, conditions = changed.pop("simulator", simulators.kind), changed.pop("conditions", simulators.conditions)
+    simulators = replace(simulators, kind=kind, conditions=conditions)
+    return replace(study, arms=(arm,), simulators=simulators, algorithm={**study.algorithm, **changed})
