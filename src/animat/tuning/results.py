@@ -106,8 +106,7 @@ def write_results(
     save_figure(draw_history(rungs, tuning.tune.chunks, chosen, reference, f"Tuning on {robot}"), folder / HISTORY)
     if importance:
         first = tuning.tune.chunks[0] / tuning.tune.chunks[-1]
-        what = "the whole training" if first == 1 else f"{100 * first:.0f} % of the training"
-        title = f"What mattered for the return after {what}, on {robot}"
+        title = f"{robot}: importance for the return after {100 * first:.0f} % of training"
         save_figure(draw_importance(importance, title), folder / IMPORTANCE)
     return tuned
 

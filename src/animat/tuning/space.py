@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from typing import Any
@@ -23,6 +24,8 @@ NUMBERS = (
 )
 """Settings of the algorithm that a compiled program takes as numbers: trials that differ in nothing else share one."""
 THROUGH_NEURONS = ("mapping", "simulator", "conditions")
+FITTING = ("environments", "replay")
+"""Settings of the algorithm that depend on each other: one is a multiple of the other."""
 SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
 
 Value = float | int | str
@@ -102,8 +105,8 @@ def read_space(given: Mapping[str, Any], study: Study) -> Space:
         if name in THROUGH_NEURONS and not study.arms[0].through_neurons:
             raise InvalidArgument(f"{where}: expected none without neurons (mapping = 'none')")
         if isinstance(among, dict):
-            if name in THROUGH_NEURONS:
-                raise InvalidArgument(f"{where}: expected a list of choices, got a range")
+            if name in (*THROUGH_NEURONS, *FITTING):
+                raise InvalidArgument(f"{where}: expected a list of choices, got a table")
             space[name] = read_record(Range, among, where)
         elif isinstance(among, list) and len(among) > 1 and len({repr(each) for each in among}) == len(among):
             space[name] = tuple(among)
@@ -112,14 +115,27 @@ def read_space(given: Mapping[str, Any], study: Study) -> Space:
                 f"{where}: expected a range {{ low = ..., high = ... }} or a list of two or more different choices, "
                 f"got {shown(among)}"
             )
-        _expect_possible(study, name, space[name], where)
+        if name not in FITTING:
+            _expect_possible(study, name, space[name], where)
         own = own_settings(study)[name]
         if own not in space[name]:
             raise InvalidArgument(
                 f"{where}: expected it to hold the study's own setting, {own!r}, which is tried first; got "
                 f"{shown(given[name])}"
             )
+    _expect_fitting(study, space)
     return space
+
+
+def _expect_fitting(study: Study, space: Space) -> None:
+    """That whatever is chosen of settings that depend on each other fits."""
+    own = own_settings(study)
+    among = [value if isinstance(value := space.get(name), tuple) else (own[name],) for name in FITTING]
+    for chosen in itertools.product(*among):
+        try:
+            with_settings(study, dict(zip(FITTING, chosen, strict=True)))
+        except InvalidArgument as error:
+            raise InvalidArgument(f"tune.search: {error}") from error
 
 
 def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], where: str) -> None:

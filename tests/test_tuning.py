@@ -1,0 +1,278 @@
+"""Tuning: the same journal whatever happens, the better ones go on, and one program for many settings."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.cli import _parse, main
+from animat.cli.named_numbers import read_sac
+from animat.cli.train import Train
+from animat.errors import AnimatError, InvalidFile, Mismatch
+from animat.neurons.synthetic import synthetic_simulator
+from animat.studies.toml import read_study
+from animat.training.group import programs
+from animat.training.settings import SAC
+from animat.training.specification import Training
+from animat.tuning import tasks
+from animat.tuning.journal import JOURNAL, Told, read_journal
+from animat.tuning.results import BEST, HISTORY, RESULTS, Tuned
+from animat.tuning.run import tune
+from animat.tuning.side_by_side import SideBySide
+from animat.tuning.space import Range, with_settings
+from animat.tuning.specification import Tuning, read_tuning, tuning_of
+from animat.tuning.tasks import Trial, same_shapes
+
+pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")
+
+TINY = Path(__file__).parent / "tiny_tuning.toml"
+SMALL = SAC(environments=8, gradient_steps=2, batch=16, replay=512, hidden=8)
+
+
+class Ends(ThreadPoolExecutor):
+    """An executor in this process that does a number of tasks, and then fails, as a machine does."""
+
+    def __init__(self, room: int) -> None:
+        super().__init__(1)
+        self.room = room
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return super().submit(self._within_room, fn, *args, **kwargs)
+
+    def _within_room(self, fn: Any, *args: Any, **kwargs: Any) -> Any:
+        self.room -= 1
+        if self.room < 0:
+            raise AnimatError("the machine is gone")
+        return fn(*args, **kwargs)
+
+
+def run(folder: Path, executor: Executor | None = None, tuning: Tuning | None = None) -> Tuned:
+    """In this process, where programs are compiled once."""
+    with ThreadPoolExecutor(1) as own:
+        return tune(tuning or read_tuning(TINY), folder, base=TINY.parent, executor=executor or own)
+
+
+def left(folder: Path) -> dict[str, bytes]:
+    """What a search leaves to be read; the recordings have dates of their own."""
+    names = [JOURNAL, BEST, RESULTS, HISTORY, "tune.json", *(f"finals/{f.name}" for f in (folder / "finals").iterdir())]
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tunings") / "tiny"
+    run(folder)
+    return folder
+
+
+def test_stopped_after_every_few_tasks_it_ends_in_the_same_bytes(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each time with room for five tasks more than all before, and after each chunk a checkpoint to go on from."""
+    monkeypatch.setattr(tasks, "CHECKPOINT_S", -1.0)
+    stops = 0
+    for _ in range(30):
+        try:
+            with Ends(5) as executor:
+                run(tmp_path / "out", executor)
+            break
+        except AnimatError as error:
+            assert "the machine is gone" in str(error)
+            stops += 1
+    assert stops >= 2
+    assert left(tmp_path / "out") == left(finished)
+    assert not (tmp_path / "out" / ".unfinished").exists()
+
+
+def test_a_trial_that_was_stopped_between_two_chunks_goes_on_from_there(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "CHECKPOINT_S", -1.0)
+    trained, train = [], SideBySide.train
+
+    def fails_now_and_then(self: SideBySide, first: int, last: int, simulator: Any) -> None:
+        trained.append(first)
+        if len(trained) in (7, 40, 90):
+            raise AnimatError("out of power")
+        train(self, first, last, simulator)
+
+    monkeypatch.setattr(SideBySide, "train", fails_now_and_then)
+    for _ in range(3):
+        with pytest.raises(AnimatError, match="out of power"):
+            run(tmp_path / "out")
+        # What it was about to train is what comes next.
+        before = trained[-1]
+        assert list((tmp_path / "out" / ".unfinished").rglob("*-of-60.npz"))
+        trained.append(before)
+    run(tmp_path / "out")
+    assert left(tmp_path / "out") == left(finished)
+
+
+def test_the_better_ones_of_each_generation_go_on_and_the_study_s_own_settings_always(finished: Path) -> None:
+    told, settings = read_journal(finished), read_tuning(TINY).tune
+    assert [each.trial for each in told] == list(range(7))
+    for first in (0, 4):
+        generation = told[first : first + 4]
+        ranked = sorted(generation, key=lambda each: -each.means[0])
+        # One in three of four or of three, more than that never but for the study's own.
+        n = -(-len(generation) // settings.keep)
+        on = {each.trial for each in ranked[:n]} | ({0} if first == 0 else set())
+        assert {each.trial for each in generation if each.state == "complete"} == on
+    assert all(each.chunks == ((20, 60) if each.state == "complete" else (20,)) for each in told)
+    assert told[0].settings == {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
+
+
+def test_the_best_is_a_study_and_a_training_of_the_settings_that_won(finished: Path) -> None:
+    results = json.loads((finished / RESULTS).read_text())
+    best = max(results["finals"], key=lambda row: row["mean_return"])
+    assert results["best"] == {"trial": best["trial"], "settings": best["settings"]}
+    assert {row["trial"] for row in results["finals"]} >= {0}
+    study = read_study(finished / BEST)
+    assert study == with_settings(read_tuning(TINY).study, best["settings"])
+    command = _parse((finished / BEST).read_text().splitlines()[0].removeprefix("# animat ").split())
+    assert isinstance(command, Train)
+    assert read_sac(command.sac) == SAC(**study.algorithm)  # type: ignore[arg-type]
+    assert (command.simulator, command.mapping) == (study.simulators.kind, study.arms[0].mapping)
+
+
+def test_a_finished_folder_is_told_again_and_nothing_is_trained(finished: Path) -> None:
+    before = {file: file.stat().st_mtime_ns for file in (finished / "finals").iterdir()}
+    with Ends(0) as executor:
+        assert run(finished, executor).best.mean > -100
+    assert before == {file: file.stat().st_mtime_ns for file in (finished / "finals").iterdir()}
+
+
+def test_a_folder_of_another_search_is_refused_and_so_is_a_journal_of_one(finished: Path, tmp_path: Path) -> None:
+    tuning = read_tuning(TINY)
+    with pytest.raises(Mismatch, match=r"tune\.seed"):
+        run(finished, tuning=replace(tuning, tune=replace(tuning.tune, seed=9)))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "tune.json").write_bytes((finished / "tune.json").read_bytes())
+    changed = (finished / JOURNAL).read_text().replace('"learning_rate": 0.001,', '"learning_rate": 0.002,', 1)
+    (out / JOURNAL).write_text(changed)
+    with pytest.raises(InvalidFile, match="other settings in trials 0 to 3"):
+        run(out)
+    (out / JOURNAL).write_text(changed[:100])
+    with pytest.raises(InvalidFile, match="journal"):
+        run(out)
+
+
+def test_a_trial_that_diverges_is_the_worst_and_leaves_the_others_as_they_are(tmp_path: Path) -> None:
+    """Side by side in one program: those beside it get what they get beside one that learns."""
+    plain = read_tuning(TINY)
+    search = {"learning_rate": [1e-3, 1e30], "discount": {"low": 0.9, "high": 0.999}}
+    made = tuning_of(plain.study, replace(plain.tune, trials=4, finalists=1, search=search))
+    run(tmp_path / "out", tuning=made)
+    told = read_journal(tmp_path / "out")
+    for each in told:
+        assert (each.state == "diverged") == (each.settings["learning_rate"] == 1e30)
+    assert {each.state for each in told} >= {"complete", "diverged"}
+    # From the same random numbers, the study's own settings get the same beside whatever else.
+    assert read_journal(tmp_path / "out")[0].state == "complete"
+
+
+@pytest.mark.parametrize("mapping", ["9-thresholds", None])
+def test_settings_as_arrays_train_as_those_that_are_compiled_in(mapping: str | None) -> None:
+    """Against the program of ordinary training, one for each of the settings; alike but for rounding."""
+    algorithms = [
+        SMALL,
+        replace(SMALL, learning_rate=3e-3, discount=0.7, tau=0.2, reward_scale=0.5),
+        replace(SMALL, initial_alpha=0.7, target_entropy_ratio=0.6, entropy_nats=-0.3),
+    ]
+    training = Training("navigation", mapping, policies=2, iterations=8 * 40, seed=4)
+    simulator = None if mapping is None else synthetic_simulator()
+    n_conditions = 0 if mapping is None else 5
+    together = SideBySide(training, n_conditions, algorithms, (0, 1))
+    together.begin()
+    together.train(0, 12, simulator)
+    found = []
+    for i, algorithm in enumerate(algorithms):
+        beginning, chunk = programs(training.environment(n_conditions), algorithm)
+        keys = jnp.stack([jax.random.fold_in(jax.random.key(4), member) for member in (0, 1)])
+        learners, _ = chunk(beginning(keys), simulator, jnp.int32(0), jnp.int32(12))
+        networks = together.networks(i, greedy=True)
+        assert networks is not None
+        for ours, theirs in zip(networks.network, learners.deployed, strict=True):
+            np.testing.assert_allclose(ours.weight, theirs.weight, rtol=2e-3, atol=2e-5)
+            np.testing.assert_allclose(ours.bias, theirs.bias, rtol=2e-3, atol=2e-5)
+        found.append(np.asarray(networks.network[0].weight))
+    # Settings that made no difference would pass, too.
+    assert np.abs(found[0] - found[1]).max() > 1e-3 and np.abs(found[0] - found[2]).max() > 1e-5
+
+
+@pytest.mark.parametrize("policies", [1, 2, 3, 7])
+def test_trials_of_one_program_are_together_five_policies_at_most(policies: int) -> None:
+    rng = random.Random(policies)
+    for n in range(1, 12):
+        among = [
+            Trial(
+                i, {"tau": rng.random(), "mapping": rng.choice(["linear", "1-threshold"]), "batch": rng.choice([8, 9])}
+            )
+            for i in range(n)
+        ]
+        groups = same_shapes(among, policies)
+        assert sorted(trial.number for group in groups for trial in group) == list(range(n))
+        for group in groups:
+            assert len(group) * policies <= max(5, policies)
+            assert len({(t.settings["mapping"], t.settings["batch"]) for t in group}) == 1
+
+
+def test_importance_finds_the_setting_that_decides() -> None:
+    from animat.tuning.search import importance_of
+
+    rng = np.random.default_rng(1)
+    space = {"tau": Range(0.0, 1.0), "discount": Range(0.0, 1.0), "mapping": ("linear", "1-threshold")}
+    told = []
+    for i in range(60):
+        settings: Any = {"tau": rng.random(), "discount": rng.random(), "mapping": ("linear", "1-threshold")[i % 2]}
+        returns = -((settings["tau"] - 0.3) ** 2) + 1e-3 * rng.random()
+        told.append(Told(i, settings, "complete", (60,), ((float(returns),),)))
+    shares = importance_of(space, told)
+    assert next(iter(shares)) == "tau" and shares["tau"] > 0.8
+    assert sum(shares.values()) == pytest.approx(1)
+    assert importance_of(space, told[:3]) == {}
+
+
+@pytest.mark.oracle
+def test_killed_five_times_with_two_workers_it_ends_in_the_same_bytes(finished: Path, tmp_path: Path) -> None:
+    """By SIGKILL, at any moment, in processes of their own; the other was one thread in this process."""
+    command = [sys.executable, "-m", "animat", "tune", str(TINY), "--out", str(tmp_path / "out")]
+    rng, kills = random.Random(5), 0
+    while kills < 5:
+        began = subprocess.Popen([*command, "--workers", "1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(rng.uniform(3, 9))
+        if began.poll() is not None:
+            break
+        os.kill(began.pid, signal.SIGKILL)
+        began.wait()
+        kills += 1
+    assert kills >= 2
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    assert left(tmp_path / "out") == left(finished)
+
+
+def test_the_command_prints_what_was_found(
+    finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["tune", str(TINY), "--out", str(finished), "--json"]) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    told = json.loads(last)
+    assert told["trials"] == {"complete": 4, "stopped": 3, "diverged": 0}
+    assert any("own settings" in line for line in lines)
+    assert any(line.startswith("importance: ") for line in lines)
+    assert any(str(finished / BEST) in line for line in lines)
