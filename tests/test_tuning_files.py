@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -46,6 +47,19 @@ def test_without_neurons_continuous_commands_are_tuned_by_their_own_entropy(tmp_
     text = '[[robots]]\nname = "navigation"\n[[arms]]\nname = "none at all"\nmapping = "none"\n'
     space = read_tuning(written(tmp_path, text)).space
     assert "entropy_nats" in space and "target_entropy_ratio" not in space
+
+
+def test_the_page_s_example_is_a_tuning_and_its_defaults_are_the_code_s(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "tuning.md").read_text()
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    tuning = read_tuning(written(tmp_path, example))
+    assert tuning.space["batch"] == (32, 64, 128) and tuning.tune.trials == 40
+    usual = Tune()
+    for names in (["trials"], ["together"], ["policies", "episodes"], ["rungs", "keep"], ["finalists"], ["seed"]):
+        row = (
+            f"| {', '.join(f'`{name}`' for name in names)} | {', '.join(str(getattr(usual, name)) for name in names)} |"
+        )
+        assert row in page
 
 
 @pytest.mark.parametrize(("rungs", "keep", "chunks"), [(1, 3, [60]), (2, 2, [30, 60]), (3, 3, [7, 20, 60])])
