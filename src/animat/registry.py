@@ -12,7 +12,7 @@ import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from animat.errors import InvalidArgument, did_you_mean, first_line, shown
 
@@ -21,6 +21,19 @@ Thing = TypeVar("Thing")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}")
 _PLACE = re.compile(r"[\w.]{1,200}:[\w.<>]{1,200}")
 _IN_MEMORY = "train in memory: train(training, timeline, None)"
+
+
+class Family(Protocol):
+    """A class whose things are each something of others, by its own name there: `gymnasium:Pendulum-v1`.
+
+    A thing's `name` is the family's, a colon, and its own. In files it is one of the family with all its parameters.
+    """
+
+    def named(self, own_name: str, /, **parameters: Any) -> Any:
+        """The one of this name, with these parameters in place of its defaults."""
+
+    def __call__(self, **parameters: Any) -> Any:
+        """The one with all of these parameters, nothing of which is looked up."""
 
 
 _registries: dict[type, Registry[Any]] = {}
@@ -43,6 +56,7 @@ class Registry(Generic[Thing]):
         self.noun, self.entry_points = noun, f"animat.{noun}s"
         self._base, self._ours, self._reserved = base, dict(ours or {}), (*(ours or {}), *reserved)
         self._registered: dict[str, type[Thing]] = {}
+        self._families: dict[str, Family] = {}
         self.kinds: Mapping[str, type[Thing]] = MappingProxyType(self._registered)
         """What is registered so far, by name."""
         _registries[base] = self
@@ -80,6 +94,10 @@ class Registry(Generic[Thing]):
             # In a worker, __main__ is the worker: what a script defines is found there by the name of its file.
             copyreg.pickle(kind, self._reduced)
 
+    def add_family(self, name: str, family: Family) -> None:
+        """Make things known whose names begin with the family's and a colon."""
+        self._families[name] = family
+
     def named(self, name: str, /, **parameters: Any) -> Thing:
         """The one of this name, with these parameters in place of its defaults.
 
@@ -94,6 +112,8 @@ class Registry(Generic[Thing]):
         """
         if isinstance(name, str) and name in self._ours and not parameters:
             return self._ours[name]
+        if (family := self._family_of(name)) is not None:
+            return family.named(name.partition(":")[2], **parameters)  # type: ignore[no-any-return]
         kind = self.class_named(name)
         known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
         for parameter in parameters:
@@ -117,7 +137,14 @@ class Registry(Generic[Thing]):
 
     def name_of(self, name: str) -> str:
         """The name of what is named so; errors as those of `named`."""
+        if self._family_of(name) is not None:
+            # Whoever names it has it looked up, so that what it is made of is imported.
+            return str(self.named(name).name)  # type: ignore[attr-defined]
         return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]
+
+    def _family_of(self, name: Any) -> Family | None:
+        family, colon, _ = str(name).partition(":")
+        return self._families.get(family) if colon else None
 
     def class_named(self, name: str) -> type[Thing]:
         """The class of this name; arguments and errors as those of `named`."""
@@ -134,7 +161,8 @@ class Registry(Generic[Thing]):
 
         Of one that is not ours it also says where it is imported from: `"import": "my_package.robots:Rover"`.
         """
-        data = {"name": thing.name, "parameters": dataclasses.asdict(thing)}  # type: ignore[attr-defined, call-overload]
+        name = thing.name if self._family_of(thing.name) is None else thing.name.partition(":")[0]  # type: ignore[attr-defined]
+        data = {"name": name, "parameters": dataclasses.asdict(thing)}  # type: ignore[call-overload]
         return data if is_ours(thing) else data | {"import": place_of(type(thing))}
 
     def from_dict(self, data: Mapping[str, Any]) -> Thing:
@@ -160,7 +188,13 @@ class Registry(Generic[Thing]):
                 f"{noun}: expected one that is registered, got {shown(data['name'])}: import {place.partition(':')[0]} "
                 f"first (on the command line: --{noun} {place})"
             )
-        return self.named(data["name"], **{name: _frozen(value) for name, value in data["parameters"].items()})
+        parameters = {name: _frozen(value) for name, value in data["parameters"].items()}
+        if data["name"] in self._families:
+            try:
+                return self._families[data["name"]](**parameters)  # type: ignore[no-any-return]
+            except TypeError as error:
+                raise InvalidArgument(f"{data['name']}: expected its parameters, got {first_line(error)}") from error
+        return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:
         """Refuse what a file could name and nothing could give back.
@@ -173,7 +207,7 @@ class Registry(Generic[Thing]):
             InvalidArgument: for one that is not registered, or that no worker could import.
         """
         noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
-        if name in self._ours and self._ours[name] == thing:
+        if (name in self._ours and self._ours[name] == thing) or self._family_of(name) is not None:
             return
         is_registered = self._registered.get(name) is kind
         if not is_registered or self.from_dict(json.loads(json.dumps(self.to_dict(thing)))) != thing:

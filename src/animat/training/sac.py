@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.scipy.special import ndtri
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
@@ -253,9 +253,7 @@ def train_chunk(
         The learner after the chunk, and the episodes that ended in it.
     """
     # The uniforms that a round acts with and learns with: one block, drawn at once.
-    acting = (settings.environments, environment.n_drawn + environment.noise_size)
-    blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
-    learning = (settings.gradient_steps, blocks, settings.batch)
+    acting, learning = uniforms_of(environment, settings)
     n_acting = math.prod(acting)
 
     def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
@@ -267,13 +265,22 @@ def train_chunk(
             environment, settings, learner, simulator, written, uniforms[:n_acting].reshape(acting), reset_key
         )
         available = jnp.minimum(written + settings.environments, settings.replay)
-        learner = _learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
-        learner = learner._replace(key=key, deployed=_average(settings, learner.deployed, learner.trained.actor, index))
+        learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
+        learner = learner._replace(key=key, deployed=average(settings, learner.deployed, learner.trained.actor, index))
         return learner, jax.tree.map(jnp.add, before, finished)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
     trained: tuple[Learner, Finished] = jax.lax.fori_loop(first_round, last_round, one_round, (learner, nothing))
     return trained
+
+
+def uniforms_of(environment: Environment[Any], settings: SAC) -> tuple[tuple[int, int], tuple[int, int, int]]:
+    """The shapes of the uniforms that a round acts with, and learns with."""
+    blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
+    return (
+        (settings.environments, environment.n_drawn + environment.noise_size),
+        (settings.gradient_steps, blocks, settings.batch),
+    )
 
 
 def _act(
@@ -286,20 +293,13 @@ def _act(
     reset_key: PRNGKeyArray,
 ) -> tuple[Learner, Finished]:
     """One step of every environment, remembered in the replay; ended episodes start anew."""
-    scales, n_drawn = environment.scales, environment.n_drawn
-
-    def state_of(episodes: State) -> Float[Array, "environments state"]:
-        left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
-        return jnp.concatenate([jax.vmap(environment.observe)(episodes) / scales, left], axis=1)
-
-    state = state_of(learner.episodes)
+    n_drawn = environment.n_drawn
+    state = state_of(environment, learner.episodes)
     action = draw_action(environment, learner.trained.actor, state[:, :-1], uniforms[:, :n_drawn])
     noise = uniforms[:, n_drawn:]
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = jnp.logical_or(*after.ended)
-    of_action = action.reshape(len(state), n_drawn).astype(jnp.float32)
-    row = jnp.stack([settings.reward_scale * after.reward, ended], axis=1, dtype=jnp.float32)
-    rows = jnp.concatenate([state, state_of(after), of_action, row], axis=1)
+    rows = transitions(settings, state, state_of(environment, after), action, after.reward, ended)
 
     returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
@@ -309,6 +309,26 @@ def _act(
         returns=jnp.where(ended, 0.0, returns),
     )
     return learner, Finished(jnp.sum(ended, dtype=jnp.float32), jnp.sum(jnp.where(ended, returns, 0.0)))
+
+
+def state_of(environment: Environment[Any], episodes: State) -> Float[Array, "environments state"]:
+    """What the critics see of episodes: scaled observations, and the time left."""
+    left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
+    return jnp.concatenate([jax.vmap(environment.observe)(episodes) / environment.scales, left], axis=1)
+
+
+def transitions(
+    settings: SAC,
+    state: Float[Array, "environments state"],
+    next_state: Float[Array, "environments state"],
+    action: Array,
+    reward: Float[Array, " environments"],
+    ended: Bool[Array, " environments"],
+) -> Float[Array, "environments row"]:
+    """Rows of the replay: what `Batch` is unpacked from."""
+    of_action = action.reshape(len(state), -1).astype(jnp.float32)
+    row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
+    return jnp.concatenate([state, next_state, of_action, row], axis=1)
 
 
 def draw_action(
@@ -335,7 +355,7 @@ def as_commands(
     return actions[:, 0] if environment.robot.n_commands == 1 else actions
 
 
-def _learn(
+def learn(
     environment: Environment[Any],
     settings: SAC,
     learner: Learner,
@@ -370,7 +390,7 @@ def _learn(
     return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
 
 
-def _average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
+def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
     """Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824): it forgets in proportion to its age.
 
     The last actor of a training is as good as its last few updates were lucky; the average is not. With k the
