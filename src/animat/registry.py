@@ -12,7 +12,7 @@ import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from animat.errors import InvalidArgument, did_you_mean, first_line, shown
 
@@ -21,19 +21,6 @@ Thing = TypeVar("Thing")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}")
 _PLACE = re.compile(r"[\w.]{1,200}:[\w.<>]{1,200}")
 _IN_MEMORY = "train in memory: train(training, timeline, None)"
-
-
-class Family(Protocol):
-    """A class whose things are each something of others, by its own name there: `gymnasium:Pendulum-v1`.
-
-    A thing's `name` is the family's, a colon, and its own. In files it is one of the family with all its parameters.
-    """
-
-    def named(self, own_name: str, /, **parameters: Any) -> Any:
-        """The one of this name, with these parameters in place of its defaults."""
-
-    def __call__(self, **parameters: Any) -> Any:
-        """The one with all of these parameters, nothing of which is looked up."""
 
 
 _registries: dict[type, Registry[Any]] = {}
@@ -56,7 +43,7 @@ class Registry(Generic[Thing]):
         self.noun, self.entry_points = noun, f"animat.{noun}s"
         self._base, self._ours, self._reserved = base, dict(ours or {}), (*(ours or {}), *reserved)
         self._registered: dict[str, type[Thing]] = {}
-        self._families: dict[str, Family] = {}
+        self._families: dict[str, type[Any]] = {}
         self.kinds: Mapping[str, type[Thing]] = MappingProxyType(self._registered)
         """What is registered so far, by name."""
         _registries[base] = self
@@ -94,8 +81,14 @@ class Registry(Generic[Thing]):
             # In a worker, __main__ is the worker: what a script defines is found there by the name of its file.
             copyreg.pickle(kind, self._reduced)
 
-    def add_family(self, name: str, family: Family) -> None:
-        """Make things known whose names begin with the family's and a colon."""
+    def add_family(self, name: str, family: type[Any]) -> None:
+        """Make things known that are each something of others, by its own name there: `gymnasium:Pendulum-v1`.
+
+        Args:
+            name: what their names begin with, before a colon; in files it is the name of all of them.
+            family: their class. `family.named(own_name, **parameters)` looks a thing up; with all of its parameters, as
+                files have them, the class itself makes it, and nothing is looked up.
+        """
         self._families[name] = family
 
     def named(self, name: str, /, **parameters: Any) -> Thing:
@@ -142,7 +135,7 @@ class Registry(Generic[Thing]):
             return str(self.named(name).name)  # type: ignore[attr-defined]
         return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]
 
-    def _family_of(self, name: Any) -> Family | None:
+    def _family_of(self, name: Any) -> type[Any] | None:
         family, colon, _ = str(name).partition(":")
         return self._families.get(family) if colon else None
 
@@ -192,8 +185,8 @@ class Registry(Generic[Thing]):
         if data["name"] in self._families:
             try:
                 return self._families[data["name"]](**parameters)  # type: ignore[no-any-return]
-            except TypeError as error:
-                raise InvalidArgument(f"{data['name']}: expected its parameters, got {first_line(error)}") from error
+            except InvalidArgument as error:
+                raise InvalidArgument(f"{data['name']}: {error}") from error
         return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -18,6 +20,9 @@ from animat.robots.host import Bodies, HostRobot
 
 AT_ONCE = 64
 """Bodies side by side: each may take megabytes, and more would not make a step of them cheaper."""
+
+_LAST = threading.local()
+"""The bodies of a thread's last wave: to make new ones takes longer than many an episode."""
 
 
 class Acting(Protocol):
@@ -87,14 +92,14 @@ def _wave(
     simulator: NeuronSimulator | None,
     actor: Acting,
     key: PRNGKeyArray,
-    seeds: list[tuple[int, ...]],
+    seeds: Sequence[tuple[int, ...]],
     counted: int,
 ) -> Counts:
     """One episode of each of several bodies; only the first `counted` ones count."""
     robot, n = environment.robot, len(seeds)
     assert isinstance(robot, HostRobot)
-    bodies = Bodies(robot, seeds)
-    state = _started(environment, jax.random.split(key, n))._replace(robot=bodies.begin())  # type: ignore[arg-type]
+    bodies = _bodies(robot, seeds)
+    state = _started(environment, jax.random.split(key, n))._replace(robot=bodies.begin())
     going = np.arange(n) < counted
     returns, lengths, terminated = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, bool)
     presented, passed = _nothing(environment, simulator)
@@ -113,8 +118,17 @@ def _wave(
         if stepped.ended.any():
             # What has ended moves on and counts no further: a body may not be stepped after its end.
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
-        state = state._replace(robot=bodies.observation)  # type: ignore[arg-type]
+        state = state._replace(robot=bodies.observation)
     return Counts(returns, lengths, terminated, presented, passed)
+
+
+def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
+    """Bodies that have not begun; those of the last wave, where what was before an episode does not count."""
+    bodies: Bodies | None = getattr(_LAST, "bodies", None)
+    if bodies is None or not robot.keeps_state or (bodies.robot, len(bodies)) != (robot, len(seeds)):
+        bodies = _LAST.bodies = Bodies(robot, seeds)
+    bodies.take_seeds(seeds)
+    return bodies
 
 
 def _nothing(environment: Environment[Any], simulator: NeuronSimulator | None) -> tuple[np.ndarray, np.ndarray]:

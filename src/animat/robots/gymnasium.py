@@ -172,7 +172,7 @@ class _Environment(Body):
 
         name = f"{FAMILY}:{id}"
         try:
-            env: Any = gymnasium.make(id, disable_env_checker=True, **dict(settings))
+            env: Any = gymnasium.make(id, disable_env_checker=True, **dict[str, Any](settings))
         except Exception as error:
             # Anything may go wrong in somebody else's environment.
             raise InvalidArgument(f"{name}: expected an environment of Gymnasium, got {_why(error)}") from error

@@ -108,7 +108,8 @@ class Stepped(NamedTuple):
     @property
     def ended(self) -> Bool[np.ndarray, " bodies"]:
         """In either way."""
-        return self.terminated | self.truncated
+        ended: Bool[np.ndarray, " bodies"] = self.terminated | self.truncated
+        return ended
 
 
 class Standing(NamedTuple):
@@ -151,6 +152,9 @@ class Bodies:
         with within(robot, "being made"):
             self._bodies = [tried(robot, "being made", robot.body) for _ in seeds]
         self._at = Standing.of_none(robot, len(self._bodies))
+
+    def __len__(self) -> int:
+        return len(self._bodies)
 
     @property
     def standing(self) -> Standing:

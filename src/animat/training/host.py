@@ -92,8 +92,8 @@ def learn_and_act(
 
     before, (observation, reward, ended, begun) = learner.episodes, moved
     after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons)
-    states = (state_of(environment, episodes) for episodes in (before, after))
-    rows = transitions(settings, *states, acted.action, reward, ended)
+    state, next_state = state_of(environment, before), state_of(environment, after)
+    rows = transitions(settings, state, next_state, acted.action, reward, ended)
     returns = learner.returns + reward
     learner = learner._replace(
         replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
