@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -116,6 +117,7 @@ def test_bodies_stand_where_others_stood() -> None:
         first.begin(np.flatnonzero(stepped.ended).tolist())
     second = Bodies(robot, [(7, 0), (7, 1)])
     assert second.stand(first.standing)
+    np.testing.assert_array_equal(second.observation, first.observation)
     for _ in range(15):
         command = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
         one, other = first.step(command), second.step(command)
@@ -174,17 +176,19 @@ def test_it_learns_what_can_be_learned(tmp_path: Path) -> None:
     of_policy, of_random = (row.mean_returns.mean() for row in table.rows[:2])
     # It needs some steps from where it starts, 0.25 away on average, at up to 0.1 or 0.3 a step.
     assert of_policy > -1.5 and of_random < -10
-    assert "best_return" not in table.to_text() and isinstance(Policy.load(tmp_path / "p0.safetensors").robot, GymnasiumRobot)
+    assert "best_return" not in table.to_text() and isinstance(
+        Policy.load(tmp_path / "p0.safetensors").robot, GymnasiumRobot
+    )
 
 
 def test_evaluation_counts_whole_episodes_whatever_their_number() -> None:
     robot = named("Slider")
     environment = WithoutNeurons(robot, (-0.5, 1.0))
     # -0.5 is an action of 0: it stays about where it starts; 1 is one of 3: it goes beyond 2 within 9 steps.
-    still, away = (roll_out(environment, None, Constant(np.array([i])), 1, episodes=70, seed=4) for i in (0, 1))
+    still, away = (roll_out(environment, None, Constant(jnp.array([i])), 1, episodes=70, seed=4) for i in (0, 1))
     assert not still.terminated.any() and np.all(still.lengths == 20)
     assert away.terminated.all() and away.lengths.min() >= 5 and away.lengths.max() <= 9
-    fewer = roll_out(environment, None, Constant(np.array([0])), 1, episodes=64, seed=4)
+    fewer = roll_out(environment, None, Constant(jnp.array([0])), 1, episodes=64, seed=4)
     np.testing.assert_array_equal(still.returns[:, :64], fewer.returns)
     bodies = Bodies(robot, [(4, 0, i) for i in range(70)])
     starts = np.abs(bodies.begin()[:, 0])

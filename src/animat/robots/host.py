@@ -226,8 +226,8 @@ class Bodies:
         seen: Any = self._at.observation[body]
         for action in self.robot.actions(at.commands[body, : at.iterations[body]]):
             seen = tried(self.robot, "step", self._bodies[body].step, action)[0]
-        self._at.iterations[body] = at.iterations[body]
-        return np.array_equal(np.asarray(seen, np.float32), at.observation[body])
+        self._at.observation[body], self._at.iterations[body] = seen, at.iterations[body]
+        return np.array_equal(self._at.observation[body], at.observation[body])
 
     def _begin(self, body: int) -> None:
         seed = np.random.SeedSequence((*self._seeds[body], int(self._at.episodes[body]))).generate_state(1)[0]

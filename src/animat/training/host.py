@@ -210,4 +210,4 @@ class _Chunks:
 
     def _by_policy(self, flat: Any) -> Any:
         """Arrays of all bodies as those of each policy."""
-        return jax.tree.map(lambda part: np.reshape(part, (-1, self._n, *part.shape[1:])), flat)
+        return jax.tree.map(lambda part: np.reshape(part, (len(part) // self._n, self._n, *part.shape[1:])), flat)
