@@ -140,7 +140,7 @@ def animat(id: str, wanted: float, cap_s: float) -> dict[str, Any]:
         index += 1
         (policy,) = together.policies()
 
-        def act(observation: Any) -> Any:
+        def act(observation: Any, policy: Any = policy) -> Any:
             action = robot.actions(np.reshape(policy.act_greedily(observation), (1, -1)))[0]  # type: ignore[attr-defined]
             return np.asarray(action, body._dtype)
 

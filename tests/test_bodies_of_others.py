@@ -22,8 +22,7 @@ from animat.errors import BodyFailed, InvalidArgument
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.robots import robot_from_dict, robot_named, robot_to_dict
-from animat.robots import host
+from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.host import Bodies, Standing
 from animat.training.folder import describe
@@ -72,7 +71,7 @@ def test_it_is_data_that_needs_no_environment() -> None:
     assert pickle.loads(pickle.dumps(robot)) == robot and hash(robot) == hash(named("Levels"))
     unknown = {**data, "parameters": {**data["parameters"], "id": "nobody_has_this:Rover-v0"}}
     elsewhere = robot_from_dict(unknown)
-    with pytest.raises(InvalidArgument, match="expected nobody_has_this to be imported.*--robot gymnasium:nobody_has"):
+    with pytest.raises(InvalidArgument, match=r"expected nobody_has_this to be imported.*--robot gymnasium:nobody_has"):
         Bodies(elsewhere, [(1,)])  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="gymnasium: settings: expected to be given, got nothing"):
         robot_from_dict({"name": "gymnasium", "parameters": {"id": "Pendulum-v1"}})

@@ -141,7 +141,7 @@ class Registry(Generic[Thing]):
 
     def class_named(self, name: str) -> type[Thing]:
         """The class of this name; arguments and errors as those of `named`."""
-        kind = self._kind(name)
+        kind = self._family_of(name) or self._kind(name)
         if kind is None:
             raise InvalidArgument(
                 f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}"

@@ -87,6 +87,40 @@ def roll_out_on_host(
     return counts
 
 
+def paths_on_host(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actors: Any,
+    keys: Key[Array, " actors"],
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One episode of each actor with all that happened in it; arguments as in `roll_out_on_host`.
+
+    Returns:
+        observations before each iteration and after the last, commands, and lengths, as `animat.studies.paths.Paths`
+        has them.
+    """
+    robot, n = environment.robot, len(keys)
+    assert isinstance(robot, HostRobot)
+    observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)
+    commands, lengths = np.zeros((n, robot.episode_limit), np.float32), np.zeros(n, np.int64)
+    for number, key in enumerate(keys):
+        actor = jax.tree.map(lambda part, number=number: part[number], actors)
+        bodies = Bodies(robot, [(seed, number)])
+        state = _started(environment, jax.random.split(key, 1))._replace(robot=bodies.begin())
+        observations[number] = state.robot
+        for iteration in range(robot.episode_limit):
+            command, state, _, _ = _iteration(environment, simulator, actor, key, np.int32(iteration), state)
+            stepped = bodies.step(np.asarray(command).reshape(1, -1))
+            commands[number, iteration] = np.asarray(command)[0]
+            observations[number, iteration + 1 :] = stepped.observation
+            lengths[number] += 1
+            if stepped.ended[0]:
+                break
+            state = state._replace(robot=stepped.observation)
+    return observations, commands, lengths
+
+
 def _wave(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
