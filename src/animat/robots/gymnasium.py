@@ -6,7 +6,7 @@ import importlib
 import re
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, final
+from typing import Annotated, Any, ClassVar, final
 
 import numpy as np
 from jaxtyping import Float
@@ -53,6 +53,8 @@ class GymnasiumRobot(HostRobot):
     Raises:
         InvalidArgument: for parameters that no environment has.
     """
+
+    packages: ClassVar[tuple[str, ...]] = ("gymnasium",)
 
     id: str
     settings: tuple[tuple[str, Number], ...]

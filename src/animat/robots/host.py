@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
@@ -53,6 +53,9 @@ class HostRobot(Robot[Any]):
     An episode is decided by its seed and its commands, where `keeps_state` says so: a checkpoint then goes on within it
     by its commands so far.
     """
+
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Installed packages that decide what its bodies do, besides ours."""
 
     keeps_state: bool
     """Whether the same seed and commands give the same episode, whatever was before it."""

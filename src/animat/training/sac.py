@@ -277,10 +277,8 @@ def train_chunk(
 def uniforms_of(environment: Environment[Any], settings: SAC) -> tuple[tuple[int, int], tuple[int, int, int]]:
     """The shapes of the uniforms that a round acts with, and learns with."""
     blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
-    return (
-        (settings.environments, environment.n_drawn + environment.noise_size),
-        (settings.gradient_steps, blocks, settings.batch),
-    )
+    acting = (settings.environments, environment.n_drawn + environment.noise_size)
+    return acting, (settings.gradient_steps, blocks, settings.batch)
 
 
 def _act(
