@@ -21,12 +21,14 @@ from animat.environment import Environment
 from animat.neurons.history import AT_FIRST
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot, Standing
+from animat.training.exploration import ended_episodes
 from animat.training.sac import (
     Finished,
     Learner,
     average,
     begin,
-    draw_action,
+    choose,
+    finished_alone,
     learn,
     state_of,
     transitions,
@@ -65,7 +67,7 @@ def act(
     """The actions of a round; arguments as in `animat.training.sac.train_chunk`."""
     key, use = jax.random.split(learner.key)
     acting, _ = uniforms_of(environment, settings)
-    return learner._replace(key=key), _acted(environment, learner, simulator, jax.random.uniform(use, acting))
+    return _acted(environment, learner._replace(key=key), simulator, jax.random.uniform(use, acting))
 
 
 def learn_and_act(
@@ -95,6 +97,7 @@ def learn_and_act(
     state, next_state = state_of(environment, before), state_of(environment, after)
     rows = transitions(settings, state, next_state, acted.action, reward, ended)
     returns = learner.returns + reward
+    finished = finished_alone(learner.exploration, ended, returns)
     learner = learner._replace(
         replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
         episodes=after._replace(
@@ -103,25 +106,24 @@ def learn_and_act(
             neurons=jnp.where(ended[:, None], jnp.array(AT_FIRST, jnp.float32), after.neurons),
         ),
         returns=jnp.where(ended, 0.0, returns),
+        exploration=ended_episodes(learner.exploration, ended, returns),
         key=key,
     )
     available = jnp.minimum(written + settings.environments, settings.replay)
     learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
     learner = learner._replace(deployed=average(settings, learner.deployed, learner.trained.actor, index))
-    finished = Finished(jnp.sum(ended, dtype=jnp.float32), jnp.sum(jnp.where(ended, returns, 0.0)))
-    return learner, _acted(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
+    return *_acted(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
 
 
 def _acted(
     environment: Environment[Any], learner: Learner, simulator: NeuronSimulator | None, uniforms: Array
-) -> Acted:
+) -> tuple[Learner, Acted]:
     observation = jax.vmap(environment.observe)(learner.episodes) / environment.scales
-    n_drawn = environment.n_drawn
-    action = draw_action(environment, learner.trained.actor, observation, uniforms[:, :n_drawn])
-    responded = jax.vmap(environment.respond, (0, 0, 0, None))(
-        uniforms[:, n_drawn:], learner.episodes, action, simulator
+    action, exploration, noise = choose(environment, learner, observation, uniforms)
+    responded = jax.vmap(environment.respond, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
+    return learner._replace(exploration=exploration), Acted(
+        action, responded.command, jnp.broadcast_to(responded.answer.history, (len(observation), 2))
     )
-    return Acted(action, responded.command, jnp.broadcast_to(responded.answer.history, (len(observation), 2)))
 
 
 @lru_cache(maxsize=8)
