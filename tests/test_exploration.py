@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from animat.coding.mapping import mapping_named
-from animat.environment import Animat, Environment, WithoutNeurons
+from animat.environment import Animat, WithoutNeurons
 from animat.robots import SwingUp, robot_named
 from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
 

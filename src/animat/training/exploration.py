@@ -2,7 +2,7 @@
 
 A policy that has learned nothing draws its actions one by one, and a body averages them: a pendulum that is to be swung
 up stays where it hangs, and where reward is rare none is ever seen. Held for a time, random actions get far (Dabney,
-Ostrovski and Barreto 2021, arXiv:2006.01782). So in half of the environments random actions are held now and then, until
+Ostrovski and Barreto 2021, arXiv:2006.01782). In half of the environments random actions are held now and then, until
 the policy's own episodes pay more. On the paper's tasks they soon do.
 """
 
