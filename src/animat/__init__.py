@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from animat.environment import Animat as Animat
     from animat.environment import WithoutNeurons as WithoutNeurons
     from animat.errors import AnimatError as AnimatError
+    from animat.errors import BodyFailed as BodyFailed
     from animat.errors import BudgetSpent as BudgetSpent
     from animat.errors import DeviceFailed as DeviceFailed
     from animat.errors import InvalidArgument as InvalidArgument
@@ -152,6 +153,7 @@ _WHERE = {
         "BudgetSpent",
         "LoopEnded",
         "DeviceFailed",
+        "BodyFailed",
     ),
 }
 """The modules of the public names, in the order of the story."""

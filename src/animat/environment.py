@@ -41,6 +41,20 @@ class Ended(NamedTuple):
     truncated: Flag
 
 
+class Responded(NamedTuple):
+    """What comes of an action before the robot moves.
+
+    Attributes:
+        delivered: the condition that reached the neurons (the action itself, where there are none).
+        answer: of the neurons.
+        command: what the robot is moved by.
+    """
+
+    delivered: Array
+    answer: Answer
+    command: Float[Array, "*commands"]
+
+
 class State(NamedTuple):
     """Where an episode stands, and what the iteration did that led there (at the start: nothing, all of it 0).
 
@@ -111,6 +125,9 @@ class Environment(abc.ABC, Generic[RobotState]):
         )
 
     @abc.abstractmethod
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+        """What comes of an action before the robot moves; arguments as in `advance`."""
+
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
         """One iteration, its random numbers handed in: training draws them for many iterations at once.
 
@@ -120,6 +137,11 @@ class Environment(abc.ABC, Generic[RobotState]):
             action: an index, or the commands.
             simulator: the neurons; None without.
         """
+        delivered, answer, command = self.respond(uniforms, state, action, simulator)
+        robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
+        info = {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
+        ended = Ended(terminated, jnp.bool_(False))
+        return State(robot, state.iteration + 1, answer.history, reward, ended, info)
 
     @final
     def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
@@ -135,15 +157,6 @@ class Environment(abc.ABC, Generic[RobotState]):
     def scales(self) -> Float[np.ndarray, " observations"]:
         """What a policy divides an observation by, so that its numbers are of order one."""
         return np.array([quantity.scale for quantity in self.observation_spec], np.float32)
-
-    def _moved(
-        self, uniforms: Uniforms, state: State, delivered: Array, answer: Answer, command: Float[Array, "*commands"]
-    ) -> State:
-        """After the neurons' answer and the robot's movement."""
-        robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
-        info = {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
-        ended = Ended(terminated, jnp.bool_(False))
-        return State(robot, state.iteration + 1, answer.history, reward, ended, info)
 
 
 @dataclass(frozen=True)
@@ -170,13 +183,13 @@ class Animat(Environment[RobotState]):
         # meet the same random numbers.
         return self.robot.noise_size + 2
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
         if simulator is None:
             raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
         expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
         command = decoded(self.mapping, answer.rate_hz, simulator.percentiles)
-        return self._moved(uniforms, state, action, answer, command)
+        return Responded(action, answer, command)
 
 
 @dataclass(frozen=True)
@@ -207,7 +220,7 @@ class WithoutNeurons(Environment[RobotState]):
     def noise_size(self) -> int:
         return self.robot.noise_size
 
-    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
         nothing = Answer(jnp.float32(jnp.nan), state.neurons)
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
-        return self._moved(uniforms, state, action, nothing, jnp.clip(command, -1.0, 1.0))
+        return Responded(action, nothing, jnp.clip(command, -1.0, 1.0))

@@ -65,6 +65,10 @@ class DeviceFailed(AnimatError):
     """A device cannot be used or failed while it was (no driver, no connection, a pulse that did not come)."""
 
 
+class BodyFailed(AnimatError):
+    """A body of somebody else (`gymnasium:...`) raised, hung, or gave no finite numbers; what was finished stays."""
+
+
 def shown(value: object, most: int = 80) -> str:
     """A value as a message shows it: in one line, and cut where it is longer than anyone reads."""
     try:

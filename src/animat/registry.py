@@ -43,6 +43,7 @@ class Registry(Generic[Thing]):
         self.noun, self.entry_points = noun, f"animat.{noun}s"
         self._base, self._ours, self._reserved = base, dict(ours or {}), (*(ours or {}), *reserved)
         self._registered: dict[str, type[Thing]] = {}
+        self._families: dict[str, type[Any]] = {}
         self.kinds: Mapping[str, type[Thing]] = MappingProxyType(self._registered)
         """What is registered so far, by name."""
         _registries[base] = self
@@ -80,6 +81,16 @@ class Registry(Generic[Thing]):
             # In a worker, __main__ is the worker: what a script defines is found there by the name of its file.
             copyreg.pickle(kind, self._reduced)
 
+    def add_family(self, name: str, family: type[Any]) -> None:
+        """Make things known that are each something of others, by its own name there: `gymnasium:Pendulum-v1`.
+
+        Args:
+            name: what their names begin with, before a colon; in files it is the name of all of them.
+            family: their class. `family.named(own_name, **parameters)` looks a thing up; with all of its parameters, as
+                files have them, the class itself makes it, and nothing is looked up.
+        """
+        self._families[name] = family
+
     def named(self, name: str, /, **parameters: Any) -> Thing:
         """The one of this name, with these parameters in place of its defaults.
 
@@ -94,6 +105,8 @@ class Registry(Generic[Thing]):
         """
         if isinstance(name, str) and name in self._ours and not parameters:
             return self._ours[name]
+        if (family := self._family_of(name)) is not None:
+            return family.named(name.partition(":")[2], **parameters)  # type: ignore[no-any-return]
         kind = self.class_named(name)
         known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
         for parameter in parameters:
@@ -117,11 +130,18 @@ class Registry(Generic[Thing]):
 
     def name_of(self, name: str) -> str:
         """The name of what is named so; errors as those of `named`."""
+        if self._family_of(name) is not None:
+            # Whoever names it has it looked up, so that what it is made of is imported.
+            return str(self.named(name).name)  # type: ignore[attr-defined]
         return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]
+
+    def _family_of(self, name: Any) -> type[Any] | None:
+        family, colon, _ = str(name).partition(":")
+        return self._families.get(family) if colon else None
 
     def class_named(self, name: str) -> type[Thing]:
         """The class of this name; arguments and errors as those of `named`."""
-        kind = self._kind(name)
+        kind = self._family_of(name) or self._kind(name)
         if kind is None:
             raise InvalidArgument(
                 f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}"
@@ -134,7 +154,8 @@ class Registry(Generic[Thing]):
 
         Of one that is not ours it also says where it is imported from: `"import": "my_package.robots:Rover"`.
         """
-        data = {"name": thing.name, "parameters": dataclasses.asdict(thing)}  # type: ignore[attr-defined, call-overload]
+        name = thing.name if self._family_of(thing.name) is None else thing.name.partition(":")[0]  # type: ignore[attr-defined]
+        data = {"name": name, "parameters": dataclasses.asdict(thing)}  # type: ignore[call-overload]
         return data if is_ours(thing) else data | {"import": place_of(type(thing))}
 
     def from_dict(self, data: Mapping[str, Any]) -> Thing:
@@ -160,7 +181,13 @@ class Registry(Generic[Thing]):
                 f"{noun}: expected one that is registered, got {shown(data['name'])}: import {place.partition(':')[0]} "
                 f"first (on the command line: --{noun} {place})"
             )
-        return self.named(data["name"], **{name: _frozen(value) for name, value in data["parameters"].items()})
+        parameters = {name: _frozen(value) for name, value in data["parameters"].items()}
+        if data["name"] in self._families:
+            try:
+                return self._families[data["name"]](**parameters)  # type: ignore[no-any-return]
+            except InvalidArgument as error:
+                raise InvalidArgument(f"{data['name']}: {error}") from error
+        return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:
         """Refuse what a file could name and nothing could give back.
@@ -173,7 +200,7 @@ class Registry(Generic[Thing]):
             InvalidArgument: for one that is not registered, or that no worker could import.
         """
         noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
-        if name in self._ours and self._ours[name] == thing:
+        if (name in self._ours and self._ours[name] == thing) or self._family_of(name) is not None:
             return
         is_registered = self._registered.get(name) is kind
         if not is_registered or self.from_dict(json.loads(json.dumps(self.to_dict(thing)))) != thing:

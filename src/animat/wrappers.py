@@ -8,7 +8,7 @@ from typing import Any, Literal, final
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from animat.environment import Animat, Environment, RobotState, State, Uniforms
+from animat.environment import Animat, Environment, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Quantity, Robot
@@ -49,6 +49,9 @@ class Wrapper(Environment[RobotState]):
     def reset(self, key: PRNGKeyArray) -> State:
         return self.inside.reset(key)
 
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+        return self.inside.respond(uniforms, state, action, simulator)
+
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
         return self.inside.advance(uniforms, state, action, simulator)
 
@@ -83,10 +86,15 @@ class ShuffledDelivery(Wrapper[RobotState]):
     def __post_init__(self) -> None:
         _expect_neurons(self)
 
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+        return self.inside.respond(uniforms, state, self._drawn(uniforms), simulator)
+
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        return self.inside.advance(uniforms, state, self._drawn(uniforms), simulator)
+
+    def _drawn(self, uniforms: Uniforms) -> Array:
         n = self.n_actions or 0
-        drawn = jnp.minimum((uniforms[-1] * n).astype(jnp.int32), n - 1)
-        return self.inside.advance(uniforms, state, drawn, simulator)
+        return jnp.minimum((uniforms[-1] * n).astype(jnp.int32), n - 1)
 
 
 @final

@@ -127,7 +127,7 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
     from animat.robots.registry import REGISTRY
     from animat.training.policy import load_policies
 
-    expected = None if robot is None else REGISTRY.class_named(robot).name
+    expected = None if robot is None else REGISTRY.name_of(robot)
     asked = mapping if mapping in (None, "none") else MAPPINGS.name_of(mapping)
     policies = load_policies(path)
     for name, policy in policies.items():

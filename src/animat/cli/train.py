@@ -24,8 +24,8 @@ class Train(Fitting):
     """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, swing-up, arm, wheels, or one of your own, such as
-    my_package.robots:Rover"""
+    """The robot to drive: cartpole, navigation, swing-up, arm, wheels, one of your own, such as
+    my_package.robots:Rover, or any of Gymnasium's, gymnasium:Reacher-v5"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""
     paper: bool = False

@@ -15,7 +15,7 @@ from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.runner import RobotRunner
+from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
 from animat.closed_loop.stretch import Asked, Stretch, rows_of
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
@@ -25,6 +25,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.errors import AnimatError, BudgetSpent, UnsafeStimulus
 from animat.responses.windows import read_windows
+from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
 
@@ -70,7 +71,8 @@ class Driver:
         self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
         self._rng = np.random.default_rng([seed, 21])
-        self._runner = RobotRunner(loop.robot, np.random.default_rng([seed, 22]))
+        runs = HostRunner if isinstance(loop.robot, HostRobot) else RobotRunner
+        self._runner: Runner = runs(loop.robot, np.random.default_rng([seed, 22]))
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
@@ -269,7 +271,7 @@ class Driver:
             "reward": moved.reward,
             "observation": tuple(moved.observation.tolist()),
             "terminated": moved.terminated,
-            "truncated": iteration + 1 >= loop.robot.episode_limit and not moved.terminated,
+            "truncated": (moved.truncated or iteration + 1 >= loop.robot.episode_limit) and not moved.terminated,
         }
 
     def _times(self, due_s: float, frequency_hz: float) -> tuple[float, Float64[np.ndarray, " pulses"]]:

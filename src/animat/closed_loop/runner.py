@@ -1,14 +1,15 @@
-"""A robot that is moved one step at a time, outside of any compiled loop."""
+"""A robot that is moved one step at a time, outside of any compiled loop; one that is stepped on the host, too."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from animat.robots.base import Robot
+from animat.robots.host import Bodies, HostRobot
 
 
 class Moved(NamedTuple):
@@ -18,11 +19,23 @@ class Moved(NamedTuple):
         reward: in the task's own units.
         terminated: the task ended by itself.
         observation: after the step, in the robot's own units.
+        truncated: the robot itself cut the episode off; at its `episode_limit` whoever runs it does.
     """
 
     reward: float
     terminated: bool
     observation: Float64[np.ndarray, " observations"]
+    truncated: bool = False
+
+
+class Runner(Protocol):
+    """A robot with its state."""
+
+    def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
+        """Start an episode where the robot draws it, the same number in the same state; returns what is observed."""
+
+    def step(self, u: ArrayLike) -> Moved:
+        """Move by a command in [-1, 1], or by several."""
 
 
 class RobotRunner:
@@ -65,3 +78,26 @@ class RobotRunner:
         uniforms = self._rng.random(self.robot.noise_size, dtype=np.float32)
         self._state, reward, terminated, observation = self._step(uniforms, self._state, np.asarray(u, np.float32))
         return Moved(float(reward), bool(terminated), np.asarray(observation, np.float64))
+
+
+class HostRunner:
+    """A robot that is stepped on the host, with its state; arguments as of `RobotRunner`."""
+
+    def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
+        assert isinstance(robot, HostRobot)
+        self._entropy = int(rng.integers(2**31))
+        self._bodies = Bodies(robot, [(self._entropy, 0)])
+        # What it loads when it first moves would come late in the middle of an episode.
+        self.reset(0)
+        self.step(np.zeros(robot.n_commands))
+
+    def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
+        """Start an episode where the robot draws it; returns what is observed; the same number in the same state."""
+        self._bodies.take_seeds([(self._entropy, number)])
+        return np.asarray(self._bodies.begin()[0], np.float64)
+
+    def step(self, u: ArrayLike) -> Moved:
+        """Move by a command in [-1, 1], or by several."""
+        stepped = self._bodies.step(np.asarray(u, np.float32).reshape(1, -1))
+        (reward,), (terminated,), (truncated,) = stepped.reward, stepped.terminated, stepped.truncated
+        return Moved(float(reward), bool(terminated), stepped.observation[0].astype(np.float64), bool(truncated))

@@ -18,8 +18,10 @@ from animat.coding.mapping import N_PERCENTILES
 from animat.compilation import FAST_TO_COMPILE
 from animat.environment import Environment
 from animat.errors import InvalidArgument, shown
+from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
+from animat.robots.host import HostRobot
 from animat.training.policy import Policy
 from animat.training.sac import Layer, Network, as_commands, draw_action, forward
 
@@ -172,6 +174,8 @@ def roll_out(
     if not 0 <= seed < 2**32:
         raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
     keys = jax.random.split(jax.random.key(seed), n_actors)
+    if isinstance(environment.robot, HostRobot):
+        return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
     returns, *counted, terminated = _roll_out(environment, episodes, simulator, actors, keys)
     lengths, presented, passed = (np.asarray(each, np.int64) for each in counted)
     return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed)

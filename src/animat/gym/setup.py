@@ -27,6 +27,7 @@ from animat.responses.conditions import conditions_named
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS
+from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
 from animat.wrappers import Delivery, EpisodeLimit, ShuffledDelivery
 
@@ -98,6 +99,10 @@ def set_up(
         UnusableData: for recordings that no controller can learn from.
     """
     body = robot_named(robot, **parameters)
+    if isinstance(body, HostRobot):
+        raise InvalidArgument(
+            f"robot: expected one that is stepped in JAX, got {body.name}, which Gymnasium steps: animat train takes it"
+        )
     for caveat in body.caveats():
         warnings.warn(caveat, stacklevel=2)
     if recordings is not None and simulator is not None:

@@ -19,11 +19,16 @@ from animat.neurons.simulator import silenced
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.passes import Passes
+from animat.robots.host import HostRobot
 
 EPISODES = 200
 """Of each policy and control in one roll-out."""
 ROLL_OUTS = 5
 """On the recording's simulator; one on each simulator of bootstrapped responses."""
+
+
+EPISODES_ON_HOST, BOOTSTRAPS_ON_HOST = 20, 40
+"""Fewer of both for a robot that is stepped on the host, where an episode takes a thousand times as long."""
 
 
 class Predicted(NamedTuple):
@@ -87,13 +92,17 @@ def predict(
         By the agent's name.
     """
     progress = progress or Silent()
-    simulators = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps)
+    simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
+    if isinstance(environment.robot, HostRobot):
+        simulators, episodes_each = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST], EPISODES_ON_HOST
     acting = [_actor(group, rule, greedy=greedy) for group in groups]
 
     def rolled(group: int, on: int) -> Episodes:
         actor, many = acting[group]
         simulator = silenced(simulators[on]) if groups[group][0].delivery == "silent" else simulators[on]
-        return roll_out(environment, simulator, actor, many, episodes=EPISODES, seed=roll_out_seed(seed, group, on))
+        return roll_out(
+            environment, simulator, actor, many, episodes=episodes_each, seed=roll_out_seed(seed, group, on)
+        )
 
     found: dict[str, Predicted] = {}
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:

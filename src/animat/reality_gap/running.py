@@ -32,13 +32,21 @@ from animat.progress import Progress
 from animat.reality_gap.answered import answered
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import Predicted, predict, together
+from animat.reality_gap.predicting import (
+    BOOTSTRAPS_ON_HOST,
+    EPISODES_ON_HOST,
+    ROLL_OUTS,
+    Predicted,
+    predict,
+    together,
+)
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.table import RealityGap, Row
 from animat.recordings.findings import Finding, warnings_once
 from animat.responses.condition import other_stimulus
 from animat.robots.capabilities import lacking
 from animat.robots.grid import grid_for, no_grid
+from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 
 FEWEST_OF_A_CONTROL = 5
@@ -127,6 +135,12 @@ def run_policies(
         *old_calibration(calibration.start_min, culture.now_s / 60),
         *no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory),
     )
+    if isinstance(loop.robot, HostRobot):
+        message = (
+            f"{loop.robot.name} is stepped on the host: predicted returns are of {ROLL_OUTS * EPISODES_ON_HOST} "
+            f"episodes, and their intervals of {BOOTSTRAPS_ON_HOST} bootstraps"
+        )
+        findings += (Finding("few-predicted", "note", message),)
     account = account or Account()
 
     environment = Animat(loop.robot, loop.mapping, len(loop.conditions))

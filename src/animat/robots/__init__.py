@@ -3,6 +3,7 @@
 from animat.robots.arm import ArmState, TwoLinkArm
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole, CartpoleState
+from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.navigation import Navigation, NavigationState
 from animat.robots.registry import ROBOTS, register_robot, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.swing_up import SwingUp, SwingUpState
@@ -13,6 +14,7 @@ __all__ = [
     "ArmState",
     "Cartpole",
     "CartpoleState",
+    "GymnasiumRobot",
     "Navigation",
     "NavigationState",
     "Quantity",

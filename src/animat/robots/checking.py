@@ -11,6 +11,7 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidArgument, first_line, shown
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
+from animat.robots.host import Bodies, HostRobot
 
 _STEPS = 3
 MOST_COMMANDS = 64
@@ -29,6 +30,9 @@ def check_robot(robot: Robot[Any]) -> None:
     import jax.numpy as jnp
 
     name = _named(robot)
+    if isinstance(robot, HostRobot):
+        _check_on_host(robot)
+        return
     observations, noise = len(robot.observation_spec), robot.noise_size
     one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)
@@ -69,6 +73,14 @@ def check_robot(robot: Robot[Any]) -> None:
         for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
             if not all(np.all(np.isfinite(value)) for value in values):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
+
+
+def _check_on_host(robot: HostRobot) -> None:
+    bodies = Bodies(robot, [(0,)])
+    bodies.begin()
+    for u in np.linspace(-1.0, 1.0, _STEPS):
+        if bodies.step(np.full((1, robot.n_commands), u)).ended[0]:
+            bodies.begin()
 
 
 def _named(robot: Any) -> str:

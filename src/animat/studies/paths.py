@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from animat.environment import Environment
+from animat.evaluation.host_rollouts import paths_on_host
 from animat.evaluation.rollouts import Actor
 from animat.neurons.simulator import NeuronSimulator
+from animat.robots.host import HostRobot
 from animat.studies.results import read_arrays, write_arrays
 
 
@@ -54,6 +56,8 @@ def record_paths(
 ) -> Paths:
     """Run one episode of each actor; arguments as in `animat.evaluation.rollouts.roll_out`."""
     keys = jax.random.split(jax.random.key(seed), n_actors)
+    if isinstance(environment.robot, HostRobot):
+        return Paths(*paths_on_host(environment, simulator, actors, keys, seed))
     observations, commands, lengths = _record(environment, simulator, actors, keys)
     return Paths(np.asarray(observations), np.asarray(commands), np.asarray(lengths, np.int64))
 

@@ -18,6 +18,7 @@ from animat.differences import description_in, fingerprint_of, first_difference,
 from animat.errors import InvalidFile, Mismatch
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
+from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.group import Group, split_groups
 from animat.training.settings import FORMER
@@ -52,10 +53,13 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
 
 def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
     """What decides how policies come out, as plain data, with a fingerprint over all of it."""
+    packages = ["animat", "jax", "jaxlib", "numpy", "optax"]
+    if isinstance(training.robot, HostRobot):
+        packages += training.robot.packages
     manifest: dict[str, Any] = {
         "training": training.to_dict(),
         "simulators": None if timeline is None else _described(timeline),
-        "versions": {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")},
+        "versions": {name: importlib.metadata.version(name) for name in packages},
     }
     # By way of JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))

@@ -21,6 +21,8 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.responses.readouts import ALL
+from animat.robots.host import HostRobot
+from animat.training.host import programs_on_host
 from animat.training.policy import Policy
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
@@ -125,7 +127,8 @@ class SideBySide:
         training = group.training
         self._group = group
         self._environment = training.environment(0 if group.timeline is None else len(group.timeline.conditions))
-        beginning, self._chunk = programs(self._environment, training.algorithm)
+        made = programs_on_host if isinstance(training.robot, HostRobot) else programs
+        beginning, self._chunk = made(self._environment, training.algorithm)
         keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
         self._learners = beginning(keys)
         self._curve: list[np.ndarray] = []

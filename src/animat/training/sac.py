@@ -24,10 +24,11 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.scipy.special import ndtri
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
+from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit
 
@@ -60,6 +61,7 @@ class Learner(NamedTuple):
     replay: Float[Array, "transitions row"]
     episodes: State
     returns: Float[Array, " environments"]
+    exploration: Exploration
     key: PRNGKeyArray
 
 
@@ -88,7 +90,10 @@ class Batch(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """Episodes that ended in a chunk of training: how many, and the sum of their returns in the task's units."""
+    """The policy's episodes that ended in a chunk of training: how many, and the sum of their returns, in task's units.
+
+    Those in which actions were held (`animat.training.exploration`) are not among them.
+    """
 
     episodes: Float[Array, ""]
     returns: Float[Array, ""]
@@ -146,23 +151,25 @@ def squashed_normal(
 
 
 def discrete_losses(
-    trained: Trained, targets: Network, batch: Batch, settings: SAC
+    trained: Trained, targets: Network, batch: Batch, settings: SAC, paid: Float[Array, ""] | float = 1.0
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """The losses of critics, actor and alpha; each has a gradient for its own parameters only.
 
     With Q the smaller of the two critics (of the two target critics where it says Q_target), d for ended, s a state
     with its time left and o the observation in it:
 
-    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) sum_a' pi(a'|o') (Q_target(s', a') - alpha log pi(a'|o')))^2 / 2
+    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) sum_a' pi(a'|o') (Q_target(s', a') - k alpha log pi(a'|o')))^2/2
     actor:   mean sum_a pi(a|o) (alpha log pi(a|o) - Q(s, a))
     alpha:   mean log alpha (H(pi(.|o)) - H_wanted)
+
+    with k = `paid`: 1, or 0 while entropy is not paid for (`learn`).
     """
     fixed = jax.lax.stop_gradient
     alpha = jnp.exp(fixed(trained.log_alpha))
 
     log_next = jax.nn.log_softmax(forward(fixed(trained.actor), batch.next_observation))
     next_q = jnp.min(forward(targets, batch.next_state), axis=0)
-    next_value = jnp.sum(jnp.exp(log_next) * (next_q - alpha * log_next), axis=-1)
+    next_value = jnp.sum(jnp.exp(log_next) * (next_q - paid * alpha * log_next), axis=-1)
     target = fixed(batch.reward + settings.discount * (1.0 - batch.ended) * next_value)
     q = forward(trained.critics, batch.state)
     taken = jax.nn.one_hot(batch.action.astype(jnp.int32), q.shape[-1])
@@ -178,11 +185,16 @@ def discrete_losses(
 
 
 def continuous_losses(
-    trained: Trained, targets: Network, batch: Batch, uniforms: Float[Array, "2 batch commands"], settings: SAC
+    trained: Trained,
+    targets: Network,
+    batch: Batch,
+    uniforms: Float[Array, "2 batch commands"],
+    settings: SAC,
+    paid: Float[Array, ""] | float = 1.0,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """The same for continuous actions, with a' and a_new drawn from the policy (reparameterised).
 
-    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - alpha log pi(a'|o')))^2 / 2
+    critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - k alpha log pi(a'|o')))^2 / 2
     actor:   mean alpha log pi(a_new|o) - Q(s, a_new)
     alpha:   mean log alpha (-log pi(a_new|o) - H_wanted)
     """
@@ -194,7 +206,7 @@ def continuous_losses(
 
     next_action, log_next = squashed_normal(forward(fixed(trained.actor), batch.next_observation), uniforms[0])
     next_q = jnp.min(critic(targets, batch.next_state, next_action), axis=0)
-    target = batch.reward + settings.discount * (1.0 - batch.ended) * (next_q - alpha * log_next)
+    target = batch.reward + settings.discount * (1.0 - batch.ended) * (next_q - paid * alpha * log_next)
     q = critic(trained.critics, batch.state, batch.action)
     critic_loss = 0.5 * jnp.sum(jnp.mean((q - fixed(target)) ** 2, axis=-1))
 
@@ -227,6 +239,7 @@ def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> L
         replay=jnp.zeros((settings.replay, 2 * (n + 1) + n_drawn + 2)),
         episodes=jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments)).carried,
         returns=jnp.zeros(settings.environments),
+        exploration=nothing_held(settings.environments, n_drawn),
         key=key,
     )
 
@@ -253,9 +266,7 @@ def train_chunk(
         The learner after the chunk, and the episodes that ended in it.
     """
     # The uniforms that a round acts with and learns with: one block, drawn at once.
-    acting = (settings.environments, environment.n_drawn + environment.noise_size)
-    blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
-    learning = (settings.gradient_steps, blocks, settings.batch)
+    acting, learning = uniforms_of(environment, settings)
     n_acting = math.prod(acting)
 
     def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
@@ -267,13 +278,20 @@ def train_chunk(
             environment, settings, learner, simulator, written, uniforms[:n_acting].reshape(acting), reset_key
         )
         available = jnp.minimum(written + settings.environments, settings.replay)
-        learner = _learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
-        learner = learner._replace(key=key, deployed=_average(settings, learner.deployed, learner.trained.actor, index))
+        learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
+        learner = learner._replace(key=key, deployed=average(settings, learner.deployed, learner.trained.actor, index))
         return learner, jax.tree.map(jnp.add, before, finished)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
     trained: tuple[Learner, Finished] = jax.lax.fori_loop(first_round, last_round, one_round, (learner, nothing))
     return trained
+
+
+def uniforms_of(environment: Environment[Any], settings: SAC) -> tuple[tuple[int, int], tuple[int, int, int]]:
+    """The shapes of the uniforms that a round acts with, and learns with."""
+    blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
+    acting = (settings.environments, environment.n_drawn + n_uniforms(environment) + environment.noise_size)
+    return acting, (settings.gradient_steps, blocks, settings.batch)
 
 
 def _act(
@@ -286,20 +304,11 @@ def _act(
     reset_key: PRNGKeyArray,
 ) -> tuple[Learner, Finished]:
     """One step of every environment, remembered in the replay; ended episodes start anew."""
-    scales, n_drawn = environment.scales, environment.n_drawn
-
-    def state_of(episodes: State) -> Float[Array, "environments state"]:
-        left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
-        return jnp.concatenate([jax.vmap(environment.observe)(episodes) / scales, left], axis=1)
-
-    state = state_of(learner.episodes)
-    action = draw_action(environment, learner.trained.actor, state[:, :-1], uniforms[:, :n_drawn])
-    noise = uniforms[:, n_drawn:]
+    state = state_of(environment, learner.episodes)
+    action, exploration, noise = choose(environment, learner, state[:, :-1], uniforms)
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = jnp.logical_or(*after.ended)
-    of_action = action.reshape(len(state), n_drawn).astype(jnp.float32)
-    row = jnp.stack([settings.reward_scale * after.reward, ended], axis=1, dtype=jnp.float32)
-    rows = jnp.concatenate([state, state_of(after), of_action, row], axis=1)
+    rows = transitions(settings, state, state_of(environment, after), action, after.reward, ended)
 
     returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
@@ -307,8 +316,51 @@ def _act(
         replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
         episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried),
         returns=jnp.where(ended, 0.0, returns),
+        exploration=ended_episodes(exploration, ended, returns),
     )
-    return learner, Finished(jnp.sum(ended, dtype=jnp.float32), jnp.sum(jnp.where(ended, returns, 0.0)))
+    return learner, finished_alone(exploration, ended, returns)
+
+
+def choose(
+    environment: Environment[Any],
+    learner: Learner,
+    observation: Float[Array, "environments observations"],
+    uniforms: Float[Array, "environments uniforms"],
+) -> tuple[Array, Exploration, Float[Array, "environments noise"]]:
+    """The actions of an iteration, what is held after them, and the uniforms that are left for the environments."""
+    n_drawn = environment.n_drawn
+    n_before = n_drawn + n_uniforms(environment)
+    action = draw_action(environment, learner.trained.actor, observation, uniforms[:, :n_drawn])
+    action, exploration = explore(environment, learner.exploration, action, uniforms[:, n_drawn:n_before])
+    return action, exploration, uniforms[:, n_before:]
+
+
+def finished_alone(
+    exploration: Exploration, ended: Bool[Array, " environments"], returns: Float[Array, " environments"]
+) -> Finished:
+    """The episodes that the policy ended in an iteration, those apart in which actions were held."""
+    alone = ended & ~exploration.was_held
+    return Finished(jnp.sum(alone, dtype=jnp.float32), jnp.sum(jnp.where(alone, returns, 0.0)))
+
+
+def state_of(environment: Environment[Any], episodes: State) -> Float[Array, "environments state"]:
+    """What the critics see of episodes: scaled observations, and the time left."""
+    left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
+    return jnp.concatenate([jax.vmap(environment.observe)(episodes) / environment.scales, left], axis=1)
+
+
+def transitions(
+    settings: SAC,
+    state: Float[Array, "environments state"],
+    next_state: Float[Array, "environments state"],
+    action: Array,
+    reward: Float[Array, " environments"],
+    ended: Bool[Array, " environments"],
+) -> Float[Array, "environments row"]:
+    """Rows of the replay: what `Batch` is unpacked from."""
+    of_action = action.reshape(len(state), -1).astype(jnp.float32)
+    row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
+    return jnp.concatenate([state, next_state, of_action, row], axis=1)
 
 
 def draw_action(
@@ -335,7 +387,7 @@ def as_commands(
     return actions[:, 0] if environment.robot.n_commands == 1 else actions
 
 
-def _learn(
+def learn(
     environment: Environment[Any],
     settings: SAC,
     learner: Learner,
@@ -347,10 +399,13 @@ def _learn(
     n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
     is_continuous = environment.n_actions is None
 
+    # Where nothing is known to pay, values would be of entropy alone, and hide the first rewards for long.
+    paid = jnp.where(is_worth_it(learner.exploration), 0.0, 1.0)
+
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
         if is_continuous:
-            return sum(continuous_losses(trained, targets, batch, noise, settings), jnp.float32(0.0))
-        return sum(discrete_losses(trained, targets, batch, settings), jnp.float32(0.0))
+            return sum(continuous_losses(trained, targets, batch, noise, settings, paid), jnp.float32(0.0))
+        return sum(discrete_losses(trained, targets, batch, settings, paid), jnp.float32(0.0))
 
     def update(carry: tuple[Trained, Network, Any], uniforms: Float[Array, "blocks batch"]) -> tuple[Any, None]:
         trained, targets, optimiser = carry
@@ -370,7 +425,7 @@ def _learn(
     return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
 
 
-def _average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
+def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
     """Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824): it forgets in proportion to its age.
 
     The last actor of a training is as good as its last few updates were lucky; the average is not. With k the

@@ -16,6 +16,7 @@ from animat.errors import InvalidArgument, shown
 from animat.neurons.timeline import SimulatorTimeline
 from animat.registry import is_ours
 from animat.robots.base import Robot
+from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named, robot_to_dict
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery
@@ -114,7 +115,10 @@ class Training:
 
     def register(self) -> None:
         """Make its robot and its mapping known in a process that they came to, so that policies can be loaded there."""
-        register_robot(type(self.robot))
+        if isinstance(self.robot, HostRobot):
+            self.robot.prepare()
+        else:
+            register_robot(type(self.robot))
         if self.mapping is not None and not is_ours(self.mapping):
             register_mapping(type(self.mapping))
 

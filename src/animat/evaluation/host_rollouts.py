@@ -1,0 +1,200 @@
+"""Episodes with bodies that are stepped on the host: acting and the neurons compiled, the bodies in between."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+
+from animat.coding.mapping import N_PERCENTILES
+from animat.compilation import FAST_TO_COMPILE
+from animat.environment import Environment, State
+from animat.neurons.simulator import NeuronSimulator
+from animat.robots.host import Bodies, HostRobot
+
+AT_ONCE = 64
+"""Bodies side by side: each may take megabytes, and more would not make a step of them cheaper."""
+
+_LAST = threading.local()
+"""The bodies of a thread's last wave: to make new ones takes longer than many an episode."""
+
+
+class Acting(Protocol):
+    """Whoever picks actions (`animat.evaluation.rollouts.Actor`)."""
+
+    def act(self, environment: Environment[Any], observation: Array, uniforms: Array) -> Array:
+        """An action for each scaled observation."""
+
+
+class Counts(NamedTuple):
+    """What came of the episodes; shapes and meanings as in `animat.evaluation.rollouts.Episodes`."""
+
+    returns: np.ndarray
+    lengths: np.ndarray
+    terminated: np.ndarray
+    presented: np.ndarray
+    passed: np.ndarray
+
+
+def roll_out_on_host(
+    environment: Environment[Any],
+    episodes: int,
+    simulator: NeuronSimulator | None,
+    actors: Any,
+    keys: Key[Array, " actors"],
+    seed: int,
+) -> Counts:
+    """Run episodes of several actors, one actor after the other.
+
+    Args:
+        environment: with a robot that is stepped on the host.
+        episodes: of each actor.
+        simulator: the neurons' answers; None without neurons.
+        actors: one kind of actor, its arrays with a leading axis of actors.
+        keys: of each actor's draws.
+        seed: of the episodes of the bodies.
+    """
+    robot = environment.robot
+    assert isinstance(robot, HostRobot)
+    n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
+    readouts = () if simulator is None else simulator.percentiles.shape[:-1]
+    shape = (len(keys), episodes)
+    counts = Counts(
+        np.zeros(shape),
+        np.zeros(shape, np.int64),
+        np.zeros(shape, bool),
+        np.zeros((len(keys), n_conditions), np.int64),
+        np.zeros((len(keys), n_conditions, *readouts), np.int64),
+    )
+    side_by_side = min(AT_ONCE, episodes)
+    for number, key in enumerate(keys):
+        actor = jax.tree.map(lambda part, number=number: part[number], actors)
+        for first in range(0, episodes, side_by_side):
+            # The last ones of a wave may be more than were asked for: the program is compiled for one number.
+            seeds = [(seed, number, first + i) for i in range(side_by_side)]
+            here = slice(first, min(first + side_by_side, episodes))
+            wave = _wave(environment, simulator, actor, jax.random.fold_in(key, first), seeds, here.stop - first)
+            for whole, part in zip(counts[:3], wave[:3], strict=True):
+                whole[number, here] = part[: here.stop - first]
+            counts.presented[number] += wave.presented
+            counts.passed[number] += wave.passed
+    return counts
+
+
+def paths_on_host(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actors: Any,
+    keys: Key[Array, " actors"],
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One episode of each actor with all that happened in it; arguments as in `roll_out_on_host`.
+
+    Returns:
+        observations before each iteration and after the last, commands, and lengths, as `animat.studies.paths.Paths`
+        has them.
+    """
+    robot, n = environment.robot, len(keys)
+    assert isinstance(robot, HostRobot)
+    observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)
+    commands, lengths = np.zeros((n, robot.episode_limit), np.float32), np.zeros(n, np.int64)
+    for number, key in enumerate(keys):
+        actor = jax.tree.map(lambda part, number=number: part[number], actors)
+        bodies = Bodies(robot, [(seed, number)])
+        state = _started(environment, jax.random.split(key, 1))._replace(robot=bodies.begin())
+        observations[number] = state.robot
+        for iteration in range(robot.episode_limit):
+            command, state, _, _ = _iteration(environment, simulator, actor, key, np.int32(iteration), state)
+            stepped = bodies.step(np.asarray(command).reshape(1, -1))
+            commands[number, iteration] = np.asarray(command)[0]
+            observations[number, iteration + 1 :] = stepped.observation
+            lengths[number] += 1
+            if stepped.ended[0]:
+                break
+            state = state._replace(robot=stepped.observation)
+    return observations, commands, lengths
+
+
+def _wave(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actor: Acting,
+    key: PRNGKeyArray,
+    seeds: Sequence[tuple[int, ...]],
+    counted: int,
+) -> Counts:
+    """One episode of each of several bodies; only the first `counted` ones count."""
+    robot, n = environment.robot, len(seeds)
+    assert isinstance(robot, HostRobot)
+    bodies = _bodies(robot, seeds)
+    state = _started(environment, jax.random.split(key, n))._replace(robot=bodies.begin())
+    going = np.arange(n) < counted
+    returns, lengths, terminated = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, bool)
+    presented, passed = _nothing(environment, simulator)
+    for iteration in range(robot.episode_limit):
+        command, state, delivered, passes = _iteration(environment, simulator, actor, key, np.int32(iteration), state)
+        stepped = bodies.step(np.asarray(command).reshape(n, -1))
+        returns += np.where(going, stepped.reward, 0.0)
+        lengths += going
+        terminated |= going & stepped.terminated
+        if len(presented):
+            np.add.at(presented, np.asarray(delivered)[going], 1)
+            np.add.at(passed, np.asarray(delivered)[going], np.asarray(passes)[going])
+        going &= ~stepped.ended
+        if not going.any():
+            break
+        if stepped.ended.any():
+            # What has ended moves on and counts no further: a body may not be stepped after its end.
+            bodies.begin(np.flatnonzero(stepped.ended).tolist())
+        state = state._replace(robot=bodies.observation)
+    return Counts(returns, lengths, terminated, presented, passed)
+
+
+def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
+    """Bodies that have not begun; those of the last wave, where what was before an episode does not count."""
+    bodies: Bodies | None = getattr(_LAST, "bodies", None)
+    if bodies is None or not robot.keeps_state or (bodies.robot, len(bodies)) != (robot, len(seeds)):
+        bodies = _LAST.bodies = Bodies(robot, seeds)
+    bodies.take_seeds(seeds)
+    return bodies
+
+
+def _nothing(environment: Environment[Any], simulator: NeuronSimulator | None) -> tuple[np.ndarray, np.ndarray]:
+    if simulator is None or environment.n_actions is None:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    n = environment.n_actions
+    return np.zeros(n, np.int64), np.zeros((n, *simulator.percentiles.shape[:-1]), np.int64)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=FAST_TO_COMPILE)
+def _started(environment: Environment[Any], keys: Key[Array, " episodes"]) -> State:
+    return jax.vmap(environment.reset)(keys).carried
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=FAST_TO_COMPILE)
+def _iteration(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actor: Acting,
+    key: PRNGKeyArray,
+    iteration: Array,
+    state: State,
+) -> tuple[Float[Array, "episodes *commands"], State, Array, Array]:
+    """Commands, the state that the neurons leave, what was delivered, and whether the answer was P50 or more."""
+    n, n_drawn = len(state.iteration), environment.n_drawn
+    uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
+    observation = jax.vmap(environment.observe)(state) / environment.scales
+    action = actor.act(environment, observation, uniforms[:, :n_drawn])
+    delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(
+        uniforms[:, n_drawn:], state, action, simulator
+    )
+    passes = jnp.zeros(n, bool)
+    if simulator is not None:
+        passes = answer.rate_hz >= simulator.percentiles[..., N_PERCENTILES // 2]
+    return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered, passes

@@ -1,0 +1,269 @@
+"""Any environment of Gymnasium as a body: `gymnasium:Reacher-v5`, `gymnasium:my_package.envs:Rover-v0`."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, final
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from animat.errors import InvalidArgument, first_line, shown
+from animat.records import Flag, Number, Whole, record
+from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Iterations, Quantity
+from animat.robots.host import Body, HostRobot, within
+from animat.robots.registry import REGISTRY
+
+FAMILY = "gymnasium"
+_ID = re.compile(r"(?:[A-Za-z_][\w.]{0,200}:)?[\w./:-]{1,200}")
+MOST_OBSERVED = 4_096
+"""Numbers of an observation at most: a policy is a small network."""
+MOST_LEVELS = 1_024
+LARGEST_BOUND = 1e6
+"""Of an observation: a bound beyond says nothing on how large it usually is."""
+MEASURED_STEPS = 1_000
+"""Of random actions, from which the scales of unbounded observations are measured."""
+_SEED = 20_260_000
+
+Scale = Annotated[Number, Field(ge=LEAST_SCALE, le=LARGEST_SCALE)]
+
+
+@final
+@record
+class GymnasiumRobot(HostRobot):
+    """An environment of Gymnasium, with an action space of kind Box or Discrete; its reward and its ends are its own.
+
+    A command in [-1, 1] becomes low + (u + 1) / 2 (high - low) of each dimension of a Box, or one of n equal levels of
+    a Discrete(n). `GymnasiumRobot.named` makes one by looking at the environment; all that was found is data, so a
+    policy is loaded where the environment is not installed.
+
+    Attributes:
+        id: as `gymnasium.make` takes it, with `module:` before it where importing that registers it.
+        settings: arguments of `gymnasium.make`, each with its name.
+        episode_limit: iterations after which an episode is cut off.
+        low, high: of each dimension of a Box; none of a Discrete.
+        levels: n of a Discrete(n); 0: a Box.
+        scales: of each number that is observed, the observation flattened.
+        keeps_state: as in `HostRobot`.
+
+    Raises:
+        InvalidArgument: for parameters that no environment has.
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("gymnasium",)
+
+    id: str
+    settings: tuple[tuple[str, Number], ...]
+    episode_limit: Iterations
+    low: Annotated[tuple[Number, ...], Field(max_length=64)]
+    high: Annotated[tuple[Number, ...], Field(max_length=64)]
+    levels: Annotated[Whole, Field(ge=0, le=MOST_LEVELS)]
+    scales: Annotated[tuple[Scale, ...], Field(min_length=1, max_length=MOST_OBSERVED)]
+    keeps_state: Flag
+
+    def __post_init__(self) -> None:
+        if not _ID.fullmatch(self.id):
+            raise InvalidArgument(f"id: expected one of Gymnasium's, got {shown(self.id)}")
+        if len(self.low) != len(self.high) or bool(self.low) == bool(self.levels):
+            raise InvalidArgument("low, high, levels: expected the bounds of a Box, or the levels of a Discrete")
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """`gymnasium:` and its id."""
+        return f"{FAMILY}:{self.id}"
+
+    @property
+    def n_commands(self) -> int:  # type: ignore[override]
+        """One for each dimension of a Box; one for a Discrete."""
+        return len(self.low) or 1
+
+    @property
+    def baseline_commands(self) -> tuple[float, ...] | None:  # type: ignore[override]
+        """The middle of each level."""
+        return tuple((2 * i + 1) / self.levels - 1 for i in range(self.levels)) or None
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return tuple(Quantity(f"observation_{i}", "1", scale) for i, scale in enumerate(self.scales))
+
+    def actions(self, commands: Float[np.ndarray, "bodies commands"]) -> Sequence[Any]:
+        shares = (np.asarray(commands, np.float64) + 1.0) / 2.0
+        if self.levels:
+            level: list[int] = np.clip(shares[:, 0] * self.levels, 0, self.levels - 1).astype(int).tolist()
+            return level
+        low, high = np.array(self.low), np.array(self.high)
+        return np.clip(low + shares * (high - low), low, high)  # type: ignore[no-any-return]
+
+    def body(self) -> Body:
+        module = self.id.rpartition(":")[0]
+        if module and module not in sys.modules:
+            # A file could name any module.
+            raise InvalidArgument(
+                f"{self.name}: expected {module} to be imported, got a policy alone: import it first (on the command "
+                f"line: --robot {self.name})"
+            )
+        body = _Environment(self.id, self.settings)
+        if (body.low, body.high, body.levels, body.observed) != (self.low, self.high, self.levels, len(self.scales)):
+            raise InvalidArgument(
+                f"{self.name}: expected {len(self.scales)} observations and {self.levels or len(self.low)} "
+                f"{'levels' if self.levels else 'actions'}, with which the policy was made, got an environment with "
+                "others: it is of another version"
+            )
+        return body
+
+    def prepare(self) -> None:
+        _imported(self.id)
+
+    def caveats(self) -> tuple[str, ...]:
+        if self.keeps_state:
+            return ()
+        return (
+            f"{self.name}: the same seed and commands do not give the same episode, so what a body does between two "
+            "checkpoints cannot be kept: at each of them episodes begin anew",
+        )
+
+    @classmethod
+    def named(cls, id: str, /, *, episode_limit: int | None = None, **settings: float) -> GymnasiumRobot:
+        """The environment of this id; it is made, looked at, and moved at random for some steps.
+
+        Args:
+            id: as `gymnasium.make` takes it.
+            episode_limit: iterations after which an episode is cut off; None: as it is registered.
+            settings: arguments of `gymnasium.make`.
+
+        Raises:
+            InvalidArgument: for one that does not exist or is not installed, with spaces that a culture cannot serve or
+                without a limit.
+            BodyFailed: for one that raises, hangs, or gives NaN.
+        """
+        if not _ID.fullmatch(id):
+            raise InvalidArgument(f"robot: expected gymnasium: and an environment's id, got {shown(f'{FAMILY}:{id}')}")
+        _imported(id)
+        at_first = cls(id, tuple(settings.items()), 1, (0.0,), (1.0,), 0, (1.0,), False)
+        with within(at_first, "being made"):
+            body = _Environment(id, tuple(settings.items()))
+        limit = episode_limit or body.limit
+        if limit is None:
+            raise InvalidArgument(
+                f"{FAMILY}:{id}: expected a limit of an episode, got an environment without one: "
+                "--parameters episode_limit=1000"
+            )
+        if not 1 <= limit <= LONGEST_EPISODE:
+            raise InvalidArgument(f"episode_limit: expected from 1 to {LONGEST_EPISODE:,} iterations, got {limit:,}")
+        from animat.robots.measuring import is_repeatable, measured_scales
+
+        scales = tuple(body.bounds) if all(body.bounds) else (1.0,) * body.observed
+        robot = cls(id, tuple(settings.items()), limit, body.low, body.high, body.levels, scales, False)
+        scales = measured_scales(robot, body.bounds, MEASURED_STEPS, _SEED)
+        return cls(id, robot.settings, limit, body.low, body.high, body.levels, scales, is_repeatable(robot, _SEED))
+
+
+REGISTRY.add_family(FAMILY, GymnasiumRobot)
+
+
+class _Environment(Body):
+    """One environment, without Gymnasium's checks and time limit."""
+
+    def __init__(self, id: str, settings: tuple[tuple[str, float], ...]) -> None:
+        import gymnasium
+        from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+        name = f"{FAMILY}:{id}"
+        try:
+            env: Any = gymnasium.make(id, disable_env_checker=True, **dict[str, Any](settings))
+        except Exception as error:
+            # Anything may go wrong in somebody else's environment.
+            raise InvalidArgument(f"{name}: expected an environment of Gymnasium, got {_why(error)}") from error
+        _expect_sound_mujoco(name, env)
+        self.limit: int | None = None
+        while isinstance(env, OrderEnforcing | PassiveEnvChecker | TimeLimit):
+            if isinstance(env, TimeLimit):
+                self.limit = env._max_episode_steps
+            env = env.env
+        self._env, self._step = env, env.step
+        self.low, self.high, self.levels = _commands(name, env.action_space)
+        self._shape, self._dtype = env.action_space.shape, env.action_space.dtype
+        self._start = int(getattr(env.action_space, "start", 0))
+        self.bounds = _observed(name, env.observation_space)
+        self.observed = len(self.bounds)
+        self._is_flat = env.observation_space.shape == (self.observed,)
+
+    def reset(self, seed: int) -> Float[np.ndarray, " observations"]:
+        return self._flat(self._env.reset(seed=seed)[0])
+
+    def step(self, action: Any) -> tuple[Float[np.ndarray, " observations"], float, bool, bool]:
+        given = action + self._start if self.levels else action.astype(self._dtype).reshape(self._shape)
+        observation, reward, terminated, truncated, _ = self._step(given)
+        return self._flat(observation), reward, terminated, truncated
+
+    def _flat(self, observation: Any) -> Float[np.ndarray, " observations"]:
+        if not self._is_flat:
+            observation = np.reshape(observation, -1)
+        if len(observation) != self.observed:
+            raise InvalidArgument(f"observation: expected {self.observed} numbers, got {len(observation)}")
+        return observation  # type: ignore[no-any-return]
+
+
+def _imported(id: str) -> None:
+    module = id.rpartition(":")[0]
+    if not module:
+        return
+    try:
+        importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        raise InvalidArgument(
+            f"robot: expected {FAMILY}:module:Id with a module that can be imported, got {first_line(error)}"
+        ) from error
+
+
+def _why(error: Exception) -> str:
+    """What Gymnasium says, with our extra for MuJoCo, which brings a version without faults."""
+    said = first_line(error)
+    return f'{said.partition(",")[0]}: pip install "animat[mujoco]"' if "mujoco" in said.lower() else said
+
+
+def _expect_sound_mujoco(name: str, env: Any) -> None:
+    is_of_mujoco = hasattr(env.unwrapped, "model") and "mujoco" in sys.modules
+    if is_of_mujoco and getattr(sys.modules["mujoco"], "__version__", "") == "4.0.0":
+        raise InvalidArgument(
+            f"{name}: expected a MuJoCo that computes accelerations right, got 4.0.0, which does not: "
+            'pip install "mujoco<4"'
+        )
+
+
+def _commands(name: str, space: Any) -> tuple[tuple[float, ...], tuple[float, ...], int]:
+    """Bounds of a Box, or levels of a Discrete."""
+    from gymnasium.spaces import Box, Discrete
+
+    if isinstance(space, Discrete):
+        if space.n > MOST_LEVELS:
+            raise InvalidArgument(f"{name}: expected at most {MOST_LEVELS:,} actions, got {space.n:,}")
+        return (), (), int(space.n)
+    if not isinstance(space, Box):
+        raise InvalidArgument(f"{name}: expected an action space of kind Box or Discrete, got {type(space).__name__}")
+    if not np.issubdtype(space.dtype, np.floating):
+        raise InvalidArgument(f"{name}: expected actions that are floating-point numbers, got {space.dtype}")
+    low, high = space.low.ravel().astype(float), space.high.ravel().astype(float)
+    if not 1 <= len(low) <= 64:
+        raise InvalidArgument(f"{name}: expected actions of 1 to 64 dimensions, got {len(low)}")
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        raise InvalidArgument(f"{name}: expected actions with finite bounds, low below high, got {shown(space)}")
+    return tuple(low.tolist()), tuple(high.tolist()), 0
+
+
+def _observed(name: str, space: Any) -> list[float]:
+    """How large each number of the flattened observation can be; 0 where that is not known."""
+    from gymnasium.spaces import Box
+
+    if not isinstance(space, Box):
+        raise InvalidArgument(f"{name}: expected an observation space of kind Box, got {type(space).__name__}")
+    bound = np.maximum(np.abs(space.low.astype(float)), np.abs(space.high.astype(float))).ravel()
+    if not 1 <= len(bound) <= MOST_OBSERVED:
+        raise InvalidArgument(f"{name}: expected observations of 1 to {MOST_OBSERVED:,} numbers, got {len(bound):,}")
+    known = np.where((bound >= LEAST_SCALE) & (bound <= LARGEST_BOUND), bound, 0.0)
+    # Without the digits that float32 adds.
+    return [float(f"{each:.6g}") for each in known]

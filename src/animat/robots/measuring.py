@@ -1,0 +1,68 @@
+"""What is found out on a body of others by moving it at random: how large its observations are, what decides it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from animat.robots.host import Bodies, HostRobot
+
+_REPEATED_STEPS = 50
+
+
+def measured_scales(robot: HostRobot, bounds: Sequence[float], steps: int, seed: int) -> tuple[float, ...]:
+    """The scale of each observed number: its bound, or where none is known the root mean square over random commands.
+
+    To two digits, so that it is the same where a processor rounds otherwise; 1 for what is always 0.
+
+    Args:
+        robot: of any scales.
+        bounds: how large each number can be; 0 where that is not known.
+        steps: iterations, in episodes one after the other.
+        seed: of episodes and commands.
+
+    Raises:
+        BodyFailed: as `Bodies.step`.
+    """
+    rng = np.random.default_rng(seed)
+    bodies = Bodies(robot, [(seed,)])
+    observed = [bodies.begin()[0]]
+    for _ in range(steps):
+        stepped = bodies.step(_random_command(robot, rng))
+        observed.append(stepped.observation[0])
+        if stepped.ended[0]:
+            observed.append(bodies.begin()[0])
+    size = np.sqrt(np.mean(np.square(observed, dtype=np.float64), axis=0))
+    return tuple(
+        float(bound or f"{min(max(float(rms), 1e-9), 1e9):.2g}") if bound or rms > 1e-9 else 1.0
+        for bound, rms in zip(bounds, size, strict=True)
+    )
+
+
+def is_repeatable(robot: HostRobot, seed: int) -> bool:
+    """Whether an episode is the same again in a new body, by its seed and commands, whatever was before it."""
+    used, new = Bodies(robot, [(seed, 1)]), Bodies(robot, [(seed, 2)])
+    rng = np.random.default_rng(seed)
+    used.begin()
+    for _ in range(_REPEATED_STEPS):
+        if used.step(_random_command(robot, rng)).ended[0]:
+            break
+    again = Bodies(robot, [(seed, 2)])
+    # The same episode, the one body fresh, the other after an episode of its own.
+    used.take_seeds([(seed, 2)])
+    starts = [each.begin() for each in (used, new, again)]
+    if any(not np.array_equal(start, starts[0]) for start in starts):
+        return False
+    for _ in range(_REPEATED_STEPS):
+        command = _random_command(robot, rng)
+        one, *others = (each.step(command) for each in (used, new, again))
+        if any(not np.array_equal(a, b) for other in others for a, b in zip(one, other, strict=True)):
+            return False
+        if one.ended[0]:
+            break
+    return True
+
+
+def _random_command(robot: HostRobot, rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(-1.0, 1.0, (1, robot.n_commands)).astype(np.float32)

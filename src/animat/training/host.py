@@ -1,0 +1,215 @@
+"""Soft Actor-Critic with bodies that are stepped on the host: acting and learning compiled, the bodies in between.
+
+A round is the one of `animat.training.sac`: every body does one iteration, which is remembered, then come the gradient
+steps. It is cut where the bodies move: one compiled program takes what they did, learns, and acts for the next round.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from animat.compilation import FAST_TO_COMPILE
+from animat.environment import Environment
+from animat.neurons.history import AT_FIRST
+from animat.neurons.simulator import NeuronSimulator
+from animat.robots.host import Bodies, HostRobot, Standing
+from animat.training.exploration import ended_episodes
+from animat.training.sac import (
+    Finished,
+    Learner,
+    average,
+    begin,
+    choose,
+    finished_alone,
+    learn,
+    state_of,
+    transitions,
+    uniforms_of,
+)
+from animat.training.settings import SAC
+from animat.wrappers import EpisodeLimit
+
+
+class Acted(NamedTuple):
+    """What a policy did in a round, in each of its environments.
+
+    Attributes:
+        action: as drawn.
+        command: that the body is to be moved by.
+        neurons: what they remember after their answer.
+    """
+
+    action: Array
+    command: Float[Array, "environments *commands"]
+    neurons: Float[Array, "environments 2"]
+
+
+class Moved(NamedTuple):
+    """What the bodies did then (`animat.robots.host.Stepped`), and what is observed where ended episodes began anew."""
+
+    observation: Float[Array, "environments observations"]
+    reward: Float[Array, " environments"]
+    ended: Bool[Array, " environments"]
+    begun: Float[Array, "environments observations"]
+
+
+def act(
+    environment: Environment[Any], settings: SAC, learner: Learner, simulator: NeuronSimulator | None
+) -> tuple[Learner, Acted]:
+    """The actions of a round; arguments as in `animat.training.sac.train_chunk`."""
+    key, use = jax.random.split(learner.key)
+    acting, _ = uniforms_of(environment, settings)
+    return _acted(environment, learner._replace(key=key), simulator, jax.random.uniform(use, acting))
+
+
+def learn_and_act(
+    environment: Environment[Any],
+    settings: SAC,
+    learner: Learner,
+    acted: Acted,
+    moved: Moved,
+    simulator: NeuronSimulator | None,
+    index: Int[Array, ""],
+) -> tuple[Learner, Acted, Finished]:
+    """Remember and learn from a round, and act in the next one.
+
+    Args:
+        environment, settings, learner, simulator: as in `animat.training.sac.train_chunk`.
+        acted, moved: the round.
+        index: its number.
+    """
+    acting, learning = uniforms_of(environment, settings)
+    n_acting = math.prod(acting)
+    key, use = jax.random.split(learner.key)
+    uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
+    written = index * settings.environments
+
+    before, (observation, reward, ended, begun) = learner.episodes, moved
+    after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons)
+    state, next_state = state_of(environment, before), state_of(environment, after)
+    rows = transitions(settings, state, next_state, acted.action, reward, ended)
+    returns = learner.returns + reward
+    finished = finished_alone(learner.exploration, ended, returns)
+    learner = learner._replace(
+        replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
+        episodes=after._replace(
+            robot=begun,
+            iteration=jnp.where(ended, 0, after.iteration),
+            neurons=jnp.where(ended[:, None], jnp.array(AT_FIRST, jnp.float32), after.neurons),
+        ),
+        returns=jnp.where(ended, 0.0, returns),
+        exploration=ended_episodes(learner.exploration, ended, returns),
+        key=key,
+    )
+    available = jnp.minimum(written + settings.environments, settings.replay)
+    learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
+    learner = learner._replace(deployed=average(settings, learner.deployed, learner.trained.actor, index))
+    return *_acted(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
+
+
+def _acted(
+    environment: Environment[Any], learner: Learner, simulator: NeuronSimulator | None, uniforms: Array
+) -> tuple[Learner, Acted]:
+    observation = jax.vmap(environment.observe)(learner.episodes) / environment.scales
+    action, exploration, noise = choose(environment, learner, observation, uniforms)
+    responded = jax.vmap(environment.respond, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
+    return learner._replace(exploration=exploration), Acted(
+        action, responded.command, jnp.broadcast_to(responded.answer.history, (len(observation), 2))
+    )
+
+
+@lru_cache(maxsize=8)
+def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], ...]:
+    """`begin`, `act` and `learn_and_act` for several policies side by side."""
+    beginning = jax.vmap(partial(begin, EpisodeLimit(environment), algorithm))
+    acting = jax.vmap(partial(act, environment, algorithm), in_axes=(0, None))
+    learning = jax.vmap(partial(learn_and_act, environment, algorithm), in_axes=(0, 0, 0, None, None))
+    return (
+        jax.jit(beginning, compiler_options=FAST_TO_COMPILE),
+        jax.jit(acting, donate_argnums=0, compiler_options=FAST_TO_COMPILE),
+        jax.jit(learning, donate_argnums=(0, 1), compiler_options=FAST_TO_COMPILE),
+    )
+
+
+def programs_on_host(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """What `animat.training.group.programs` gives, for a robot that is stepped on the host.
+
+    In the learners between chunks, bodies are data (`Standing`), so that checkpoints are as those of other robots. The
+    bodies themselves are made when the first chunk is trained.
+    """
+    chunks = _Chunks(environment, algorithm)
+    return chunks.begin, chunks
+
+
+class _Chunks:
+    def __init__(self, environment: Environment[Any], algorithm: SAC) -> None:
+        assert isinstance(environment.robot, HostRobot)
+        self._robot, self._n = environment.robot, algorithm.environments
+        self._beginning, self._act, self._learn_and_act = _compiled(environment, algorithm)
+        self._bodies: Bodies | None = None
+
+    def begin(self, keys: PRNGKeyArray) -> Learner:
+        """Policies that have learned nothing yet."""
+        members = len(keys)
+        # Of each policy its own, as its other draws are.
+        words = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
+        self._seeds = [(*word, body) for word in words for body in range(self._n)]
+        learners: Learner = self._beginning(keys)
+        none = Standing.of_none(self._robot, members * self._n)
+        return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
+
+    def __call__(
+        self, learners: Learner, simulator: NeuronSimulator | None, first_round: Array, last_round: Array
+    ) -> tuple[Learner, Finished]:
+        """As `animat.training.sac.train_chunk`."""
+        members = len(learners.returns)
+        finished = Finished(np.zeros(members), np.zeros(members))  # type: ignore[arg-type]
+        if int(last_round) == int(first_round):
+            return learners, finished
+        learners, bodies = self._standing(learners)
+        learners, acted = self._act(learners, simulator)
+        for index in range(int(first_round), int(last_round)):
+            commands = np.asarray(acted.command).reshape(len(self._seeds), -1)
+            stepped = bodies.step(commands)
+            ended = np.flatnonzero(stepped.ended)
+            begun = bodies.begin(ended.tolist()) if len(ended) else stepped.observation
+            moved = Moved(stepped.observation, stepped.reward.astype(np.float32), stepped.ended, begun)  # type: ignore[arg-type]
+            learners, acted, of_round = self._learn_and_act(
+                learners, acted, self._by_policy(moved), simulator, np.int32(index)
+            )
+            if len(ended):
+                finished = Finished(*(a + np.asarray(b) for a, b in zip(finished, of_round, strict=True)))
+        standing = self._by_policy(bodies.standing)
+        return learners._replace(episodes=learners.episodes._replace(robot=standing)), finished
+
+    def _standing(self, learners: Learner) -> tuple[Learner, Bodies]:
+        """The bodies where the learners have them, and learners that see of them the observation alone."""
+        flat = Standing(
+            *(np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
+        )
+        episodes = learners.episodes
+        is_there = True
+        if self._bodies is None or not flat.commands.shape[1]:
+            self._bodies = Bodies(self._robot, self._seeds)
+            is_there = self._bodies.stand(flat)
+        observation = self._by_policy(self._bodies.observation)
+        if is_there:
+            return learners._replace(episodes=episodes._replace(robot=observation)), self._bodies
+        anew = episodes._replace(
+            robot=observation,
+            iteration=jnp.zeros_like(episodes.iteration),
+            neurons=jnp.broadcast_to(jnp.array(AT_FIRST, jnp.float32), episodes.neurons.shape),
+        )
+        return learners._replace(episodes=anew, returns=jnp.zeros_like(learners.returns)), self._bodies
+
+    def _by_policy(self, flat: Any) -> Any:
+        """Arrays of all bodies as those of each policy."""
+        return jax.tree.map(lambda part: np.reshape(part, (len(part) // self._n, self._n, *part.shape[1:])), flat)
