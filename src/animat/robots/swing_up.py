@@ -72,7 +72,7 @@ class SwingUp(Robot[SwingUpState]):
 
     name: ClassVar[str] = "swing-up"
     noise_size: ClassVar[int] = 0
-    paper_iterations: ClassVar[int] = 500_000
+    paper_iterations: ClassVar[int] = 1_000_000
     # Full power either way swings highest, and is what random commands come near to swinging it up with.
     baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
 

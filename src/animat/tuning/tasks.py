@@ -123,7 +123,7 @@ class TrainTrials(StudyTask):
             networks = together.networks(i, greedy=self.study.actions == "most probable")
             returns: list[float] | None = None
             if networks is not None:
-                simulator = _at(judged, training.minute(last - 1))
+                simulator = _at(judged, training.minute(CHUNKS - 1))
                 n = len(self.members)
                 ran = roll_out(environment, simulator, networks, n, episodes=self.episodes, seed=self.seeds[1])
                 returns = ran.returns.mean(axis=1).tolist()
