@@ -273,9 +273,9 @@ def forward(calls: int) -> dict[str, Any]:
     from animat.coding.mapping import mapping_named
     from animat.responses.condition import Condition
     from animat.robots.cartpole import Cartpole
+    from animat.training.networks import Layer
+    from animat.training.networks import forward as jax_forward
     from animat.training.policy import Policy
-    from animat.training.sac import Layer
-    from animat.training.sac import forward as jax_forward
 
     rng = np.random.default_rng(0)
     sizes = ((4, 64), (64, 64), (64, 5))

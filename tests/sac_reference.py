@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from animat.training.sac import Batch, Network, Trained, initial_networks
+from animat.training.networks import Network, initial_networks
+from animat.training.sac import Batch, Trained
 
 
 def drawn_networks(

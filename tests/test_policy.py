@@ -32,9 +32,9 @@ from animat.responses.conditions import conditions_named
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
+from animat.training.networks import Layer, forward
 from animat.training.policy import Policy, load_policies
 from animat.training.provenance import Simulated, Trained
-from animat.training.sac import Layer, forward
 from animat.training.specification import Percentiles
 from animat.wrappers import Delivery
 

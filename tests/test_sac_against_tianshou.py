@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import sac_reference as reference
-from animat.training.sac import Batch, Layer, Network, Trained, continuous_losses, discrete_losses
+from animat.training.networks import Layer, Network
+from animat.training.sac import Batch, Trained, continuous_losses, discrete_losses
 from animat.training.settings import SAC
 
 pytestmark = pytest.mark.oracle

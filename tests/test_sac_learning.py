@@ -20,17 +20,16 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
+from animat.training.networks import Network, forward
 from animat.training.sac import (
     Batch,
     Finished,
     Learner,
-    Network,
     Trained,
     begin,
     continuous_losses,
     discrete_losses,
     draw_action,
-    forward,
     train_chunk,
 )
 from animat.training.settings import SAC

@@ -22,8 +22,9 @@ from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.robots.host import HostRobot
+from animat.training.networks import Layer, Network, forward
 from animat.training.policy import Policy
-from animat.training.sac import Layer, Network, as_commands, draw_action, forward
+from animat.training.sac import as_commands, draw_action
 
 Seen = Float[Array, "episodes observations"]
 Uniforms = Float[Array, "episodes drawn"]

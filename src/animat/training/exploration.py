@@ -102,4 +102,5 @@ def ended_episodes(
 def is_worth_it(exploration: Exploration) -> Bool[Array, ""]:
     """Whether the policy alone does no better, as far as is known: of no episodes the mean is NaN."""
     alone, with_held = exploration.returns / exploration.episodes
-    return ~(alone > with_held)
+    is_better: Bool[Array, ""] = alone > with_held
+    return ~is_better

@@ -16,31 +16,20 @@ side; a transition is one packed row; the random numbers of an iteration are one
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
 from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
+from animat.training.networks import Network, forward, initial_networks, squashed_normal
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit
-
-
-class Layer(NamedTuple):
-    """Weights and biases of one layer; leading axes stack networks."""
-
-    weight: Float[Array, "*stack inputs outputs"]
-    bias: Float[Array, "*stack 1 outputs"]
-
-
-Network = tuple[Layer, ...]
 
 
 class Trained(NamedTuple):
@@ -97,54 +86,6 @@ class Finished(NamedTuple):
 
     episodes: Float[Array, ""]
     returns: Float[Array, ""]
-
-
-# --- networks -------------------------------------------------------------------------------------------------------
-
-
-def initial_networks(key: PRNGKeyArray, *shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> list[Network]:
-    """New networks of the given sizes (inputs, hidden, ..., outputs) and stacks (how many of them side by side).
-
-    Weights are uniform in +-1/sqrt(inputs), a hundred times smaller in the last layer: a policy starts undecided.
-    """
-    counts = [math.prod(stack) * sum(i * o for i, o in itertools.pairwise(sizes)) for sizes, stack in shapes]
-    # Drawn at once and cut up: a random generator in the program costs more to compile than to run.
-    draws = jax.random.uniform(key, (sum(counts),), minval=-1.0, maxval=1.0)
-    networks = []
-    for sizes, stack in shapes:
-        layers = []
-        for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
-            shape = (*stack, inputs, outputs)
-            used, draws = draws[: math.prod(shape)], draws[math.prod(shape) :]
-            limit = (0.01 if i == len(sizes) - 2 else 1.0) / math.sqrt(inputs)
-            layers.append(Layer(limit * used.reshape(shape), jnp.zeros((*stack, 1, outputs))))
-        networks.append(tuple(layers))
-    return networks
-
-
-def forward(network: Network, inputs: Float[Array, "*_ batch inputs"]) -> Float[Array, "*_ batch outputs"]:
-    """Hidden layers of rectified units, then a linear one."""
-    hidden = inputs
-    for layer in network[:-1]:
-        hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
-    return hidden @ network[-1].weight + network[-1].bias
-
-
-def squashed_normal(
-    outputs: Float[Array, "batch means_and_deviations"], uniforms: Float[Array, "batch commands"]
-) -> tuple[Float[Array, "batch commands"], Float[Array, " batch"]]:
-    """A continuous action a = tanh(z) and log p(a), the z of its commands independent normal numbers.
-
-    Their means stand in the first half of the actor's outputs, their log deviations in the second.
-    """
-    mean, log_std = jnp.split(outputs, 2, axis=-1)
-    log_std = jnp.clip(log_std, -5.0, 2.0)
-    standard = ndtri(jnp.clip(uniforms, 1e-6, 1.0 - 1e-6))
-    z = mean + jnp.exp(log_std) * standard
-    log_normal = -0.5 * standard**2 - log_std - 0.5 * math.log(2.0 * math.pi)
-    # log(1 - tanh(z)^2), in the form that does not lose its digits for large |z|
-    log_slope = 2.0 * (math.log(2.0) - z - jax.nn.softplus(-2.0 * z))
-    return jnp.tanh(z), jnp.sum(log_normal - log_slope, axis=-1)
 
 
 # --- losses ---------------------------------------------------------------------------------------------------------
