@@ -68,12 +68,14 @@ def test_rungs_are_shares_of_a_training(rungs: int, keep: int, chunks: list[int]
     assert chunks[-1] == CHUNKS
 
 
+BODY = 'name = "pendulum"\nkind = "gymnasium:Pendulum-v1"'
 SEARCH = f"{PLAIN}[tune.search]\n"
 BAD = {
     "no TOML": ("[tune", ["TOML"]),
     "no study": ("[tune]\ntrials = 3\n", ["[[robots]]"]),
     "two robots": ("[tune]\n[[arms]]\nname = 'a'\n", ["robots", "got 2"]),
     "an arm that is not trained": (f"{PLAIN}trained = false\n", ["arms.trained"]),
+    "a body of others": (PLAIN.replace('name = "cartpole"', BODY), ["gymnasium:Pendulum-v1", "stepped in JAX"]),
     "no trials": (f"{PLAIN}[tune]\ntrials = 0\n", ["tune.trials", "at least 1"]),
     "a misspelt key": (f"{PLAIN}[tune]\ntrails = 9\n", ["trails", "[tune]", "did you mean trials?"]),
     "more rungs than parts": (f"{PLAIN}[tune]\nrungs = 5\n", ["rungs", "60", "3^4"]),

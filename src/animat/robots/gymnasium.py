@@ -6,6 +6,7 @@ import importlib
 import re
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, final
 
 import numpy as np
@@ -127,6 +128,7 @@ class GymnasiumRobot(HostRobot):
         )
 
     @classmethod
+    @lru_cache(maxsize=32)  # a study asks for its robots often
     def named(cls, id: str, /, *, episode_limit: int | None = None, **settings: float) -> GymnasiumRobot:
         """The environment of this id; it is made, looked at, and moved at random for some steps.
 

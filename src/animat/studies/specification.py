@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
@@ -84,12 +83,6 @@ class Simulators:
             conditions_named(self.conditions)
 
 
-@lru_cache(maxsize=32)
-def _robot(kind: str, parameters: tuple[tuple[str, float], ...]) -> Robot[Any]:
-    """To look at a body of others takes a moment, and a study asks for its robots often."""
-    return robot_named(kind, **dict(parameters))
-
-
 @record
 class RobotSpec:
     """A robot of the study.
@@ -131,7 +124,7 @@ class RobotSpec:
 
     def robot(self) -> Robot[Any]:
         """The robot itself."""
-        return _robot(self.kind or self.name, tuple(self.parameters.items()))
+        return robot_named(self.kind or self.name, **self.parameters)
 
     @property
     def trained_for(self) -> int:

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from animat.errors import InvalidArgument, InvalidFile
 from animat.records import Seed, Whole, read_record, record
+from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
 from animat.studies.toml import read_toml, study_from
 from animat.training.specification import CHUNKS
@@ -85,13 +86,18 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
     """A study and how it is searched, checked together.
 
     Raises:
-        InvalidArgument: for other than one robot and one arm, an arm that is not trained, or as `read_space` does.
+        InvalidArgument: for other than one robot and one arm, an arm that is not trained, a body of others, or as
+            `read_space` does.
     """
     for what in ("robots", "arms"):
         if (n := len(getattr(study, what))) != 1:
             raise InvalidArgument(f"{what}: expected one [[{what}]] to tune for, got {n}")
     if not study.arms[0].trained:
         raise InvalidArgument("arms.trained: expected an arm that is trained, got one that is not")
+    if isinstance(robot := study.robots[0].robot(), HostRobot):
+        raise InvalidArgument(
+            f"robots: expected one that is stepped in JAX, as trials are trained side by side, got {robot.name}"
+        )
     return Tuning(study, tune, usual_space(study) if tune.search is None else read_space(tune.search, study))
 
 
