@@ -43,9 +43,16 @@ compiled_begin = jax.jit(begin, static_argnums=(0, 1))
 compiled_chunk = jax.jit(train_chunk, static_argnums=(0, 1))
 
 
-def start(environment: Environment[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
+def start(environment: Environment[Any], settings: SAC, key: PRNGKeyArray | None = None) -> Learner:
+    key = jax.random.key(0) if key is None else key
     learner: Learner = compiled_begin(EpisodeLimit(environment), settings, key)
     return learner
+
+
+def explored(learner: Learner) -> Learner:
+    """Where the policy alone is known to do better: no actions are held, and entropy is paid for."""
+    known = learner.exploration._replace(episodes=jnp.ones(2), returns=jnp.array([1e9, 0.0]))
+    return learner._replace(exploration=known)
 
 
 def chunk(
@@ -81,10 +88,7 @@ def trained_for(
 def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> None:
     limit = 3  # no divisor of the five rounds that the replay holds, so a row tells which round it is of
     environment = WithoutNeurons(Payer(pay=7.0, shows_iteration=True, episode_limit=limit), DISCRETE)
-    learner = start(environment, SMALL, jax.random.key(0))
-    # As where the policy alone is known to do better: no actions are held, and all episodes are its own.
-    known = learner.exploration._replace(episodes=jnp.ones(2), returns=jnp.array([1e9, 0.0]))
-    learner, finished = trained_for(environment, SMALL, rounds, learner=learner._replace(exploration=known))
+    learner, finished = trained_for(environment, SMALL, rounds, learner=explored(start(environment, SMALL)))
     expected_rows = np.full((5, 2, 7), np.nan)
     for index in range(rounds):
         counted = index % limit
@@ -193,7 +197,7 @@ def test_critics_converge_to_the_closed_form(limit: int, ends: bool) -> None:
     """One state, two actions: what is ahead ends with the episode, and critics know how much of it is left."""
     robot = Payer(pay=0.8, ends=ends, episode_limit=limit)
     environment = WithoutNeurons(robot, DISCRETE)
-    learner, _ = trained_for(environment, CLOSED_FORM, 3000)
+    learner, _ = trained_for(environment, CLOSED_FORM, 3000, learner=explored(start(environment, CLOSED_FORM)))
     pay = CLOSED_FORM.reward_scale * robot.pay
     alpha, p, value = soft_solution(pay)
     observation = jnp.ones((1, 1))
