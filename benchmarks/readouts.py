@@ -3,8 +3,7 @@
     python benchmarks/readouts.py [--cultures 1 2 3] [--places halves] [--frequencies 5 80] [--trials 500]
     python benchmarks/readouts.py --places corners --frequencies 20
 
-Of each virtual culture one recording is made, with its conditions mixed, one pulse each. With `corners` the stimulated
-places are the left half of the electrodes, the right half, both, and one electrode. Printed, as a table of
+Of each virtual culture one recording is made, with its conditions mixed, one pulse each. Printed, as a table of
 Markdown, is for each condition how often each readout gives a command above 0 (x of P50 or more), how often each corner
 of commands is hit, and Spearman's correlation of the readouts within the condition.
 """
@@ -15,7 +14,6 @@ import argparse
 import itertools
 
 import numpy as np
-from jaxtyping import Int64
 from scipy.stats import spearmanr
 
 from animat.cultures.virtual import VirtualCulture
@@ -23,28 +21,18 @@ from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import readouts_on
 from animat.responses.responses import Responses
-from animat.stimulation.array import MAXONE
-from animat.stimulation.places import NAMED, Places, electrodes_of
+from animat.stimulation.places import NAMED
 from animat.stimulation.protocol import Protocol
 
 
 def recorded(seed: int, places: str, frequencies_hz: tuple[float, ...], trials: int) -> Responses:
     """The responses of a virtual culture, read by halves or quadrants."""
     with VirtualCulture(seed) as culture:
-        electrodes = np.array(culture.stimulation_electrodes)
-        groups: Places = places if places in NAMED else corners_of(electrodes)
-        protocol = Protocol(order="mixed", places=groups, frequencies_hz=frequencies_hz, trials=trials)
+        protocol = Protocol(order="mixed", places=places, frequencies_hz=frequencies_hz, trials=trials)
         recording = culture.record(protocol, seed=1)
     by = conditions_named("frequency x electrode")
-    readouts = readouts_on(places if places in NAMED else "halves", recording.channels)
+    readouts = readouts_on("halves" if places == "corners" else places, recording.channels)
     return extract_responses(recording, by, readouts=readouts)
-
-
-def corners_of(electrodes: Int64[np.ndarray, " electrodes"]) -> tuple[tuple[int, ...], ...]:
-    """The left half of them, the right half, both, and the first of the left."""
-    x_um, y_um = MAXONE.position_um(electrodes)
-    left, right = electrodes_of("halves", electrodes, x_um, y_um)
-    return left, right, (*left, *right), left[:1]
 
 
 def table(responses: Responses) -> list[str]:
@@ -71,7 +59,7 @@ def main() -> None:
     """Record and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cultures", type=int, nargs="+", default=[1, 2, 3], help="seeds")
-    parser.add_argument("--places", default="halves", choices=[*NAMED, "corners"])
+    parser.add_argument("--places", default="halves", choices=NAMED)
     parser.add_argument("--frequencies", type=float, nargs="+", default=[5.0, 80.0], help="Hz")
     parser.add_argument("--trials", type=int, default=500, help="of each condition")
     given = parser.parse_args()

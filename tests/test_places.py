@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,13 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.cli.record import Record
-from animat.cli.responses import Fitting
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import write_synthetic_series
+from animat.responses.condition import Condition, abbreviated, listed
 from animat.responses.conditions import conditions_named
-from animat.stimulation.places import check_places, electrodes_of, read_places
+from animat.responses.extraction import extract_responses
+from animat.stimulation.places import check_places, count_places, electrodes_of, read_places
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
 from cultures import small_culture
@@ -146,14 +145,54 @@ def test_the_command_says_how_to_train_on_places(
 ) -> None:
     monkeypatch.setattr(Record, "_virtual", lambda *_: [])
     assert main(["record", "--places", "halves"]) == 0
-    assert "train --conditions 'frequency x electrode';" in capsys.readouterr().out
+    assert "each place is a condition; --conditions frequency mixes the places" in capsys.readouterr().out
     assert main(["record"]) == 0
     assert "--conditions" not in capsys.readouterr().out
 
 
-def test_recordings_of_places_that_are_mixed_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (file,) = write_synthetic_series(0, tmp_path / "recordings", sessions=1)
-    write_nwb(replace(read_recording(file), protocol=Protocol(places="halves")), tmp_path / "places.nwb")
-    for path, is_told in ((file, False), (tmp_path / "places.nwb", True)):
-        Fitting().timeline([path])
-        assert ("the recordings have places, which are mixed" in capsys.readouterr().err) == is_told
+@pytest.mark.parametrize(("hz", "by"), [((20.0,), "electrode"), ((5.0, 20.0), "frequency x electrode")])
+def test_places_are_conditions_where_none_are_asked_for(hz: tuple[float, ...], by: str) -> None:
+    protocol = Protocol(hz, "mixed", trials=20, places="halves", setup_s=0.0, pause_s=0.1)
+    with small_culture() as culture:
+        recording = culture.record(protocol)
+    responses = extract_responses(recording, burst_threshold=1.0)
+    assert responses.by == by and len(responses.conditions) == 2 * len(hz)
+    assert extract_responses(recording, conditions_named("frequency"), burst_threshold=1.0).by == "frequency"
+
+
+def test_corners_are_spread_over_the_halves() -> None:
+    left, right, both, one = electrodes_of("corners", GRID, X_UM, Y_UM)
+    assert (left, right, both, one) == ((0, 1, 4, 5, 8, 9), (2, 3, 6, 7, 10, 11), tuple(GRID.tolist()), (0,))
+    # 24 electrodes in a column, as many in another: of each the first, the last, and six between them.
+    column = np.arange(48)
+    of_many = electrodes_of("corners", column, 1.0 * (column >= 24), 1.0 * (column % 24))
+    assert of_many[0] == (0, 3, 7, 10, 13, 16, 20, 23) and of_many[1] == tuple(24 + e for e in of_many[0])
+    assert count_places("corners") == 4 == Protocol(places="corners").n_places
+    with pytest.raises(InvalidArgument, match=r"positions of 4 stimulation electrodes or more .* corners, got 3"):
+        electrodes_of("corners", GRID[:3], X_UM[:3], Y_UM[:3])
+
+
+@given(st.integers(4, 40), st.integers(0, 10**6))
+def test_corners_are_parts_of_the_halves_and_differ(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    positions = rng.permutation(100)[:n], rng.integers(0, 5, n) * 1.0, rng.integers(0, 5, n) * 1.0
+    half_left, half_right = electrodes_of("halves", *positions)
+    left, right, both, one = corners = electrodes_of("corners", *positions)
+    assert set(left) <= set(half_left) and set(right) <= set(half_right)
+    assert len(left) == min(8, len(half_left)) and len(right) == min(8, len(half_right))
+    assert set(both) == {*left, *right} and set(one) < set(left) and len(set(corners)) == 4
+
+
+def test_corners_are_recorded_at_one_frequency() -> None:
+    protocol = Record(places="corners")._protocol()
+    assert (protocol.frequencies_hz, protocol.trials, protocol.order) == ((20.0,), 1000, "mixed")
+    assert Record(places="corners")._interval_min == 5.0 and Record(places="halves")._interval_min == 10.0
+
+
+def test_large_sets_of_electrodes_are_counted_in_labels() -> None:
+    small, large, other = (1, 2), (1, 2, 3, 4, 5, 6), (1, 2, 3, 4, 5, 7)
+    written = [Condition(f"5 Hz, {listed(one)}", float(i), electrodes=(one,)) for i, one in enumerate((small, large))]
+    assert [one.label for one in abbreviated(written)] == ["5 Hz, electrodes 1+2", "5 Hz, 6 electrodes from 1"]
+    assert abbreviated(abbreviated(written)) == abbreviated(written)
+    alike = [*written, Condition(listed(other), 2.0, electrodes=(other,))]
+    assert abbreviated(alike) == tuple(alike)

@@ -43,10 +43,11 @@ class Record:
     pulses: int | None = None
     """Pulses per trial, the last one read; default: 1"""
     trials: int | None = None
-    """Presentations at each frequency; default: 500, with --paper 100"""
+    """Presentations at each frequency; default: 500, with --paper 100, with --places corners 1000"""
     places: str | None = None
-    """halves, quadrants, or a file of JSON with groups of electrodes, [[1, 2], [3, 4]]: each at each frequency is a
-    condition then, presented so often; default: at each frequency all of the culture's patterns"""
+    """corners: four places at 20 Hz, for a robot with two commands; halves, quadrants, or a file of JSON with groups of
+    electrodes, [[1, 2], [3, 4]]: each at each frequency is a condition then, presented so often; default: at each
+    frequency all of the culture's patterns"""
     protocol: Path | None = None
     """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too"""
     out: Path = Path("recordings")
@@ -86,10 +87,7 @@ class Record:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
         if protocol is not None and protocol.places:
-            conditions = "electrode" if len(protocol.frequencies_hz) == 1 else "'frequency x electrode'"
-            print(
-                f"each place is a condition for: animat train --conditions {conditions}; without it, places are mixed"
-            )
+            print("each place is a condition; --conditions frequency mixes the places")
         return {"recordings": [str(file) for file in files]}
 
     def _synthetic(self, progress: Progress) -> list[Path]:
@@ -156,18 +154,20 @@ class Record:
             return self.interval_min
         # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
         usual = not self.paper and self.culture != "synthetic" and self.protocol is None
-        return 5.0 if usual and all(getattr(self, name) is None for name in _PRESENTED) else 10.0
+        asked = [getattr(self, name) for name in _PRESENTED]
+        return 5.0 if usual and set(asked) <= {None, "corners"} else 10.0
 
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
         from animat.cultures.kinds import pulse_for
         from animat.stimulation.places import read_places
-        from animat.stimulation.protocol import CLOSED_LOOP, PAPER, read_protocol
+        from animat.stimulation.protocol import CLOSED_LOOP, PAPER, TWO_COMMANDS, read_protocol
 
         assert self.culture != "synthetic"
         # What a file leaves out is the paper's: it stands alone.
         paper = self.paper or self.protocol is not None
-        usual = replace(PAPER if paper else CLOSED_LOOP, patterns=min(100, patterns), pulse=pulse_for(self.culture))
+        living = TWO_COMMANDS if self.places == "corners" else CLOSED_LOOP
+        usual = replace(PAPER if paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
         asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}

@@ -23,7 +23,7 @@ class Responding:
 
     conditions: str | None = None
     """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, "frequency x electrode", all;
-    default: by frequency"""
+    default: by frequency, and by place where places were recorded"""
     window_ms: tuple[float, float] | None = None
     """Start and end of the response window after a stimulus, in ms; default: 2 10"""
     burst_threshold: float | None = None
@@ -50,7 +50,6 @@ class Fitting(Responding):
         """Read the recordings and fit a simulator to each: as those that a policy was trained on, unless asked."""
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_sources
-        from animat.recordings.recording import Recording
         from animat.responses.conditions import conditions_named
         from animat.responses.readouts import ALL
         from animat.responses.series import extract_series
@@ -61,16 +60,8 @@ class Fitting(Responding):
         if not recordings:
             raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
         by = self.conditions or fitted.get("by")
-        sources = read_sources(recordings)
-        protocols = [source.protocol for source in sources if isinstance(source, Recording)]
-        if by in (None, "frequency") and any(protocol is not None and protocol.places for protocol in protocols):
-            print(
-                "warning: the recordings have places, which are mixed: to choose among them, --conditions electrode or "
-                "'frequency x electrode'",
-                file=sys.stderr,
-            )
         series = extract_series(
-            sources,
+            read_sources(recordings),
             None if by is None else conditions_named(by),
             self.window_ms or (trained and trained.window_ms) or DEFAULT_WINDOW_MS,
             burst_threshold=fitted.get("burst_threshold") if self.burst_threshold is None else self.burst_threshold,

@@ -33,9 +33,9 @@ class Train(Fitting):
     mapping: str | None = None
     """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
     my_package.mappings:Steep; none: the baseline without neurons; default: 9-thresholds, with --paper 1-threshold"""
-    readouts: str = "all"
+    readouts: str | None = None
     """What becomes a command each: all channels as one; halves or quadrants of the array; or a file of groups of
-    electrodes, {"left": [1, 2], "right": [3, 4]}. As many as the robot takes commands"""
+    electrodes, {"left": [1, 2], "right": [3, 4]}; default: for one, two or four commands all, halves or quadrants"""
     policies: int | None = None
     """How many policies, each from its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
@@ -78,7 +78,8 @@ class Train(Fitting):
         robot = robot_named(self.robot, **read_numbers("--parameters", self.parameters))
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
-        readouts = read_readouts(self.readouts)
+        usual_readouts = "all" if mapping == "none" else _READOUTS.get(robot.n_commands, "all")
+        readouts = read_readouts(self.readouts or usual_readouts)
         if mapping != "none":
             expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
         elif readouts != ALL:
@@ -149,6 +150,8 @@ class Train(Fitting):
 
 _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
 """What works in a closed loop; `share`: of the paper's iterations, in per cent."""
+_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
+"""By how many commands a robot takes."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from animat.errors import InvalidArgument, shown
 _LONGEST_LABEL = 10_000
 """A condition may be a set of very many electrodes, and its label names all of them."""
 _LARGEST_VALUE = 2.0**63
+_MOST_LISTED = 5
+"""Electrodes of a set that its label lists: the paper's patterns have as many."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,29 @@ class Condition:
             raise InvalidArgument(f"condition.only_last: expected true or false, got {shown(self.only_last)}")
         object.__setattr__(self, "frequencies_hz", frequencies_hz)
         object.__setattr__(self, "electrodes", electrodes)
+
+
+def listed(electrodes: Sequence[int]) -> str:
+    """A set of electrodes in words: `"electrodes 909+23923"`."""
+    return f"electrode{'s' if len(electrodes) > 1 else ''} {'+'.join(map(str, electrodes))}"
+
+
+def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
+    """Conditions whose labels count the electrodes of large sets (`"16 electrodes from 909"`) in place of listing them.
+
+    Where that would call two sets the same, all are listed. Files of before list them.
+    """
+    sets = {one.electrodes[0] for one in conditions if one.electrodes is not None and len(one.electrodes) == 1}
+    large = [electrodes for electrodes in sets if len(electrodes) > _MOST_LISTED]
+    brief = {electrodes: f"{len(electrodes)} electrodes from {electrodes[0]}" for electrodes in large}
+    if len(set(brief.values())) < len(brief):
+        return tuple(conditions)
+    return tuple(
+        replace(one, label=one.label.replace(listed(one.electrodes[0]), brief[one.electrodes[0]]))
+        if one.electrodes and one.electrodes[0] in brief
+        else one
+        for one in conditions
+    )
 
 
 def other_stimulus(conditions: Sequence[Condition], others: Sequence[Condition]) -> str | None:

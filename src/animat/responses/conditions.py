@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument
-from animat.responses.condition import Condition
+from animat.responses.condition import Condition, abbreviated, listed
+from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
@@ -160,9 +161,8 @@ class ByElectrode(Conditions):
         sets = self.sets or tuple(sorted({s for s in set_of_row if s}, key=lambda s: (len(s), s)))
         index_of = {electrodes: i for i, electrodes in enumerate(sets)}
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
-        labels = [f"electrode{'s' if len(s) > 1 else ''} {'+'.join(map(str, s))}" for s in sets]
-        found = [Condition(label, float(i), electrodes=(sets[i],)) for i, label in enumerate(labels)]
-        return _recorded(stimuli, index_of_row[row_of.reshape(-1)], found)
+        found = [Condition(listed(electrodes), float(i), electrodes=(electrodes,)) for i, electrodes in enumerate(sets)]
+        return _recorded(stimuli, index_of_row[row_of.reshape(-1)], abbreviated(found))
 
 
 @dataclass(frozen=True)
@@ -226,8 +226,13 @@ class ByBoth(Conditions):
         return _recorded(stimuli, index, found)
 
 
-def default_conditions(stimuli: Stimuli) -> Conditions:
-    """The conditions of a recording for which none were asked: by frequency where it is known, else all in one."""
+def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Conditions:
+    """The conditions of a recording for which none were asked.
+
+    By frequency where it is known, else all in one; places are conditions, too, where a protocol has some.
+    """
+    if protocol is not None and protocol.places:
+        return ByElectrode() if len(protocol.frequencies_hz) == 1 else ByBoth(ByFrequency(), ByElectrode())
     return ByFrequency() if np.any(~np.isnan(stimuli.frequency_hz)) else All()
 
 

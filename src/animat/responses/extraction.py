@@ -54,7 +54,7 @@ def extract_responses(
 
     Args:
         recording: the spikes and stimuli.
-        by: what makes a condition; by frequency where it is known, else all in one.
+        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
         readouts: groups of channels whose x is read too, in the same windows; bursts are told by all channels.
@@ -97,7 +97,7 @@ def responses_of_table(
 
     Args:
         table: what each channel did after each stimulus.
-        by: what makes a condition; by frequency where it is known, else all in one.
+        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
         window_ms: the window that was counted in, where the table does not say; one that it says goes before the
             default one.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
@@ -144,7 +144,7 @@ def _sorted(
 ) -> tuple[Responses, Assignment, BurstSeparation]:
     """What was read after the last pulses, by condition and apart from bursts; with how it was sorted."""
     stimuli, n_channels = source.stimuli, len(source.channels)
-    by = by or default_conditions(stimuli)
+    by = by or default_conditions(stimuli, source.protocol if isinstance(source, Recording) else None)
     assignment = by.assign(stimuli)
     condition = assignment.condition[presented]
     chosen = condition != NO_CONDITION

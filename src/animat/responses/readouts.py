@@ -15,11 +15,11 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import read_plain_text
 from animat.recordings.recording import Channels
 from animat.responses.windows import Spiking, spikes_in
-from animat.stimulation.places import NAMED, count_places, electrodes_of
+from animat.stimulation.places import CUT, count_places, electrodes_of
 from animat.tables import UNKNOWN
 
 _NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
-"""Of the groups that `NAMED` makes; left is the smaller x, top the smaller y."""
+"""Of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
 _MOST_BYTES = 2**20
 MOST_READOUTS = 64
 
@@ -151,12 +151,12 @@ def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
     """
     if text == "all":
         return ALL
-    if text in NAMED:
+    if text in CUT:
         return str(text)
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
-        raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(NAMED)}") from error
+        raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(CUT)}") from error
     try:
         data = json.loads(written, object_pairs_hook=_each_once)
         if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
@@ -200,9 +200,9 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
     if readouts == "all":
         return ALL
     if isinstance(readouts, str):
-        if readouts not in NAMED:
+        if readouts not in CUT:
             raise InvalidArgument(
-                f"readouts: expected all, {', '.join(NAMED)} or groups of electrodes, got {shown(readouts)}"
+                f"readouts: expected all, {', '.join(CUT)} or groups of electrodes, got {shown(readouts)}"
             )
         electrodes, first = np.unique(channels.electrode, return_index=True)
         if UNKNOWN in electrodes or len(electrodes) < count_places(readouts):

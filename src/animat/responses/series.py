@@ -44,7 +44,7 @@ def extract_series(
 
     Args:
         recordings: of one culture; tables of responses too.
-        by: what makes a condition; None: by frequency where it is known, else all in one.
+        by: what makes a condition; None: by frequency where it is known, by place where the protocol has places.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         allow: names of findings (`"dead-window"`) to go on in spite of.

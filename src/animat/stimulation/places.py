@@ -12,8 +12,11 @@ from jaxtyping import Float64, Int64
 from animat.errors import InvalidArgument, InvalidFile, shown
 from animat.plain_file import read_plain_text
 
-NAMED = {"halves": (2, 1), "quadrants": (2, 2)}
-"""Columns and rows that the stimulation electrodes are cut into, as many electrodes in each as can be."""
+CUT = {"halves": (2, 1), "quadrants": (2, 2)}
+"""Columns and rows that electrodes are cut into, as many electrodes in each as can be."""
+NAMED = (*CUT, "corners")
+SITES = 8
+"""Of a corner: with five the commands part less clearly, and more than are needed tire a culture."""
 _MOST_BYTES = 2**20
 _MOST_PLACES = 1000
 
@@ -32,7 +35,7 @@ def check_places(given: Any) -> Places:
     is_listed = isinstance(given, list | tuple) and all(isinstance(place, list | tuple) and place for place in given)
     if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in given for e in place):
         raise InvalidArgument(
-            f"places: expected {' or '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], got "
+            f"places: expected {', '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], got "
             f"{shown(given)}"
         )
     places = tuple(tuple(sorted(set(place))) for place in given)
@@ -52,7 +55,7 @@ def read_places(text: str | os.PathLike[str]) -> Places:
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
-        raise InvalidFile(f"{error}; places that have names are {' and '.join(NAMED)}") from error
+        raise InvalidFile(f"{error}; places that have names are {', '.join(NAMED)}") from error
     try:
         places = check_places(json.loads(written))
         if not places:
@@ -67,7 +70,7 @@ def read_places(text: str | os.PathLike[str]) -> Places:
 
 def count_places(places: Places) -> int:
     """How many there are."""
-    return int(np.prod(NAMED[places])) if isinstance(places, str) else len(places)
+    return (int(np.prod(CUT[places])) if places in CUT else 4) if isinstance(places, str) else len(places)
 
 
 def electrodes_of(
@@ -79,7 +82,8 @@ def electrodes_of(
     """The electrodes of each place on an array.
 
     Halves are those with the smaller and the larger x; each is cut by y for quadrants. Electrodes at the same x (or y)
-    go by their numbers.
+    go by their numbers. Corners are what puts two commands, read from the halves, into all four corners: `SITES`
+    electrodes spread over the left half, as many over the right one, both together, and one of the left.
 
     Args:
         places: named or listed.
@@ -91,18 +95,29 @@ def electrodes_of(
     """
     if not isinstance(places, str):
         return places
-    columns, rows = NAMED[places]
     known = np.isfinite(x_um) & np.isfinite(y_um)
-    if not np.all(known) or len(electrodes) < columns * rows:
+    if not np.all(known) or len(electrodes) < count_places(places):
         missing = (
             f"{np.count_nonzero(~known)} of them unknown" if not np.all(known) else f"{len(electrodes)} electrodes"
         )
         raise InvalidArgument(
-            f"places: expected positions of {columns * rows} stimulation electrodes or more to cut into {places}, got "
-            f"{missing}: list the electrodes of each place"
+            f"places: expected positions of {count_places(places)} stimulation electrodes or more to cut into "
+            f"{places}, got {missing}: list the electrodes of each place"
         )
+    if places == "corners":
+        y_of_um = dict(zip(electrodes.tolist(), y_um.tolist(), strict=True))
+        left, right = (_spread(half, y_of_um) for half in electrodes_of("halves", electrodes, x_um, y_um))
+        return left, right, tuple(sorted(left + right)), left[:1]
+    columns, rows = CUT[places]
     found = []
     for column in np.array_split(np.lexsort((electrodes, x_um)), columns):
         in_order = column[np.lexsort((electrodes[column], y_um[column]))]
         found += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
     return tuple(found)
+
+
+def _spread(half: tuple[int, ...], y_of_um: dict[int, float]) -> tuple[int, ...]:
+    """Some electrodes of a half, evenly from its smallest to its largest y."""
+    in_order = sorted(half, key=lambda electrode: (y_of_um[electrode], electrode))
+    ranks = np.unique(np.linspace(0, len(half) - 1, SITES).round().astype(int))
+    return tuple(sorted(in_order[rank] for rank in ranks))

@@ -67,8 +67,9 @@ class Protocol:
         pulses: of one trial, with different patterns where there are enough.
         patterns: how many of the culture's patterns are used, the first ones; 1 repeats one pattern.
         trials: at each frequency; each pattern is read equally often, in random order.
-        places: groups of electrodes, `"halves"` or `"quadrants"` (`animat.stimulation.places`), in place of patterns:
-            each at each frequency is then a condition of its own, presented as often, all pulses on the whole group.
+        places: groups of electrodes, `"corners"`, `"halves"` or `"quadrants"` (`animat.stimulation.places`), in place
+            of patterns: each at each frequency is then a condition of its own, presented as often, all pulses on the
+            whole group.
         setup_s: before each block (mixed: before the one block), the time that setting up takes. Nothing is recorded
             meanwhile, and the recording's clock leaves it out.
         pause_s: recorded without stimuli before each block.
@@ -191,3 +192,7 @@ PAPER = Protocol()
 CLOSED_LOOP = Protocol(order="mixed", trials=500)
 """What a closed loop needs: frequencies mixed at random, one pulse a trial, and so many of each that a simulator
 with memory finds responses with a similar history."""
+
+TWO_COMMANDS = replace(CLOSED_LOOP, places="corners", frequencies_hz=(20.0,), trials=1000)
+"""What a closed loop with two commands needs: stimuli that differ in place alone. A culture is then stimulated as often
+whatever is chosen; of several frequencies a policy takes the fastest all the time, which no recording has shown."""

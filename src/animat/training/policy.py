@@ -25,7 +25,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, s
 from animat.neurons.history import AT_FIRST
 from animat.plain_file import expect_plain_file, is_folder
 from animat.records import Number, read_record
-from animat.responses.condition import Condition
+from animat.responses.condition import Condition, abbreviated
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
@@ -273,7 +273,7 @@ class Policy:
                 scales=arrays["scales"],
                 robot=robot_from_dict(described["robot"]),
                 mapping=None if described["mapping"] is None else mapping_from_data(described["mapping"]),
-                conditions=tuple(Condition(**condition) for condition in described["conditions"]),
+                conditions=abbreviated([Condition(**condition) for condition in described["conditions"]]),
                 commands=None if described["commands"] is None else tuple(described["commands"]),
                 window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
