@@ -39,10 +39,25 @@ def test_what_is_printed_under_a_bar_goes_where_it_should() -> None:
     assert b"the result" not in drawn
 
 
-def test_nothing_is_drawn_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_line_comes_every_ten_seconds_where_there_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("animat.progress.time.monotonic", lambda: now_s)
     with Bar("counting") as progress:
-        progress.update(1, 2)
-    assert capsys.readouterr() == ("", "")
+        # Two in a hundred a second; a second part begins at 40 s, four times as slow.
+        for now_s in (1.0, 9.9, 10.0, 15.0, 21.0, 40.0):
+            progress.update(2 * now_s, 100, f"at {now_s:g} s")
+        for now_s in (41.0, 55.0, 65.0):
+            progress.update((now_s - 41) / 2, 100)
+    told = [
+        "counting: 20 %, 40 s left, at 10 s",
+        "counting: 42 %, 29 s left, at 21 s",
+        "counting: 80 %, 10 s left, at 40 s",
+        "counting: 7 %, 3 min left",
+        "counting: 12 %, 3 min left",
+    ]
+    assert capsys.readouterr() == ("", "\n".join(told) + "\n")
 
 
 def test_parts_make_up_the_whole() -> None:
