@@ -6,6 +6,7 @@ import csv
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -182,8 +183,18 @@ def assert_table_is_the_session(folder: Path, names: list[str]) -> None:
 def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Robot[Any], names: list[str]) -> None:
     loop = loop_of(robot=robot, pulses=2, burst_threshold=0.9, on_burst="repeat")
     agents = [RANDOM, Agent("no", "", OneCondition(0), "silent")]
+    said: list[tuple[float, float, str]] = []
     with FakeCulture(1) as culture:
-        session = run_session(culture, loop, agents, tmp_path, episodes=3)
+        session = run_session(
+            culture,
+            loop,
+            agents,
+            tmp_path,
+            episodes=3,
+            progress=SimpleNamespace(update=lambda *told: said.append(told)),
+        )
+    last = [tick for tick in session.ticks if tick.episode == 5 and tick.reward is not None]
+    assert said[-1] == (6, 6, f"{last[0].agent}: return {sum(tick.reward or 0.0 for tick in last):.1f}")
     assert {tick.handled for tick in session.ticks} == {"used", "repeated"}
     assert_table_is_the_session(tmp_path, names)
     said = read_recording(session.recording_file).provenance["session_description"]

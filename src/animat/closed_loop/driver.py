@@ -62,7 +62,7 @@ class Driver:
         seed: int,
     ) -> None:
         self.records: deque[Record] = deque()
-        self.episodes_done = 0
+        self.episodes_done, self.last_return = 0, ""
         self.is_stopped = False
         self.expected = float("inf"), "nobody"
         """By when, on `time.monotonic()`, who should have answered at the latest; a supervisor watches it."""
@@ -126,6 +126,7 @@ class Driver:
             self._percentiles = self._adaptive.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
+        return_ = 0.0
         for iteration in range(loop.robot.episode_limit):
             chosen = self._choose(agent, controller, observation)
             repeats = 0
@@ -137,9 +138,11 @@ class Driver:
                 if not again:
                     break
                 repeats += 1
+            return_ += tick.reward or 0.0
             if tick.terminated or tick.truncated:
                 break
             observation = np.array(tick.observation)
+        self.last_return = f"{agent.name}: return {return_:.1f}"
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Put the robot where it starts: in a round of all agents each meets the same start."""

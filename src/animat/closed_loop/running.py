@@ -183,7 +183,7 @@ class _Supervisor:
                 return Ending(
                     "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: left alone"
                 )
-            self._progress.update(driver.episodes_done, self._episodes)
+            self._progress.update(driver.episodes_done, self._episodes, driver.last_return)
         return None
 
     def _write(self) -> None:
