@@ -1,0 +1,80 @@
+"""The command that says whether simulators of a recording predict what was held out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+from animat.cli.responses import Responding, say_findings
+from animat.errors import InvalidArgument, UnusableData
+from animat.writing import expect_writable
+
+
+@dataclass(frozen=True)
+class Validate(Responding):
+    """Make simulators of the first half of each recording, predict the second, and say whether to trust them."""
+
+    recordings: Positional[tuple[Path, ...]] = ()
+    """Files of recordings, or folders of them"""
+    simulator: Literal["histogram", "empirical", "memory"] | None = None
+    """The kind that the verdict is on; default: the one that a training would take. All are scored"""
+    allow: tuple[str, ...] = ()
+    """Findings to allow, by name, such as dead-window"""
+    out: Path | None = None
+    """Folder for a figure of each recording; default: none is drawn"""
+    format: Literal["png", "svg", "pdf"] = "png"
+    """Of the figures"""
+    seed: int = 1
+    """Decides every random draw"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Validate each recording."""
+        from animat.compilation import keep_compilations
+        from animat.neurons.validation import validate
+        from animat.progress import Bar
+        from animat.recordings.reading import list_recordings, read_source
+        from animat.report.inspection import expect_unlike_stems, figure_stem
+        from animat.report.style import save_figure
+        from animat.report.validation import draw_validation, validation_text
+        from animat.responses.conditions import conditions_named
+        from animat.responses.series import extract_series
+        from animat.responses.windows import DEFAULT_WINDOW_MS
+
+        if self.out is not None:
+            expect_writable(self.out)
+        if self.seed < 0:
+            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        by = None if self.conditions is None else conditions_named(self.conditions)
+        files = list_recordings(self.recordings)
+        if self.out is not None:
+            expect_unlike_stems([file.name for file in files])
+        keep_compilations()
+        validated = []
+        with Bar("validating") as progress:
+            for number, file in enumerate(files):
+                progress.update(number, len(files), file.name)
+                try:
+                    (responses,) = extract_series(
+                        [read_source(file)],
+                        by,
+                        self.window_ms or DEFAULT_WINDOW_MS,
+                        burst_threshold=self.burst_threshold,
+                        allow=self.allow,
+                    )
+                    validation = validate(responses, kind=self.simulator, seed=self.seed)
+                except UnusableData as error:
+                    raise UnusableData(f"{file}: {error}") from error
+                say_findings(responses.findings)
+                print(validation_text(file.name, validation), end="\n\n")
+                validated.append({"name": file.name, **validation.to_dict()})
+                if self.out is not None:
+                    figure = self.out / f"{figure_stem(file.name)}-validation.{self.format}"
+                    save_figure(draw_validation(file.name, validation), figure)
+                    print(f"figure: {figure}\n")
+                    validated[-1]["figure"] = str(figure)
+        return {"recordings": validated}
