@@ -122,8 +122,8 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
 def _predict_with_memory(simulator: MemorySimulator, halves: Halves) -> Prediction:
     places = halves.whole.presentations[1][halves.rows]
     states = recorded_states(halves.first, simulator.memory)
-    near = jax.jit(jax.vmap(simulator.rows_near))(
-        halves.condition, states.trace[places].astype(np.float32), states.load[places].astype(np.float32)
+    near = _rows_near(
+        simulator, halves.condition, states.trace[places].astype(np.float32), states.load[places].astype(np.float32)
     )
     first, end = (np.asarray(each) for each in near)
     index = np.searchsorted(halves.values_hz, np.asarray(simulator.after_hz))
@@ -133,6 +133,9 @@ def _predict_with_memory(simulator: MemorySimulator, halves: Halves) -> Predicti
     ]
     n = (end - first).astype(np.float64)
     return Prediction(np.stack(counted) / n[:, None], n)
+
+
+_rows_near = jax.jit(jax.vmap(MemorySimulator.rows_near, (None, 0, 0, 0)))
 
 
 def _shares(

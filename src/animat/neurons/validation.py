@@ -228,8 +228,12 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1) ->
 
     Raises:
         UnusableData: as `halved` does.
-        InvalidArgument: for a kind that there is not.
+        InvalidArgument: for a kind that there is not, or several readouts.
     """
+    if len(responses.readouts) > 1:
+        raise InvalidArgument(
+            f"responses: expected one readout, got {len(responses.readouts)}; validate each, or all channels as one"
+        )
     rng = np.random.default_rng(seed)
     halves = halved(responses)
     kinds: tuple[str, ...] = get_args(Kind)

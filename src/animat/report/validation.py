@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from animat.neurons.free_runs import LAGS
-from animat.neurons.validation import MARGINAL, PIT_BINS, Band, Validation, pit_shares
+from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
 from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
 
 if TYPE_CHECKING:
@@ -50,14 +50,15 @@ def draw_validation(name: str, validation: Validation) -> Figure:
     """Three panels: the transforms' histograms, the autocorrelation, and how long runs above P50 last."""
     v = validation
     figure = new_figure(10.5, 3.7)
-    figure.suptitle(f"{name}: first half predicts second, n = {sum(v.n_held):,} held-out responses", fontsize=10)
+    n = f"{sum(v.n_held):,} held-out responses"
+    figure.suptitle(f"{name}: {n}; shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators", fontsize=10)
     calibration, correlation, runs = figure.subplots(1, 3)
     # The empirical kind lies on the histogram.
     shown = [v.of(kind) for kind in dict.fromkeys(("histogram", v.kind, "memory"))]
 
     style_axes(calibration, "calibration", "probability integral transform (-)", "share of responses (-)")
     low, high = v.pit_band
-    calibration.axhspan(low, high, color="#DDDDDD", label="uniform, 95 % of chance", linewidth=0)
+    calibration.axhspan(low, high, color="#DDDDDD", label="uniform", linewidth=0)
     edges = np.linspace(0, 1, PIT_BINS + 1)
     for s in (v.of(MARGINAL), *shown):
         calibration.stairs(pit_shares(s.transforms), edges, color=_COLOURS[s.kind], linewidth=1.6, label=s.kind)
