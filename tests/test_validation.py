@@ -446,7 +446,7 @@ def test_virtual_cultures_by_hand(seed: int) -> None:
     assert found.gain("empirical", MARGINAL).is_certain
     if seed > 1:
         assert found.verdict.startswith("Can be trusted: ")
-        assert found.gain("memory", "empirical").is_certain
+        assert found.gain("memory", "empirical", "crps_hz").is_certain
 
 
 # --- the command ----------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ MARGINAL = "marginal"
 """The name of the baseline: all conditions' responses in one distribution."""
 SMALL_DISTANCE, LARGE_DISTANCE = 0.1, 0.2
 """Of the transforms from uniform: through a threshold, a mean command is off by twice as much at most. Of virtual
-cultures 1 to 5, whose measured returns are near the predicted ones, the largest is 0.08."""
+cultures 1 to 5, whose measured returns lie in the intervals of their predictions, the largest is 0.08."""
 LARGE_DIFFERENCE = 0.15
 """Between the recorded correlation of successive responses and the simulator's: of these cultures 0.07 at most with
 memory, and 0.30 to 0.41 without."""
