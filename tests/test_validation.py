@@ -26,12 +26,13 @@ from animat.neurons.history import Memory, recorded_states
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.prediction import halved, predict
-from animat.neurons.validation import MARGINAL, Validation, validate
+from animat.neurons.validation import MARGINAL, Validation, correlations, validate
 from animat.recordings.reading import read_recording
 from animat.recordings.synthetic import write_synthetic_series
 from animat.report.validation import draw_validation, validation_text
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
+from animat.responses.readouts import Readouts
 from animat.responses.responses import Presented, Responses
 from animat.stimulation.protocol import Presentation, Protocol
 from test_simulator import responses_of
@@ -291,19 +292,17 @@ def test_a_free_run_remembers_its_own_answers() -> None:
 # --- an independent computation ---------------------------------------------------------------------------------------
 
 
-def by_hand(responses: Responses, kind: str) -> dict[str, float]:
+def by_hand(responses: Responses, kind: str, readout: int | None = None) -> dict[str, float]:
     """Log-likelihood, CRPS and calibration of one kind by plain loops over trials, lists of draws, and scipy."""
     n = len(responses)
-    rows = [
-        (i, int(c), np.float32(x)) for i, (c, x) in enumerate(zip(responses.condition, responses.rate_hz, strict=True))
-    ]
+    read_hz = responses.read_hz if readout is None else responses.read_hz[:, readout]
+    rows = [(i, int(c), np.float32(x)) for i, (c, x) in enumerate(zip(responses.condition, read_hz, strict=True))]
     kept = [row for row in rows if not responses.is_burst[row[0]]]
     first = [row for row in kept if row[0] < n // 2]
     held = [row for row in kept if row[0] >= n // 2]
     every = sorted({float(x) for _, _, x in rows})
     cuts = [
-        np.float32(np.percentile([float(r) for r in responses.rate_hz[[i for i, _, _ in first]]], q))
-        for q in range(10, 100, 10)
+        np.float32(np.percentile([float(r) for r in read_hz[[i for i, _, _ in first]]], q)) for q in range(10, 100, 10)
     ]
 
     command = {x: sum(x >= cut for cut in cuts) for x in every}
@@ -336,10 +335,10 @@ def by_hand(responses: Responses, kind: str) -> dict[str, float]:
 
     everything = [float(x) for _, _, x in first]
     of_condition = {c: [float(x) for _, of, x in first if of == c] for c in range(len(responses.conditions))}
-    edges = np.percentile(responses.rate_hz[[i for i, _, _ in first]], np.linspace(0, 100, 21)).astype(np.float32)
+    edges = np.percentile(read_hz[[i for i, _, _ in first]], np.linspace(0, 100, 21)).astype(np.float32)
     coarse = [(len(everything) * p + 1) / (len(everything) + 10) for p in commands(equally(everything))]
     alike = {c: commands(equally(x)) for c, x in of_condition.items()}
-    nearest = neighbours(responses, [i for i, _, _ in first]) if kind == "memory" else None
+    nearest = neighbours(responses, [i for i, _, _ in first], read_hz) if kind == "memory" else None
     known = {c: (len(x), binned(x, edges) if kind == "histogram" else equally(x)) for c, x in of_condition.items()}
     if kind == MARGINAL:
         known = dict.fromkeys(of_condition, (len(everything), equally(everything)))
@@ -365,10 +364,10 @@ def by_hand(responses: Responses, kind: str) -> dict[str, float]:
     return {"bits": np.mean(bits), "crps_hz": np.mean(scores), "distance": np.abs(below - at).max()}
 
 
-def neighbours(responses: Responses, first: list[int]) -> Callable[[int, int], list[float]]:
+def neighbours(responses: Responses, first: list[int], read_hz: np.ndarray) -> Callable[[int, int], list[float]]:
     """Which responses of the first half a simulator with memory draws from, its parameters given."""
-    halves = halved(responses)
-    simulator = fit_simulator(halves.first, kind="memory")
+    several = responses.read_hz.ndim == 2
+    simulator = fit_simulator(halved(responses, 0 if several else None).first, kind="memory")
     assert isinstance(simulator, MemorySimulator)
     decay, weight, exponent, load_s = simulator.memory
     presented, place = responses.presentations
@@ -404,15 +403,15 @@ def neighbours(responses: Responses, first: list[int]) -> Callable[[int, int], l
         smaller, no_larger = int(np.sum(at < here)), int(np.sum(at <= here))
         start = min(max((smaller + no_larger - k) // 2, 0), len(rows) - k)
         start, end = min(start, smaller), max(start + k, no_larger)
-        return [float(np.float32(responses.rate_hz[rows[row]])) for row in order[start:end]]
+        return [float(np.float32(read_hz[rows[row]])) for row in order[start:end]]
 
     return drawn
 
 
-def check_by_hand(responses: Responses) -> Validation:
-    found = validate(responses)
+def check_by_hand(responses: Responses, readout: int | None = None) -> Validation:
+    found = validate(responses, readout=readout)
     for kind in (MARGINAL, "histogram", "empirical", "memory"):
-        scores, expected = found.of(kind), by_hand(responses, kind)
+        scores, expected = found.of(kind), by_hand(responses, kind, readout)
         # Single precision may put one response on the other side of a history.
         loose = 1e-3 if kind == "memory" else 1e-5
         assert scores.bits.mean() == pytest.approx(expected["bits"], abs=loose)
@@ -436,6 +435,33 @@ def test_the_organoid_by_hand(real_data: Path, window_ms: tuple[float, float], d
         assert gain.value < -2 * gain.error
     else:
         assert abs(gain.value) < 0.01
+
+
+def test_several_readouts_by_hand() -> None:
+    """Each on its own, of simulators that answer for both; what they remember is of all channels."""
+    rng = np.random.default_rng(4)
+    condition = rng.integers(0, 2, 400)
+    total = np.zeros(400)
+    for i in range(400):
+        total[i] = 0.5 * (total[i - 1] - 40) * (i > 0) + 40 + 15 * condition[i] + 6 * rng.normal()
+    left = total / 2 + 4 * rng.normal(size=400)
+    read_hz = np.round(np.stack([left, total - left], axis=1), 1)
+    readouts = Readouts(("left", "right"), ((1,), (2,)))
+    responses = series(total, condition, 2, readouts=readouts, readout_hz=read_hz)
+    for readout in (0, 1):
+        check_by_hand(responses, readout)
+        # Of one readout alone there is a histogram of its own: the law that the joint one keeps.
+        alone, among = validate(responses.of_readout(readout)), validate(responses, readout=readout)
+        for kind in (MARGINAL, "histogram", "empirical"):
+            assert np.array_equal(alone.of(kind).bits, among.of(kind).bits)
+            assert np.array_equal(alone.of(kind).crps_hz, among.of(kind).crps_hz)
+    for found, rows in zip(correlations(responses), (slice(0, 200), slice(200, 400)), strict=True):
+        parts = [read_hz[rows][condition[rows] == c] for c in (0, 1)]
+        each = [stats.spearmanr(part[:, 0], part[:, 1]).statistic for part in parts]
+        assert found[0] == pytest.approx(np.average(each, weights=[len(part) for part in parts]))
+    for asked in (None, 2):
+        with pytest.raises(InvalidArgument, match=f"readout: expected which of 2 readouts, None of one, got {asked}"):
+            validate(responses, readout=asked)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.oracle) for seed in (2, 3, 4, 5))])
@@ -514,6 +540,16 @@ def test_figures_of_one_name_are_refused(recorded: Path, tmp_path: Path, capsys:
     assert main(["validate", str(recorded), str(other), "--out", str(tmp_path / "figures")]) == 1
     assert "--out: expected recordings of different names" in capsys.readouterr().err
     assert not list((tmp_path / "figures").glob("*"))
+
+
+def test_readouts_are_scored_each(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, figures = recorded / "recording_0000_min.nwb", tmp_path / "figures"
+    assert main(["validate", str(file), "--readouts", "halves", "--out", str(figures), "--json"]) == 0
+    printed = capsys.readouterr().out
+    told = json.loads(printed.splitlines()[-1])["recordings"]
+    assert [each["name"] for each in told] == [f"{file.name}, left", f"{file.name}, right"]
+    assert len(list(figures.glob("*.png"))) == 2
+    assert "left, right: " in printed
 
 
 def test_a_recording_without_stimuli(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

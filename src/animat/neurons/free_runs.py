@@ -57,7 +57,7 @@ def free_runs(
         np.float32(states.trace[since]),
         rng.random((len(states.load) - since, n), np.float32),
     )
-    runs[:, places] = np.asarray(rate_hz)[places - since].T
+    runs[:, places] = halves.read(np.asarray(rate_hz))[places - since].T
     return runs
 
 
@@ -72,7 +72,7 @@ def _remembering(
     is_rested: Bool[Array, " trials"],
     trace: Float[Array, ""],
     uniforms: Float[Array, "trials n"],
-) -> Float[Array, "trials n"]:
+) -> Float[Array, "trials n *readouts"]:
     answer = jax.vmap(simulator.answer_at, (None, 0, 0, None))
 
     def trial(trace: Float[Array, " n"], given: tuple[Array, ...]) -> tuple[Array, Array]:

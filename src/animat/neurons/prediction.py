@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from animat.errors import UnusableData
 from animat.neurons.history import recorded_states
+from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator
 from animat.responses.responses import Responses
@@ -28,8 +29,9 @@ class Halves(NamedTuple):
         first: those to fit to.
         rows: the non-burst responses of the second part, by their row in `whole`, shape (held,).
         condition: of these, shape (held,).
-        x_hz: of these, in the precision that thresholds are compared in, shape (held, *readouts).
+        x_hz: of these, in the precision that thresholds are compared in, shape (held,).
         values_hz: all responses that the recording has, of any condition and half, each once, rising.
+        readout: whose responses these are, of several; None: of the only one.
     """
 
     whole: Responses
@@ -38,10 +40,23 @@ class Halves(NamedTuple):
     condition: Int64[np.ndarray, " held"]
     x_hz: Float32[np.ndarray, " held"]
     values_hz: Float32[np.ndarray, " values"]
+    readout: int | None = None
+
+    def read(self, every: Float[np.ndarray, "*some"]) -> Float[np.ndarray, "*others"]:
+        """What is the readout's, of an array that has readouts last where there are several."""
+        return every if self.readout is None else every[..., self.readout]
+
+    def first_of(self, condition: int) -> Float64[np.ndarray, " fitted"]:
+        """The non-burst responses to one condition in the first half, in Hz."""
+        return self.read(self.first.read_of(condition))
 
 
-def halved(responses: Responses) -> Halves:
+def halved(responses: Responses, readout: int | None = None) -> Halves:
     """Part a recording's responses in the middle: by time, or each condition's where they were presented in blocks.
+
+    Args:
+        responses: of one recording.
+        readout: which of several is to be predicted.
 
     Raises:
         UnusableData: for one condition, or a half with fewer than `FEWEST` non-burst responses to one.
@@ -66,9 +81,10 @@ def halved(responses: Responses) -> Halves:
                 f"{n[0]} and {n[1]}; leave it out with --conditions, or record more trials"
             )
     rows = np.flatnonzero(is_held & ~responses.is_burst)
-    x_hz = responses.read_hz.astype(np.float32)
+    every = responses.read_hz if readout is None else responses.read_hz[:, readout]
+    x_hz = every.astype(np.float32)
     first = responses.at_rows(np.flatnonzero(~is_held))
-    return Halves(responses, first, rows, responses.condition[rows], x_hz[rows], np.unique(x_hz))
+    return Halves(responses, first, rows, responses.condition[rows], x_hz[rows], np.unique(x_hz), readout)
 
 
 class Prediction(NamedTuple):
@@ -90,7 +106,7 @@ class Prediction(NamedTuple):
 
 def predict_marginal(halves: Halves) -> Prediction:
     """The first half's non-burst responses of all conditions together: what is known without any condition."""
-    x_hz = halves.first.read_hz[~halves.first.is_burst].astype(np.float32)
+    x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
     share = _shares(x_hz, halves.values_hz)
     return Prediction(np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
 
@@ -106,14 +122,14 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
         return _predict_with_memory(simulator, halves)
     if isinstance(simulator, EmpiricalSimulator):
         counts = np.asarray(simulator.counts)
-        table = np.asarray(simulator.values_hz)
+        table = halves.read(np.asarray(simulator.values_hz))
         of_condition = [_shares(x[:n], values_hz) for x, n in zip(table, counts, strict=True)]
-    elif isinstance(simulator, HistogramSimulator):
-        counts = np.array([len(halves.first.read_of(c)) for c in range(simulator.n_conditions)])
-        of_condition = [
-            np.diff(_below(np.asarray(cumulative), np.asarray(simulator.edges_hz), values_hz[1:]), prepend=0, append=1)
-            for cumulative in np.asarray(simulator.cumulative)
-        ]
+    elif isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
+        counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
+        cumulatives, edges_hz = np.asarray(simulator.cumulative), np.asarray(simulator.edges_hz)
+        if halves.readout is not None:
+            cumulatives, edges_hz = cumulatives[halves.readout], edges_hz[halves.readout]
+        of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
     else:
         raise TypeError(f"simulator: expected a histogram, an empirical or a memory one, got {type(simulator)}")
     return Prediction(np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
@@ -126,7 +142,7 @@ def _predict_with_memory(simulator: MemorySimulator, halves: Halves) -> Predicti
         simulator, halves.condition, states.trace[places].astype(np.float32), states.load[places].astype(np.float32)
     )
     first, end = (np.asarray(each) for each in near)
-    index = np.searchsorted(halves.values_hz, np.asarray(simulator.after_hz))
+    index = np.searchsorted(halves.values_hz, halves.read(np.asarray(simulator.after_hz)))
     n_values = len(halves.values_hz)
     counted = [
         np.bincount(index[c, a:b], minlength=n_values) for c, a, b in zip(halves.condition, first, end, strict=True)

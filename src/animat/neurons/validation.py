@@ -218,28 +218,29 @@ class Validation:
         )
 
 
-def validate(responses: Responses, *, kind: str | None = None, seed: int = 1) -> Validation:
+def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, readout: int | None = None) -> Validation:
     """Fit all kinds of simulators to the first half of a recording's responses, and score them on the second.
 
     Args:
-        responses: of one recording, with one readout.
+        responses: of one recording.
         kind: that the verdict is on; None: the one that a training would take.
         seed: decides the free runs, and what chance alone makes.
+        readout: which of several readouts is scored; simulators answer for all of them.
 
     Raises:
         UnusableData: as `halved` does.
-        InvalidArgument: for a kind that there is not, or several readouts.
+        InvalidArgument: for a kind or a readout that there is not.
     """
-    if len(responses.readouts) > 1:
-        raise InvalidArgument(
-            f"responses: expected one readout, got {len(responses.readouts)}; validate each, or all channels as one"
-        )
+    n_readouts = responses.read_hz.shape[1] if responses.read_hz.ndim == 2 else None
+    if (readout is None) != (n_readouts is None) or (readout is not None and not 0 <= readout < (n_readouts or 0)):
+        raise InvalidArgument(f"readout: expected which of {n_readouts or 1} readouts, None of one, got {readout}")
     rng = np.random.default_rng(seed)
-    halves = halved(responses)
+    halves = halved(responses, readout)
     kinds: tuple[str, ...] = get_args(Kind)
     if kind is not None and kind not in kinds:
         raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")
     percentiles = np.asarray(pooled_percentiles(halves.first))
+    percentiles = percentiles if readout is None else percentiles[readout]
     simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}
     distances, band = _of_chance(halves, rng)
     probabilities: dict[str, Float64[np.ndarray, "held classes"]] = {}
@@ -272,7 +273,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1) ->
     # At its own median, as a loop's thresholds adapt: what has drifted is told apart.
     lasted = run_lengths(recorded, float(np.median(halves.x_hz)))
     conditions = range(len(responses.conditions))
-    first = [halves.first.read_of(c) for c in conditions]
+    first = [halves.first_of(c) for c in conditions]
     second = [halves.x_hz[halves.condition == c] for c in conditions]
     return Validation(
         tuple(condition.label for condition in responses.conditions),
@@ -288,6 +289,28 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1) ->
         responses.is_blocked,
         band,
     )
+
+
+def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
+    """Spearman's correlation of every two readouts in the first half, which simulators keep, and in the second.
+
+    Of each condition on its own; the mean by their trials. Pairs are (0, 1), (0, 2), ..., (1, 2), ...
+    """
+    from scipy.stats import rankdata
+
+    halves = halved(responses, 0)
+    rows = ~responses.is_burst & np.isin(np.arange(len(responses)), halves.rows)
+    of_halves = []
+    for read_hz, condition in (
+        (halves.first.read_hz[~halves.first.is_burst], halves.first.condition[~halves.first.is_burst]),
+        (responses.read_hz[rows], responses.condition[rows]),
+    ):
+        of_condition = [rankdata(read_hz[condition == c], axis=0) for c in range(len(responses.conditions))]
+        upper = np.triu_indices(read_hz.shape[1], 1)
+        with np.errstate(invalid="ignore", divide="ignore"):  # NaN of a readout that is always the same.
+            each = [np.corrcoef(ranks, rowvar=False)[upper] for ranks in of_condition]
+        of_halves.append(np.average(each, axis=0, weights=list(map(len, of_condition))))
+    return np.array(of_halves)
 
 
 def pit_shares(transforms: Float64[np.ndarray, "held 2"]) -> Float64[np.ndarray, " bins"]:
@@ -307,7 +330,7 @@ def _of_chance(halves: Halves, rng: np.random.Generator) -> tuple[Float64[np.nda
     Independent responses of any continuous distribution do, as only ranks count: those of the second half among the
     first's, of each condition as many as there are.
     """
-    n = [(len(halves.first.read_of(c)), np.count_nonzero(halves.condition == c)) for c in np.unique(halves.condition)]
+    n = [(len(halves.first_of(c)), np.count_nonzero(halves.condition == c)) for c in np.unique(halves.condition)]
     distances, shares = [], []
     for _ in range(_CHANCES):
         x = np.sort(np.concatenate([np.searchsorted(np.sort(rng.random(a)), rng.random(b)) / a for a, b in n]))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.neurons.free_runs import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
@@ -43,6 +46,14 @@ def validation_text(name: str, validation: Validation) -> str:
         n = f"{v.n_fitted[c]:,}, {v.n_held[c]:,}"
         medians = f"{v.medians_hz[0, c]:.2f}, {v.medians_hz[1, c]:.2f}"
         lines.append(f"  {label:<{width}}  {n:>13}  {medians:>16}  {v.of(v.kind).above[c]:.2f}, {v.above[c]:.2f}")
+    return "\n".join(lines)
+
+
+def correlations_text(names: Sequence[str], correlations: Float64[np.ndarray, "2 pairs"]) -> str:
+    """Spearman's correlation of every two readouts, in the half that simulators keep it of and in the held-out one."""
+    lines = ["  readouts, Spearman's correlation within conditions: first half, second half"]
+    for (one, other), (first, second) in zip(itertools.combinations(names, 2), correlations.T, strict=True):
+        lines.append(f"  {one}, {other}: {first:.2f}, {second:.2f}")
     return "\n".join(lines)
 
 
