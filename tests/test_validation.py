@@ -185,6 +185,16 @@ def test_what_the_verdict_says(known: Validation) -> None:
         validate(chain, kind="none")
 
 
+@pytest.mark.parametrize("share", [0.0, 0.05])
+def test_a_culture_that_hardly_answers_is_not_trusted(share: float) -> None:
+    rng = np.random.default_rng(6)
+    v = validate(series(1.0 * (rng.random(1_000) < share), np.arange(1_000) % 2, 2))
+    assert v.verdict.startswith("Cannot be trusted: to know the condition is worth ")
+    assert np.isnan(v.drift)
+    assert "nan %" not in validation_text("still.npz", v)
+    draw_validation("still.npz", v)
+
+
 def test_blocks_are_parted_each() -> None:
     condition = np.repeat([0, 1], 60)
     halves = halved(series(np.arange(120), condition, 2, presentation=Presentation("blocked")))

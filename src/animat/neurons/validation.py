@@ -177,8 +177,13 @@ class Validation:
 
     @property
     def drift(self) -> float:
-        """The relative change of the median from the first half to the second, conditions weighted by their trials."""
-        first, second = np.maximum(self.medians_hz, 1e-9)
+        """The relative change of the median from the first half to the second, conditions weighted by their trials.
+
+        NaN where a median is 0.
+        """
+        if not np.all(self.medians_hz > 0):
+            return float("nan")
+        first, second = self.medians_hz
         return float(np.exp(np.average(np.log(second / first), weights=self.n_held)) - 1)
 
     @property
@@ -196,11 +201,13 @@ class Validation:
                 "Cannot be trusted: conditions were presented in blocks, and a loop mixes them, which this recording "
                 "says nothing of; record with --order mixed"
             )
-        if not conditions.is_certain:
-            return (
-                f"Cannot be trusted: to know the condition is worth {conditions.value:.3f} ± {conditions.error:.3f} "
-                "bits a trial, not certainly more than nothing, so that there is next to nothing to steer with"
-            )
+        # Where nearly all responses are in one class, what is added for classes without any looks like bits.
+        for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
+            if not gain.is_certain:
+                return (
+                    f"Cannot be trusted: to know the condition is worth {gain.value:.3f} ± {gain.error:.3f} {unit} "
+                    "a trial, not certainly more than nothing, so that there is next to nothing to steer with"
+                )
         if distance > LARGE_DISTANCE:
             return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"
         if distance > SMALL_DISTANCE:

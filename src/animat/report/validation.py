@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
-_HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>20}"
+_HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"
 
 
 def validation_text(name: str, validation: Validation) -> str:
@@ -26,8 +26,8 @@ def validation_text(name: str, validation: Validation) -> str:
     v = validation
     lines = [
         f"{name}: {v.verdict}",
-        f"  fitted to {sum(v.n_fitted):,} responses of the first half, scored on {sum(v.n_held):,} of the second; "
-        f"medians moved by {100 * v.drift:+.0f} %",
+        f"  fitted to {sum(v.n_fitted):,} responses of the first half, scored on {sum(v.n_held):,} of the second"
+        + ("" if np.isnan(v.drift) else f"; medians moved by {100 * v.drift:+.0f} %"),
         "",
         _HEADER,
     ]
@@ -35,9 +35,9 @@ def validation_text(name: str, validation: Validation) -> str:
         off, runs = f"{s.distance:.3f} ({s.p_value:.3f})", s.run_length
         lines.append(
             f"  {s.kind:<11}{s.bits.mean():>11.3f}{s.crps_hz.mean():>11.3f}{off:>14}{s.autocorrelation.mean[0]:>8.2f}"
-            f"{f'{runs.mean:.2f} ({runs.low:.2f} to {runs.high:.2f})':>20}"
+            f"{f'{runs.mean:.2f} ({runs.low:.2f} to {runs.high:.2f})':>25}"
         )
-    lines.append(f"  {'recorded':<47}{v.autocorrelation[0]:>8.2f}{f'{v.run_length:.2f}':>20}")
+    lines.append(f"  {'recorded':<47}{v.autocorrelation[0]:>8.2f}{f'{v.run_length:.2f}':>25}")
     gains = [("conditions bring", v.gain("empirical", MARGINAL)), ("memory brings", v.gain("memory", "empirical"))]
     lines.append("  " + "; ".join(f"{what} {gain.value:.3f} ± {gain.error:.3f} bits a trial" for what, gain in gains))
     width = max(len("condition"), *map(len, v.labels))
