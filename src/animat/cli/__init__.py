@@ -36,12 +36,14 @@ from animat.cli.run import Run
 from animat.cli.study import StudyFile
 from animat.cli.train import Train
 from animat.cli.tune import TuneFile
+from animat.cli.validate import Validate
 from animat.ctrl_c import heard_everywhere
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 
 Command = (
     Annotated[Record, subcommand("record")]
     | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Validate, subcommand("validate")]
     | Annotated[Convert, subcommand("convert")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Evaluate, subcommand("evaluate")]
@@ -62,6 +64,7 @@ _LESS: dict[type, str] = {
     Live: "ask for fewer episodes (--episodes {episodes}) or policies (--policies {policies})",
     Record: "ask for fewer trials or pulses (--trials, --pulses, or those of --protocol)",
     Train: "ask for fewer bins (--bins), or give fewer recordings (--recordings)",
+    Validate: "validate fewer recordings at once",
     Inspect: "inspect fewer recordings at once",
 }
 """What a command's memory grows with, and what was asked for."""
@@ -111,7 +114,7 @@ def _run(given: list[str]) -> int:
         _say_notes(error)
         return 1
     except KeyboardInterrupt as error:
-        kept = "" if isinstance(command, Inspect | Convert | Evaluate) else "; what was finished is kept"
+        kept = "" if isinstance(command, Inspect | Validate | Convert | Evaluate) else "; what was finished is kept"
         again = (
             "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile) else ""
         )

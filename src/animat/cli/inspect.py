@@ -47,7 +47,7 @@ class Inspect(Responding):
         """Inspect each file."""
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings
-        from animat.report.inspection import figure_stem
+        from animat.report.inspection import expect_unlike_stems
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
@@ -62,14 +62,9 @@ class Inspect(Responding):
         check_window(window_ms)
         check_threshold(self.burst_threshold)
         files = list_recordings(self.recordings)
-        # The figures of the series have a name of their own.
-        stems = ["series", *(figure_stem(file.name) for file in files)]
-        if self.out is not None and len(set(stems)) < len(stems):
-            alike = next(stem for stem in stems if stems.count(stem) > 1)
-            raise InvalidArgument(
-                f"--out: expected recordings of different names, got figures that would all be called {alike}-...; "
-                "inspect them apart, or rename one"
-            )
+        if self.out is not None:
+            # The figures of the series have a name of their own.
+            expect_unlike_stems([file.name for file in files], "series")
         with Bar("inspecting") as progress:
             return self._inspect(files, by, window_ms, progress)
 

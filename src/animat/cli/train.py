@@ -170,7 +170,8 @@ def _control(timeline: SimulatorTimeline) -> str:
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
     """What each simulator remembers, where they are of the kind that does."""
-    from animat.neurons.memory import NO_MEMORY, MemorySimulator
+    from animat.neurons.history import NO_MEMORY
+    from animat.neurons.memory import MemorySimulator
 
     for start_min in timeline.start_min.tolist():
         simulator = timeline.at(start_min)

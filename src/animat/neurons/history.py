@@ -1,6 +1,14 @@
-"""The history state: what neurons remember, as two numbers."""
+"""The history state: what neurons remember, as two numbers, and how it is read from a recording."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.responses.conditions import NO_CONDITION
+from animat.responses.responses import Presented, Responses
 
 AT_FIRST = (0.5, 0.5)
 """Trace and load that an episode begins with: its warm-up was presented in random order, as in a recording.
@@ -8,3 +16,152 @@ AT_FIRST = (0.5, 0.5)
 The trace is of what was answered just before, from 0 to 1; the load of what was presented in the seconds before, 0 or
 more. Both are 0 after silence (`animat.neurons.memory`).
 """
+
+
+class Memory(NamedTuple):
+    """How the history state is made of what was presented and answered, and how much of it an answer hangs on.
+
+        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
+        l  = exp(-t / load_s) l',    l' = l + c
+
+    The trace p is what was answered just before: p before a response and p' after it, r the response's rank (the share
+    of all responses below it), m the mean rank of its condition; all are in [0, 1], 0 after silence. Ranks are of the
+    response of all channels, also where several readouts are read. The load l is how much was stimulated in the seconds
+    before: it falls during the time t from one trial to the next, and each trial adds c, by which its mean over
+    the recording is 0.5.
+
+    Attributes:
+        decay: of the trace before; 0: only the last presentation is remembered.
+        weight: of what was presented beside what was answered; 0: only the answer is remembered.
+        neighbour_exponent: of n responses the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
+            them, whatever the history.
+        load_s: the load's time constant, s; 0: there is none.
+    """
+
+    decay: float
+    weight: float
+    neighbour_exponent: float
+    load_s: float = 0.0
+
+
+NO_MEMORY = Memory(0.0, 0.0, 1.0)
+
+
+class Loads(NamedTuple):
+    """The load of a recording.
+
+    Attributes:
+        every: at each trial, shape (presentations,).
+        at: each response, shape (responses,).
+        after: the trial before it, shape (responses,).
+        kept: the share that is left at a trial of each condition, shape (conditions,).
+        added: what a trial adds; 0: there is no load.
+    """
+
+    every: Float64[np.ndarray, " presentations"]
+    at: Float64[np.ndarray, " responses"]
+    after: Float64[np.ndarray, " responses"]
+    kept: Float64[np.ndarray, " conditions"]
+    added: float
+
+
+class Ranked:
+    """Responses by rank.
+
+    Attributes:
+        rank: of each, the share of non-burst responses below it, ties half, shape (responses,).
+        means: the mean rank of each condition's non-burst responses, shape (conditions,).
+        rows: of each condition, the responses that can be drawn.
+    """
+
+    def __init__(self, responses: Responses) -> None:
+        self._presented, self._place = responses.presentations
+        self._sorted_hz = np.sort(responses.non_burst_rate_hz)
+        self.rank = self._ranks(responses.rate_hz)
+        conditions = range(len(responses.conditions))
+        usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in conditions]
+        self.means = np.array([self.rank[rows].mean() for rows in usable])
+        known = ~np.isnan(responses.last_hz)
+        self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
+
+    def _ranks(self, rate_hz: Float64[np.ndarray, " values"]) -> Float64[np.ndarray, " values"]:
+        below, no_larger = (np.searchsorted(self._sorted_hz, rate_hz, side=side) for side in ("left", "right"))
+        return np.asarray((below + no_larger) / (2 * len(self._sorted_hz)))
+
+    def traces(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
+        """The trace before each response."""
+        return np.asarray(self.recorded(memory)[0][self._place])
+
+    def recorded(
+        self, memory: Memory
+    ) -> tuple[Float64[np.ndarray, " presentations"], Float64[np.ndarray, " presentations"]]:
+        """The trace before each trial, and what its response adds."""
+        presented: Presented = self._presented
+        # Of what has no condition of its own the middle one's is as good as any.
+        means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
+        left = left_by(self._ranks(presented.rate_hz), means, memory)
+        trace, traces = 0.0, []
+        for is_rested, is_burst, more in zip(
+            presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
+        ):
+            trace = 0.0 if is_rested else trace
+            traces.append(trace)
+            # What a burst leaves is not known: what comes right after one is not drawn, and begins anew.
+            trace = 0.5 if is_burst else memory.decay * trace + more
+        return np.array(traces, np.float64), left
+
+    def loads(self, load_s: float) -> Loads:
+        """The load before each response."""
+        presented = self._presented
+        if not load_s or presented.time_s is None:
+            every = np.full(len(presented.rate_hz), 0.5)
+            half = every[self._place]
+            return Loads(every, half, half, np.ones(len(self.rows)), 0.0)
+        since_s = np.diff(presented.time_s, prepend=-np.inf)
+        left, lefts, loads = 0.0, [], []
+        for kept in np.exp(-since_s / load_s).tolist():
+            lefts.append(left)
+            loads.append(kept * left)
+            left = loads[-1] + 1
+        # Before the first trial of all, time has no length.
+        has_length = np.isfinite(since_s)
+        usual_s = [
+            np.median(since_s[of] if (of := (presented.condition == c) & has_length).any() else np.inf)
+            for c in range(len(self.rows))
+        ]
+        added = 0.5 / max(float(np.mean(loads)), 1e-9)
+        every, after = added * np.array(loads), added * np.array(lefts)[self._place]
+        return Loads(every, every[self._place], after, np.exp(-np.array(usual_s) / load_s), added)
+
+
+def left_by(
+    rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
+) -> Float64[np.ndarray, " responses"]:
+    """What responses add to the history."""
+    return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
+
+
+class Recorded(NamedTuple):
+    """What there is to remember before each trial of a recording, as a simulator of a part of it reads it.
+
+    Attributes:
+        trace, load: when the trial comes, shape (presentations,).
+        left: what its recorded response adds to the trace, shape (presentations,).
+    """
+
+    trace: Float64[np.ndarray, " presentations"]
+    load: Float64[np.ndarray, " presentations"]
+    left: Float64[np.ndarray, " presentations"]
+
+
+def recorded_states(responses: Responses, memory: Memory) -> Recorded:
+    """The history states of all trials of a recording.
+
+    Args:
+        responses: that a simulator was fitted to. Ranks are among them; the trials (`Responses.presentations`) may be
+            more.
+        memory: the simulator's.
+    """
+    ranked = Ranked(responses)
+    traces, left = ranked.recorded(memory)
+    return Recorded(traces, ranked.loads(memory.load_s).every, left)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from animat.errors import InvalidArgument
+from animat.neurons.history import Memory
 from animat.neurons.joint_histogram import fit_joint_histogram
-from animat.neurons.memory import Memory, fit_memory
+from animat.neurons.memory import fit_memory
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogram
 from animat.responses.responses import Responses
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,38 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
 from animat.brief import briefly
+from animat.neurons.history import NO_MEMORY, Memory, Ranked, left_by
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical
-from animat.responses.conditions import NO_CONDITION
-from animat.responses.responses import Presented, Responses
-
-
-class Memory(NamedTuple):
-    """How the history state is made of what was presented and answered, and how much of it an answer hangs on.
-
-        p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
-        l  = exp(-t / load_s) l',    l' = l + c
-
-    The trace p is what was answered just before: p before a response and p' after it, r the response's rank (the share
-    of all responses below it), m the mean rank of its condition; all are in [0, 1], 0 after silence. Ranks are of the
-    response of all channels, also where several readouts are read. The load l is how much was stimulated in the seconds
-    before: it falls during the time t from one trial to the next, and each trial adds c, by which its mean over
-    the recording is 0.5.
-
-    Attributes:
-        decay: of the trace before; 0: only the last presentation is remembered.
-        weight: of what was presented beside what was answered; 0: only the answer is remembered.
-        neighbour_exponent: of n responses the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
-            them, whatever the history.
-        load_s: the load's time constant, s; 0: there is none.
-    """
-
-    decay: float
-    weight: float
-    neighbour_exponent: float
-    load_s: float = 0.0
-
-
-NO_MEMORY = Memory(0.0, 0.0, 1.0)
+from animat.responses.responses import Responses
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0)
@@ -113,18 +84,31 @@ class MemorySimulator(EmpiricalSimulator):
         return Memory(float(self.decay), float(self.weight), float(self.neighbour_exponent), float(self.load_s))
 
     def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
+        load = jnp.asarray(self.kept)[condition] * history[1]
+        rate_hz, trace = self.answer_at(condition, uniform, history[0], load)
+        return Answer(rate_hz, jnp.stack([trace, load + jnp.asarray(self.added)]))
+
+    def answer_at(
+        self, condition: Int[Array, ""], uniform: Float[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
+    ) -> tuple[Float[Array, "*readouts"], Float[Array, ""]]:
+        """What is answered at a trace and a load as they are when the trial comes, and the trace after it."""
+        first, end = self.rows_near(condition, trace, load)
+        # float32 rounds a uniform just under 1 times a count up to the count.
+        row = jnp.minimum(first + (uniform * (end - first)).astype(jnp.int32), end - 1)
+        trace = jnp.asarray(self.decay) * trace + jnp.asarray(self.left)[condition, row]
+        return jnp.asarray(self.after_hz)[condition, row], trace
+
+    def rows_near(
+        self, condition: Int[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
+    ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """The first row of `after_hz` that is drawn from at a trace and a load, and the one after the last."""
         before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
-        trace, load = history[0], jnp.asarray(self.kept)[condition] * history[1]
         toward = jnp.asarray(self.toward)[condition]
         here = toward[0] * trace + toward[1] * load
         smaller, no_larger = jnp.sum(before < here), jnp.sum(before <= here)
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
         # Small arrays count few spikes, and many responses may have the same history.
-        first, end = jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
-        # float32 rounds a uniform just under 1 times a count up to the count.
-        row = jnp.minimum(first + (uniform * (end - first)).astype(jnp.int32), end - 1)
-        trace = jnp.asarray(self.decay) * trace + jnp.asarray(self.left)[condition, row]
-        return Answer(jnp.asarray(self.after_hz)[condition, row], jnp.stack([trace, load + jnp.asarray(self.added)]))
+        return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
 
 
 def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory | None = None) -> MemorySimulator:
@@ -151,7 +135,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     Source: the rule of one standard error, Breiman, Friedman, Olshen and Stone 1984.
     """
     values = fit_empirical(responses, room=room)
-    ranked = _Ranked(responses)
+    ranked = Ranked(responses)
     memory = memory or _found(ranked)
     trace, load = ranked.traces(memory), ranked.loads(memory.load_s)
     memory = memory if load.added else memory._replace(load_s=0.0)
@@ -167,7 +151,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         before[condition, : len(rows)] = np.sort(at)
         histories[condition, : len(rows)] = state[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
-        left[condition, : len(rows)] = _left(ranked.rank[in_order], ranked.means[condition], memory)
+        left[condition, : len(rows)] = left_by(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
         values.values_hz,
@@ -186,92 +170,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     )
 
 
-class _Loads(NamedTuple):
-    """The load of a recording.
-
-    Attributes:
-        at: each response, shape (responses,).
-        after: the trial before it, shape (responses,).
-        kept: the share that is left at a trial of each condition, shape (conditions,).
-        added: what a trial adds; 0: there is no load.
-    """
-
-    at: Float64[np.ndarray, " responses"]
-    after: Float64[np.ndarray, " responses"]
-    kept: Float64[np.ndarray, " conditions"]
-    added: float
-
-
-class _Ranked:
-    """Responses by rank.
-
-    Attributes:
-        rank: of each, the share of non-burst responses below it, ties half, shape (responses,).
-        means: the mean rank of each condition's non-burst responses, shape (conditions,).
-        rows: of each condition, the responses that can be drawn.
-    """
-
-    def __init__(self, responses: Responses) -> None:
-        self._presented, self._place = responses.presentations
-        self._sorted_hz = np.sort(responses.non_burst_rate_hz)
-        self.rank = self._ranks(responses.rate_hz)
-        conditions = range(len(responses.conditions))
-        usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in conditions]
-        self.means = np.array([self.rank[rows].mean() for rows in usable])
-        known = ~np.isnan(responses.last_hz)
-        self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
-
-    def _ranks(self, rate_hz: Float64[np.ndarray, " values"]) -> Float64[np.ndarray, " values"]:
-        below, no_larger = (np.searchsorted(self._sorted_hz, rate_hz, side=side) for side in ("left", "right"))
-        return np.asarray((below + no_larger) / (2 * len(self._sorted_hz)))
-
-    def traces(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
-        """The trace before each response."""
-        presented: Presented = self._presented
-        # Of what has no condition of its own the middle one's is as good as any.
-        means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
-        left = _left(self._ranks(presented.rate_hz), means, memory)
-        trace, traces = 0.0, []
-        for is_rested, is_burst, more in zip(
-            presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
-        ):
-            trace = 0.0 if is_rested else trace
-            traces.append(trace)
-            # What a burst leaves is not known: what comes right after one is not drawn, and begins anew.
-            trace = 0.5 if is_burst else memory.decay * trace + more
-        return np.asarray(np.array(traces, np.float64)[self._place])
-
-    def loads(self, load_s: float) -> _Loads:
-        """The load before each response."""
-        presented = self._presented
-        if not load_s or presented.time_s is None:
-            half = np.full(len(self.rank), 0.5)
-            return _Loads(half, half, np.ones(len(self.rows)), 0.0)
-        since_s = np.diff(presented.time_s, prepend=-np.inf)
-        left, lefts, loads = 0.0, [], []
-        for kept in np.exp(-since_s / load_s).tolist():
-            lefts.append(left)
-            loads.append(kept * left)
-            left = loads[-1] + 1
-        # Before the first trial of all, time has no length.
-        has_length = np.isfinite(since_s)
-        usual_s = [
-            np.median(since_s[of] if (of := (presented.condition == c) & has_length).any() else np.inf)
-            for c in range(len(self.rows))
-        ]
-        added = 0.5 / max(float(np.mean(loads)), 1e-9)
-        at, after = (added * np.array(each)[self._place] for each in (loads, lefts))
-        return _Loads(at, after, np.exp(-np.array(usual_s) / load_s), added)
-
-
-def _left(
-    rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
-) -> Float64[np.ndarray, " responses"]:
-    """What responses add to the history."""
-    return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
-
-
-def _found(ranked: _Ranked) -> Memory:
+def _found(ranked: Ranked) -> Memory:
     """The memory that tells responses best, as `fit_memory` says."""
     rows = [rows for rows in ranked.rows if len(rows) > 1]
     if not rows:
@@ -302,7 +201,7 @@ def _found(ranked: _Ranked) -> Memory:
     return found._replace(load_s=_LOAD_S if _has_load(ranked, found) else 0.0)
 
 
-def _has_load(ranked: _Ranked, memory: Memory) -> bool:
+def _has_load(ranked: Ranked, memory: Memory) -> bool:
     """Whether a load explains ranks that the trace does not."""
     from scipy.stats import f
 

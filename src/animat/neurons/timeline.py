@@ -116,6 +116,11 @@ def room_for(series: Sequence[Responses]) -> int:
     return max(int(np.bincount(each.condition[~each.is_burst], minlength=1).max()) for each in series)
 
 
+def usual_kind(responses: Responses) -> Kind:
+    """The kind that suits a recording: one with memory, where it was presented so that it shows any."""
+    return "histogram" if responses.is_blocked else "memory"
+
+
 def fit_timeline(
     series: Sequence[Responses], *, kind: Kind | None = None, bins: int = 20, range_hz: float | None = None
 ) -> SimulatorTimeline:
@@ -139,9 +144,7 @@ def fit_timeline(
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
-    blocked = first.presentation is not None and first.presentation.order == "blocked"
-    if kind is None:
-        kind = "histogram" if blocked else "memory"
+    kind = kind or usual_kind(first)
     for other in ordered[1:]:
         for name in ("conditions", "window_ms", "presentation", "readouts"):
             if getattr(other, name) != getattr(first, name):
@@ -164,7 +167,7 @@ def fit_timeline(
         for responses, kept in zip(ordered, fidelities, strict=True)
         for finding in (*responses.findings, *kept.findings(of_memory=kind == "memory"))
     )
-    if kind == "memory" and blocked:
+    if kind == "memory" and first.is_blocked:
         findings += (_MEMORY_OF_BLOCKS,)
     return SimulatorTimeline(
         simulators=jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted),

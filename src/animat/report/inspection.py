@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
+from animat.errors import InvalidArgument
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.burst_separation import draw_burst_separation
@@ -122,6 +124,21 @@ def draw_inspection(
 def figure_stem(name: str) -> str:
     """What the figures' names of a recording begin with: its file's name without ending."""
     return Path(name).name.removesuffix(".gz").rsplit(".", 1)[0]
+
+
+def expect_unlike_stems(names: Sequence[str], *others: str) -> None:
+    """Raise if the figures of two recordings would have the same names, or a name that is used for others.
+
+    Raises:
+        InvalidArgument: naming it.
+    """
+    stems = [*others, *map(figure_stem, names)]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise InvalidArgument(
+                f"--out: expected recordings of different names, got figures that would all be called {stem}-...; "
+                "give them apart, or rename one"
+            )
 
 
 def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHistogram:

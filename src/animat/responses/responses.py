@@ -149,6 +149,11 @@ class Responses:
         return len(self.condition)
 
     @property
+    def is_blocked(self) -> bool:
+        """Whether all trials of a condition were presented together; False where that is not known."""
+        return self.presentation is not None and self.presentation.order == "blocked"
+
+    @property
     def presentations(self) -> tuple[Presented, Int64[np.ndarray, " responses"]]:
         """All trials of the recording in the order of time, and where among them each response is."""
         if self.presented is not None and self.place is not None:
@@ -201,13 +206,13 @@ class Responses:
         """
         rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
         drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
-        return replace(self._rows(drawn), findings=())
+        return replace(self.at_rows(drawn), findings=())
 
     def only(self, conditions: Sequence[int]) -> Responses:
         """The responses to some conditions, by index; what was presented before them is kept."""
         index = np.full(len(self.conditions) + 1, NO_CONDITION)
         index[list(conditions)] = np.arange(len(conditions))
-        kept = self._rows(np.flatnonzero(index[self.condition] != NO_CONDITION))
+        kept = self.at_rows(np.flatnonzero(index[self.condition] != NO_CONDITION))
         presented, _ = kept.presentations
         return replace(
             kept,
@@ -217,7 +222,7 @@ class Responses:
             presented=replace(presented, condition=index[presented.condition]),
         )
 
-    def _rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
+    def at_rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
         """Some of the responses; what was presented before them is kept."""
         presented, place = self.presentations
         columns: dict[str, Any] = {

@@ -1,0 +1,117 @@
+"""A simulator left to itself under a recorded sequence of conditions, and what series of responses are told by."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64, Int64
+
+from animat.neurons.history import recorded_states
+from animat.neurons.memory import MemorySimulator
+from animat.neurons.prediction import Halves, Prediction
+from animat.neurons.simulator import NeuronSimulator
+
+LAGS = 10
+"""Up to which responses are correlated with the ones before, and run lengths are told apart."""
+
+
+def recorded_series(halves: Halves) -> Float64[np.ndarray, " presentations"]:
+    """The held-out responses in their places among all trials, NaN at the others."""
+    presented, place = halves.whole.presentations
+    series = np.full(len(presented.rate_hz), np.nan)
+    series[place[halves.rows]] = halves.x_hz
+    return series
+
+
+def free_runs(
+    simulator: NeuronSimulator | None, prediction: Prediction, halves: Halves, n: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "n presentations"]:
+    """What a simulator answers in the held-out half's place, n times.
+
+    Conditions and times are the recorded ones. A simulator with memory remembers its own answers; what it does not
+    answer, bursts and trials of no condition or of the first half, it is given.
+
+    Returns:
+        Responses in Hz in the places of the recorded ones, NaN elsewhere.
+    """
+    presented, place = halves.whole.presentations
+    places = place[halves.rows]
+    runs = np.full((n, len(presented.rate_hz)), np.nan)
+    if not isinstance(simulator, MemorySimulator):
+        at_most, uniform = prediction.at_most, rng.random((len(places), n))
+        drawn = [np.searchsorted(row[:-1], u, side="right") for row, u in zip(at_most, uniform, strict=True)]
+        runs[:, places] = halves.values_hz[np.stack(drawn, axis=1)]
+        return runs
+    states = recorded_states(halves.first, simulator.memory)
+    since = int(places[0])
+    is_answered = np.isin(np.arange(len(presented.rate_hz)), places)
+    rate_hz = _remembering(
+        simulator,
+        np.maximum(presented.condition, 0)[since:],
+        states.load.astype(np.float32)[since:],
+        states.left.astype(np.float32)[since:],
+        is_answered[since:],
+        presented.is_burst[since:],
+        presented.is_rested[since:],
+        np.float32(states.trace[since]),
+        rng.random((len(states.load) - since, n), np.float32),
+    )
+    runs[:, places] = halves.read(np.asarray(rate_hz))[places - since].T
+    return runs
+
+
+@jax.jit
+def _remembering(
+    simulator: MemorySimulator,
+    condition: Int64[Array, " trials"],
+    load: Float[Array, " trials"],
+    left: Float[Array, " trials"],
+    is_answered: Bool[Array, " trials"],
+    is_burst: Bool[Array, " trials"],
+    is_rested: Bool[Array, " trials"],
+    trace: Float[Array, ""],
+    uniforms: Float[Array, "trials n"],
+) -> Float[Array, "trials n *readouts"]:
+    answer = jax.vmap(simulator.answer_at, (None, 0, 0, None))
+
+    def trial(trace: Float[Array, " n"], given: tuple[Array, ...]) -> tuple[Array, Array]:
+        condition, load, left, is_answered, is_burst, is_rested, uniform = given
+        trace = jnp.where(is_rested, 0.0, trace)
+        rate_hz, after = answer(condition, uniform, trace, load)
+        after = jnp.where(is_answered, after, jnp.asarray(simulator.decay) * trace + left)
+        # As `history.Ranked` has it: what a burst leaves is not known.
+        return jnp.where(is_burst, 0.5, after), rate_hz
+
+    begun = jnp.full(uniforms.shape[1], trace)
+    return jax.lax.scan(trial, begun, (condition, load, left, is_answered, is_burst, is_rested, uniforms))[1]
+
+
+def autocorrelation(series: Float64[np.ndarray, "*n trials"]) -> Float64[np.ndarray, "*n lags"]:
+    """The correlation of responses with those 1 to `LAGS` trials before, over the pairs that there are; NaN of none."""
+    is_there = ~np.isnan(series)
+    count = is_there.sum(axis=-1, keepdims=True)
+    filled = np.where(is_there, series, 0.0)
+    centred = np.where(is_there, filled - filled.sum(axis=-1, keepdims=True) / count, 0.0)
+    variance = np.sum(centred**2, axis=-1) / count[..., 0]
+    of_lags = []
+    for lag in range(1, LAGS + 1):
+        pairs = np.sum(is_there[..., :-lag] & is_there[..., lag:], axis=-1)
+        products = np.sum(centred[..., :-lag] * centred[..., lag:], axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            of_lags.append(products / pairs / variance)
+    return np.stack(of_lags, axis=-1)
+
+
+def run_lengths(series: Float64[np.ndarray, " trials"], threshold_hz: float) -> Int64[np.ndarray, " runs"]:
+    """How many trials in a row the response is at or above a threshold; what is missing ends a run."""
+    passes = np.concatenate([[False], series >= threshold_hz, [False]])
+    edges = np.flatnonzero(np.diff(passes.astype(np.int8))).reshape(-1, 2)
+    return np.asarray(edges[:, 1] - edges[:, 0])
+
+
+def shares_lasting(lengths: Int64[np.ndarray, " runs"]) -> Float64[np.ndarray, " lengths"]:
+    """The share of runs that last 1, 2, ..., `LAGS` trials or more; NaN without runs."""
+    if not len(lengths):
+        return np.full(LAGS, np.nan)
+    return np.asarray(np.mean(lengths[:, None] >= np.arange(1, LAGS + 1), axis=0))

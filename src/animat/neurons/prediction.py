@@ -1,0 +1,233 @@
+"""What a simulator made from the first half of a recording says of each response in the second, and how well."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+
+from animat.errors import UnusableData
+from animat.neurons.history import recorded_states
+from animat.neurons.joint_histogram import JointHistogramSimulator
+from animat.neurons.memory import MemorySimulator
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator
+from animat.responses.responses import Responses
+
+FEWEST = 20
+"""Non-burst responses of each condition in each half, at least: of fewer there is no distribution to speak of."""
+CLASSES = 10
+"""That the percentiles P10 to P90 make: the commands of nine thresholds."""
+
+
+class Halves(NamedTuple):
+    """A recording's responses in two parts.
+
+    Attributes:
+        whole: all of them.
+        first: those to fit to.
+        rows: the non-burst responses of the second part, by their row in `whole`, shape (held,).
+        condition: of these, shape (held,).
+        x_hz: of these, in the precision that thresholds are compared in, shape (held,).
+        values_hz: all responses that the recording has, of any condition and half, each once, rising.
+        readout: whose responses these are, of several; None: of the only one.
+    """
+
+    whole: Responses
+    first: Responses
+    rows: Int64[np.ndarray, " held"]
+    condition: Int64[np.ndarray, " held"]
+    x_hz: Float32[np.ndarray, " held"]
+    values_hz: Float32[np.ndarray, " values"]
+    readout: int | None = None
+
+    def read(self, every: Float[np.ndarray, "*some"]) -> Float[np.ndarray, "*others"]:
+        """What is the readout's, of an array that has readouts last where there are several."""
+        return every if self.readout is None else every[..., self.readout]
+
+    def first_of(self, condition: int) -> Float64[np.ndarray, " fitted"]:
+        """The non-burst responses to one condition in the first half, in Hz."""
+        return self.read(self.first.read_of(condition))
+
+
+def halved(responses: Responses, readout: int | None = None) -> Halves:
+    """Part a recording's responses in the middle: by time, or each condition's where they were presented in blocks.
+
+    Args:
+        responses: of one recording.
+        readout: which of several is to be predicted.
+
+    Raises:
+        UnusableData: for one condition, or a half with fewer than `FEWEST` non-burst responses to one.
+    """
+    labels = [condition.label for condition in responses.conditions]
+    if len(labels) < 2:
+        raise UnusableData(
+            f"conditions: expected two or more, so that there is something to predict from, got "
+            f"{', '.join(labels) or 'none'}; choose others with --conditions, such as interval:5,10+-25%"
+        )
+    is_held = np.arange(len(responses)) >= len(responses) // 2
+    if responses.is_blocked:
+        for c in range(len(labels)):
+            of = np.flatnonzero(responses.condition == c)
+            is_held[of] = np.arange(len(of)) >= len(of) // 2
+    for c, label in enumerate(labels):
+        usable = ~responses.is_burst & (responses.condition == c)
+        n = [int(np.count_nonzero(usable & part)) for part in (~is_held, is_held)]
+        if min(n) < FEWEST:
+            raise UnusableData(
+                f"condition {label}: expected {FEWEST} non-burst responses or more in each half of the recording, got "
+                f"{n[0]} and {n[1]}; leave it out with --conditions, or record more trials"
+            )
+    rows = np.flatnonzero(is_held & ~responses.is_burst)
+    every = responses.read_hz if readout is None else responses.read_hz[:, readout]
+    x_hz = every.astype(np.float32)
+    first = responses.at_rows(np.flatnonzero(~is_held))
+    return Halves(responses, first, rows, responses.condition[rows], x_hz[rows], np.unique(x_hz), readout)
+
+
+class Prediction(NamedTuple):
+    """Distributions over the values of a recording, one for each held-out response.
+
+    Attributes:
+        probability: of each value, shape (held, values).
+        n: how many responses each is made of, shape (held,).
+    """
+
+    probability: Float64[np.ndarray, "held values"]
+    n: Float64[np.ndarray, " held"]
+
+    @property
+    def at_most(self) -> Float64[np.ndarray, "held values"]:
+        """The distribution functions."""
+        return np.cumsum(self.probability, axis=1)
+
+
+def predict_marginal(halves: Halves) -> Prediction:
+    """The first half's non-burst responses of all conditions together: what is known without any condition."""
+    x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
+    share = _shares(x_hz, halves.values_hz)
+    return Prediction(np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
+
+
+def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
+    """What a simulator of the first half says of each held-out response.
+
+    Given are its condition and, where the simulator remembers, all that was recorded before it. A histogram's draw
+    counts as the largest value of the recording that is not above it, so that thresholds read it as they would.
+    """
+    values_hz = halves.values_hz
+    if isinstance(simulator, MemorySimulator):
+        return _predict_with_memory(simulator, halves)
+    if isinstance(simulator, EmpiricalSimulator):
+        counts = np.asarray(simulator.counts)
+        table = halves.read(np.asarray(simulator.values_hz))
+        of_condition = [_shares(x[:n], values_hz) for x, n in zip(table, counts, strict=True)]
+    elif isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
+        counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
+        cumulatives, edges_hz = np.asarray(simulator.cumulative), np.asarray(simulator.edges_hz)
+        if halves.readout is not None:
+            cumulatives, edges_hz = cumulatives[halves.readout], edges_hz[halves.readout]
+        of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
+    else:
+        raise TypeError(f"simulator: expected a histogram, an empirical or a memory one, got {type(simulator)}")
+    return Prediction(np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
+
+
+def _predict_with_memory(simulator: MemorySimulator, halves: Halves) -> Prediction:
+    places = halves.whole.presentations[1][halves.rows]
+    states = recorded_states(halves.first, simulator.memory)
+    near = _rows_near(
+        simulator, halves.condition, states.trace[places].astype(np.float32), states.load[places].astype(np.float32)
+    )
+    first, end = (np.asarray(each) for each in near)
+    index = np.searchsorted(halves.values_hz, halves.read(np.asarray(simulator.after_hz)))
+    n_values = len(halves.values_hz)
+    counted = [
+        np.bincount(index[c, a:b], minlength=n_values) for c, a, b in zip(halves.condition, first, end, strict=True)
+    ]
+    n = (end - first).astype(np.float64)
+    return Prediction(np.stack(counted) / n[:, None], n)
+
+
+_rows_near = jax.jit(jax.vmap(MemorySimulator.rows_near, (None, 0, 0, 0)))
+
+
+def _shares(
+    x_hz: Float[np.ndarray, " some"], values_hz: Float[np.ndarray, " values"]
+) -> Float64[np.ndarray, " values"]:
+    return np.bincount(np.searchsorted(values_hz, x_hz), minlength=len(values_hz)) / len(x_hz)
+
+
+def _below(
+    cumulative: Float[np.ndarray, " edges"], edges_hz: Float[np.ndarray, " edges"], x_hz: Float[np.ndarray, " some"]
+) -> Float64[np.ndarray, " some"]:
+    """P(draw < x) of a histogram; a bin between two equal edges is drawn as that value."""
+    inside = np.interp(x_hz, edges_hz, cumulative, left=0.0, right=1.0)
+    place = np.minimum(np.searchsorted(edges_hz, x_hz), len(edges_hz) - 1)
+    return np.asarray(np.where(edges_hz[place] == x_hz, cumulative[place], inside), np.float64)
+
+
+def crps(prediction: Prediction, halves: Halves) -> Float64[np.ndarray, " held"]:
+    """The continuous ranked probability score of each held-out response, in Hz; smaller is better.
+
+        CRPS = integral of (F(z) - 1[z >= x])^2 dz
+
+    Source: Gneiting and Raftery 2007, doi:10.1198/016214506000001437.
+    """
+    values_hz = halves.values_hz.astype(np.float64)
+    passed = values_hz[:-1] >= halves.x_hz[:, None]
+    return np.asarray((prediction.at_most[:, :-1] - passed) ** 2 @ np.diff(values_hz))
+
+
+def transformed(prediction: Prediction, halves: Halves) -> Float64[np.ndarray, "held 2"]:
+    """The probability integral transform of each held-out response, F(x-) and F(x): from below x, and with it."""
+    at = np.searchsorted(halves.values_hz, halves.x_hz)[:, None]
+    mass = np.take_along_axis(prediction.probability, at, 1)
+    up_to = np.take_along_axis(prediction.at_most, at, 1)
+    return np.concatenate([up_to - mass, up_to], axis=1)
+
+
+def share_below(
+    transforms: Float64[np.ndarray, "held 2"], at: Float64[np.ndarray, " places"]
+) -> Float64[np.ndarray, " places"]:
+    """The mean distribution function of the transforms, each spread evenly from F(x-) to F(x).
+
+    It is the diagonal where the predictions are calibrated, whether or not responses are tied.
+
+    Source: the non-randomised transform of Czado, Gneiting and Held 2009, doi:10.1111/j.1541-0420.2009.01191.x.
+    """
+    low, high = transforms.T[:, :, None]
+    within = (at - low) / np.maximum(high - low, 1e-12)
+    return np.asarray(np.clip(within, 0.0, 1.0).mean(axis=0))
+
+
+def command_probabilities(
+    prediction: Prediction,
+    prior: Float64[np.ndarray, "held classes"] | float,
+    halves: Halves,
+    thresholds_hz: Float[np.ndarray, " thresholds"],
+) -> Float64[np.ndarray, "held classes"]:
+    """The probability of each command through nine thresholds, for each held-out response.
+
+    What was never drawn is not impossible. To the n responses that a prediction is made of, ten, one a class, are added
+    as a coarser prediction has them: p = (n p_n + 10 prior) / (n + 10).
+
+    Args:
+        prediction: of the responses.
+        prior: the coarser one's probabilities; a number for all.
+        halves: of the recording.
+        thresholds_hz: P10, P20, ..., P90 of the first half.
+    """
+    of_value = np.searchsorted(thresholds_hz, halves.values_hz, side="right")
+    n = prediction.n[:, None]
+    return np.asarray((n * (prediction.probability @ np.eye(CLASSES)[of_value]) + CLASSES * prior) / (n + CLASSES))
+
+
+def log_likelihood_bits(
+    probability: Float64[np.ndarray, "held classes"], halves: Halves, thresholds_hz: Float[np.ndarray, " thresholds"]
+) -> Float64[np.ndarray, " held"]:
+    """The logarithm to base 2 of the probability that each held-out response's command had."""
+    observed = np.searchsorted(thresholds_hz, halves.x_hz, side="right")[:, None]
+    return np.asarray(np.log2(np.take_along_axis(probability, observed, 1)[:, 0]))

@@ -1,0 +1,364 @@
+"""Whether simulators made from the first half of a recording predict its second half."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from animat.brief import briefly
+from animat.errors import InvalidArgument
+from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
+from animat.neurons.kinds import Kind, fit_simulator
+from animat.neurons.prediction import (
+    CLASSES,
+    Halves,
+    command_probabilities,
+    crps,
+    halved,
+    log_likelihood_bits,
+    predict,
+    predict_marginal,
+    share_below,
+    transformed,
+)
+from animat.neurons.simulator import pooled_percentiles
+from animat.neurons.timeline import usual_kind
+from animat.responses.responses import Responses
+
+MARGINAL = "marginal"
+"""The name of the baseline: all conditions' responses in one distribution."""
+SMALL_DISTANCE, LARGE_DISTANCE = 0.1, 0.2
+"""Of the transforms from uniform: through a threshold, a mean command is off by twice as much at most. Of virtual
+cultures 1 to 5, whose measured returns lie in the intervals of their predictions, the largest is 0.08."""
+LARGE_DIFFERENCE = 0.15
+"""Between the recorded correlation of successive responses and the simulator's: of these cultures 0.07 at most with
+memory, and 0.30 to 0.41 without."""
+CERTAIN = 2.0
+"""Standard errors by which one prediction must be better than another."""
+FREE_RUNS = 200
+PIT_BINS = 10
+_STRETCHES = 20
+_CHANCES = 500
+
+
+class Band(NamedTuple):
+    """What free runs of a simulator have: the middle 95 % of the runs, and their mean."""
+
+    low: Any
+    mean: Any
+    high: Any
+
+
+class Gain(NamedTuple):
+    """By how much one kind predicts better than another, a trial, with the standard error."""
+
+    value: float
+    error: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is better, beyond `CERTAIN` standard errors."""
+        return self.value > CERTAIN * self.error
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How one kind of simulator does on the held-out half.
+
+    Attributes:
+        kind: which; `MARGINAL` for none.
+        bits: log-likelihood of each held-out command through nine thresholds, shape (held,).
+        crps_hz: continuous ranked probability score of each, shape (held,).
+        transforms: the probability integral transform of each, from F(x-) to F(x), shape (held, 2).
+        distance: Kolmogorov's, of the transforms from uniform.
+        p_value: how often chance alone makes it so large.
+        autocorrelation: of the free runs, at lags 1 to `LAGS`.
+        run_length: the mean length of the free runs' runs at or above P50 of the first half.
+        lasting: the share of these that last 1 to `LAGS` trials or more.
+        above: P(x >= P50) predicted for the held-out trials of each condition, shape (conditions,).
+    """
+
+    __repr__ = briefly
+
+    kind: str
+    bits: Float64[np.ndarray, " held"]
+    crps_hz: Float64[np.ndarray, " held"]
+    transforms: Float64[np.ndarray, "held 2"]
+    distance: float
+    p_value: float
+    autocorrelation: Band
+    run_length: Band
+    lasting: Band
+    above: Float64[np.ndarray, " conditions"]
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """All kinds of simulators on one recording: fitted to its first half, scored on its second.
+
+    Attributes:
+        labels: the conditions.
+        n_fitted, n_held: non-burst responses to each in the first and in the second half, shape (conditions,).
+        medians_hz: of these, shape (2, conditions).
+        above: P(x >= P50) of the held-out responses to each, P50 that of the first half, shape (conditions,).
+        autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50,
+            as the thresholds of a loop adapt.
+        scores: of the marginal distribution and of each kind.
+        kind: the one that the verdict is on.
+        is_blocked: whether conditions were presented in blocks.
+        pit_band: the middle 95 % of the share of transforms in one of `PIT_BINS` bins, of chance alone.
+    """
+
+    __repr__ = briefly
+
+    labels: tuple[str, ...]
+    n_fitted: tuple[int, ...]
+    n_held: tuple[int, ...]
+    medians_hz: Float64[np.ndarray, "2 conditions"]
+    above: Float64[np.ndarray, " conditions"]
+    autocorrelation: Float64[np.ndarray, " lags"]
+    run_length: float
+    lasting: Float64[np.ndarray, " lags"]
+    scores: tuple[Scores, ...]
+    kind: str
+    is_blocked: bool
+    pit_band: tuple[float, float]
+
+    def of(self, kind: str) -> Scores:
+        """The scores of a kind."""
+        return next(scores for scores in self.scores if scores.kind == kind)
+
+    def gain(self, kind: str, over: str, score: Literal["bits", "crps_hz"] = "bits") -> Gain:
+        """How much better a kind is than another, in bits or Hz.
+
+        The standard error is that of the means of `_STRETCHES` stretches in time, as neighbours may hang together.
+        """
+        sign = 1 if score == "bits" else -1
+        each = sign * (getattr(self.of(kind), score) - getattr(self.of(over), score))
+        means = np.array([part.mean() for part in np.array_split(each, min(_STRETCHES, len(each)))])
+        return Gain(float(each.mean()), float(means.std(ddof=1) / np.sqrt(len(means))))
+
+    def to_dict(self) -> dict[str, Any]:
+        """All numbers as JSON data, without those of single trials."""
+        kinds = {
+            scores.kind: {
+                "bits": float(scores.bits.mean()),
+                "crps_hz": float(scores.crps_hz.mean()),
+                "distance": scores.distance,
+                "p_value": scores.p_value,
+                "pit": pit_shares(scores.transforms).tolist(),
+                "above": scores.above.tolist(),
+                "autocorrelation": {end: x.tolist() for end, x in scores.autocorrelation._asdict().items()},
+                "run_length": {end: float(x) for end, x in scores.run_length._asdict().items()},
+                "lasting": {end: x.tolist() for end, x in scores.lasting._asdict().items()},
+            }
+            for scores in self.scores
+        }
+        return {
+            "verdict": self.verdict,
+            "simulator": self.kind,
+            "conditions": list(self.labels),
+            "n_fitted": list(self.n_fitted),
+            "n_held": list(self.n_held),
+            "medians_hz": self.medians_hz.tolist(),
+            "drift": self.drift,
+            "above": self.above.tolist(),
+            "autocorrelation": self.autocorrelation.tolist(),
+            "run_length": self.run_length,
+            "lasting": self.lasting.tolist(),
+            "conditions_bring_bits": self.gain("empirical", MARGINAL)._asdict(),
+            "memory_brings_bits": self.gain("memory", "empirical")._asdict(),
+            "simulators": kinds,
+        }
+
+    @property
+    def drift(self) -> float:
+        """The relative change of the median from the first half to the second, conditions weighted by their trials.
+
+        NaN where a median is 0.
+        """
+        if not np.all(self.medians_hz > 0):
+            return float("nan")
+        first, second = self.medians_hz
+        return float(np.exp(np.average(np.log(second / first), weights=self.n_held)) - 1)
+
+    @property
+    def verdict(self) -> str:
+        """Whether a policy that is trained on the simulator can be trusted, in a sentence, with what decides."""
+        scores = self.of(self.kind)
+        conditions = self.gain("empirical", MARGINAL)
+        distance, lag = scores.distance, self.autocorrelation[0] - scores.autocorrelation.mean[0]
+        better = [s.kind for s in self.scores[1:] if self.gain(s.kind, self.kind, "crps_hz").is_certain]
+        off = f"the held-out distribution is off by up to {distance:.2f}"
+        drifted = f", as responses {'fell' if self.drift < 0 else 'rose'} by {100 * abs(self.drift):.0f} % meanwhile"
+        off += drifted if abs(self.drift) > SMALL_DISTANCE / 2 else ""
+        if self.is_blocked:
+            return (
+                "Cannot be trusted: conditions were presented in blocks, and a loop mixes them, which this recording "
+                "says nothing of; record with --order mixed"
+            )
+        # Where nearly all responses are in one class, what is added for classes without any looks like bits.
+        for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
+            if not gain.is_certain:
+                return (
+                    f"Cannot be trusted: to know the condition is worth {gain.value:.3f} ± {gain.error:.3f} {unit} "
+                    "a trial, not certainly more than nothing, so that there is next to nothing to steer with"
+                )
+        if distance > LARGE_DISTANCE:
+            return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"
+        if distance > SMALL_DISTANCE:
+            return f"With care: {off} (at most {SMALL_DISTANCE:g} to be trusted)"
+        if abs(lag) > LARGE_DIFFERENCE:
+            return (
+                f"With care: successive responses correlate by {self.autocorrelation[0]:.2f}, the simulator's by "
+                f"{scores.autocorrelation.mean[0]:.2f} (at most {LARGE_DIFFERENCE:g} apart to be trusted)"
+            )
+        if better:
+            return f"With care: the {better[-1]} simulator predicts better; train with --simulator {better[-1]}"
+        return (
+            f"Can be trusted: the held-out distribution is off by {distance:.2f} at most, and the condition is worth "
+            f"{conditions.value:.2f} ± {conditions.error:.2f} bits a trial"
+        )
+
+
+def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, readout: int | None = None) -> Validation:
+    """Fit all kinds of simulators to the first half of a recording's responses, and score them on the second.
+
+    Args:
+        responses: of one recording.
+        kind: that the verdict is on; None: the one that a training would take.
+        seed: decides the free runs, and what chance alone makes.
+        readout: which of several readouts is scored; simulators answer for all of them.
+
+    Raises:
+        UnusableData: as `halved` does.
+        InvalidArgument: for a kind or a readout that there is not.
+    """
+    n_readouts = responses.read_hz.shape[1] if responses.read_hz.ndim == 2 else None
+    if (readout is None) != (n_readouts is None) or (readout is not None and not 0 <= readout < (n_readouts or 0)):
+        raise InvalidArgument(f"readout: expected which of {n_readouts or 1} readouts, None of one, got {readout}")
+    rng = np.random.default_rng(seed)
+    halves = halved(responses, readout)
+    kinds: tuple[str, ...] = get_args(Kind)
+    if kind is not None and kind not in kinds:
+        raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")
+    percentiles = np.asarray(pooled_percentiles(halves.first))
+    percentiles = percentiles if readout is None else percentiles[readout]
+    simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}
+    distances, band = _of_chance(halves, rng)
+    probabilities: dict[str, Float64[np.ndarray, "held classes"]] = {}
+    scores = []
+    for each in (MARGINAL, *kinds):
+        simulator = simulators.get(each)
+        prediction = predict_marginal(halves) if simulator is None else predict(simulator, halves)
+        prior = probabilities.get("empirical" if each == "memory" else MARGINAL, 1 / CLASSES)
+        probabilities[each] = command_probabilities(prediction, prior, halves, percentiles[1:10])
+        transforms = transformed(prediction, halves)
+        distance = from_uniform(transforms)
+        series = free_runs(simulator, prediction, halves, FREE_RUNS, rng)
+        lengths = [run_lengths(one, percentiles[5]) for one in series]
+        passing = prediction.probability @ (halves.values_hz >= percentiles[5])
+        scores.append(
+            Scores(
+                each,
+                log_likelihood_bits(probabilities[each], halves, percentiles[1:10]),
+                crps(prediction, halves),
+                transforms,
+                distance,
+                float(np.mean(distances >= distance)),
+                _band(autocorrelation(series)),
+                _band(np.array([_mean(runs) for runs in lengths])),
+                _band(np.array([shares_lasting(runs) for runs in lengths])),
+                _by_condition(passing, halves),
+            )
+        )
+    recorded = recorded_series(halves)
+    # At its own median, as a loop's thresholds adapt: what has drifted is told apart.
+    lasted = run_lengths(recorded, float(np.median(halves.x_hz)))
+    conditions = range(len(responses.conditions))
+    first = [halves.first_of(c) for c in conditions]
+    second = [halves.x_hz[halves.condition == c] for c in conditions]
+    return Validation(
+        tuple(condition.label for condition in responses.conditions),
+        tuple(map(len, first)),
+        tuple(map(len, second)),
+        np.array([[np.median(x) for x in half] for half in (first, second)], np.float64),
+        _by_condition(halves.x_hz >= percentiles[5], halves),
+        autocorrelation(recorded),
+        _mean(lasted),
+        shares_lasting(lasted),
+        tuple(scores),
+        kind or usual_kind(responses),
+        responses.is_blocked,
+        band,
+    )
+
+
+def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
+    """Spearman's correlation of every two readouts in the first half, which simulators keep, and in the second.
+
+    Of each condition on its own; the mean by their trials. Pairs are (0, 1), (0, 2), ..., (1, 2), ...
+    """
+    from scipy.stats import rankdata
+
+    halves = halved(responses, 0)
+    rows = ~responses.is_burst & np.isin(np.arange(len(responses)), halves.rows)
+    of_halves = []
+    for read_hz, condition in (
+        (halves.first.read_hz[~halves.first.is_burst], halves.first.condition[~halves.first.is_burst]),
+        (responses.read_hz[rows], responses.condition[rows]),
+    ):
+        of_condition = [rankdata(read_hz[condition == c], axis=0) for c in range(len(responses.conditions))]
+        upper = np.triu_indices(read_hz.shape[1], 1)
+        with np.errstate(invalid="ignore", divide="ignore"):  # NaN of a readout that is always the same.
+            each = [np.corrcoef(ranks, rowvar=False)[upper] for ranks in of_condition]
+        of_halves.append(np.average(each, axis=0, weights=list(map(len, of_condition))))
+    return np.array(of_halves)
+
+
+def pit_shares(transforms: Float64[np.ndarray, "held 2"]) -> Float64[np.ndarray, " bins"]:
+    """The share of the transforms in each of `PIT_BINS` equal bins."""
+    return np.diff(share_below(transforms, np.linspace(0, 1, PIT_BINS + 1)[1:-1]), prepend=0, append=1)
+
+
+def from_uniform(transforms: Float64[np.ndarray, "held 2"]) -> float:
+    """Kolmogorov's distance of the transforms from the uniform distribution, to 0.001."""
+    at = np.linspace(0, 1, 1001)
+    return float(np.abs(share_below(transforms, at) - at).max())
+
+
+def _of_chance(halves: Halves, rng: np.random.Generator) -> tuple[Float64[np.ndarray, " chances"], tuple[float, float]]:
+    """Distances from uniform, and the middle 95 % of the bins' shares, where both halves have the same distributions.
+
+    Independent responses of any continuous distribution do, as only ranks count: those of the second half among the
+    first's, of each condition as many as there are.
+    """
+    n = [(len(halves.first_of(c)), np.count_nonzero(halves.condition == c)) for c in np.unique(halves.condition)]
+    distances, shares = [], []
+    for _ in range(_CHANCES):
+        x = np.sort(np.concatenate([np.searchsorted(np.sort(rng.random(a)), rng.random(b)) / a for a, b in n]))
+        below = np.arange(len(x) + 1) / len(x)
+        distances.append(max((below[1:] - x).max(), (x - below[:-1]).max()))
+        shares.append(np.histogram(x, PIT_BINS, (0, 1))[0] / len(x))
+    low, high = np.quantile(shares, [0.025, 0.975])
+    return np.array(distances), (float(low), float(high))
+
+
+def _by_condition(x: Any, halves: Halves) -> Float64[np.ndarray, " conditions"]:
+    return np.array([x[halves.condition == c].mean() for c in range(len(halves.whole.conditions))], np.float64)
+
+
+def _mean(runs: Int64[np.ndarray, " runs"]) -> float:
+    return float(runs.mean()) if len(runs) else float("nan")
+
+
+def _band(x: Float64[np.ndarray, "n *some"]) -> Band:
+    """Over the free runs, without those that have none of it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # Where no run has any: NaN.
+        low, high = np.nanquantile(x, [0.025, 0.975], axis=0)
+        return Band(low, np.nanmean(x, axis=0), high)

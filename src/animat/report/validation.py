@@ -1,0 +1,100 @@
+"""A validation as text for a terminal and as a figure: calibration, autocorrelation and runs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.neurons.free_runs import LAGS
+from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
+from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
+_HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"
+
+
+def validation_text(name: str, validation: Validation) -> str:
+    """Lines for a terminal: the verdict, what was predicted and what was recorded."""
+    v = validation
+    lines = [
+        f"{name}: {v.verdict}",
+        f"  fitted to {sum(v.n_fitted):,} responses of the first half, scored on {sum(v.n_held):,} of the second"
+        + ("" if np.isnan(v.drift) else f"; medians moved by {100 * v.drift:+.0f} %"),
+        "",
+        _HEADER,
+    ]
+    for s in v.scores:
+        off, runs = f"{s.distance:.3f} ({s.p_value:.3f})", s.run_length
+        lines.append(
+            f"  {s.kind:<11}{s.bits.mean():>11.3f}{s.crps_hz.mean():>11.3f}{off:>14}{s.autocorrelation.mean[0]:>8.2f}"
+            f"{f'{runs.mean:.2f} ({runs.low:.2f} to {runs.high:.2f})':>25}"
+        )
+    lines.append(f"  {'recorded':<47}{v.autocorrelation[0]:>8.2f}{f'{v.run_length:.2f}':>25}")
+    gains = [("conditions bring", v.gain("empirical", MARGINAL)), ("memory brings", v.gain("memory", "empirical"))]
+    lines.append("  " + "; ".join(f"{what} {gain.value:.3f} ± {gain.error:.3f} bits a trial" for what, gain in gains))
+    width = max(len("condition"), *map(len, v.labels))
+    lines += ["", f"  {'condition':<{width}}  {'responses':>13}  {'median x (Hz)':>16}  P(x >= P50) {v.kind}, recorded"]
+    for c, label in enumerate(v.labels):
+        n = f"{v.n_fitted[c]:,}, {v.n_held[c]:,}"
+        medians = f"{v.medians_hz[0, c]:.2f}, {v.medians_hz[1, c]:.2f}"
+        lines.append(f"  {label:<{width}}  {n:>13}  {medians:>16}  {v.of(v.kind).above[c]:.2f}, {v.above[c]:.2f}")
+    return "\n".join(lines)
+
+
+def correlations_text(names: Sequence[str], correlations: Float64[np.ndarray, "2 pairs"]) -> str:
+    """Spearman's correlation of every two readouts, in the half that simulators keep it of and in the held-out one."""
+    lines = ["  readouts, Spearman's correlation within conditions: first half, second half"]
+    for (one, other), (first, second) in zip(itertools.combinations(names, 2), correlations.T, strict=True):
+        lines.append(f"  {one}, {other}: {first:.2f}, {second:.2f}")
+    return "\n".join(lines)
+
+
+def draw_validation(name: str, validation: Validation) -> Figure:
+    """Three panels: the transforms' histograms, the autocorrelation, and how long runs above P50 last."""
+    v = validation
+    figure = new_figure(10.5, 3.7)
+    n = f"{sum(v.n_held):,} held-out responses"
+    figure.suptitle(f"{name}: {n}; shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators", fontsize=10)
+    calibration, correlation, runs = figure.subplots(1, 3)
+    # The empirical kind lies on the histogram.
+    shown = [v.of(kind) for kind in dict.fromkeys(("histogram", v.kind, "memory"))]
+
+    style_axes(calibration, "calibration", "probability integral transform (-)", "share of responses (-)")
+    low, high = v.pit_band
+    calibration.axhspan(low, high, color="#DDDDDD", label="uniform", linewidth=0)
+    edges = np.linspace(0, 1, PIT_BINS + 1)
+    for s in (v.of(MARGINAL), *shown):
+        calibration.stairs(pit_shares(s.transforms), edges, color=_COLOURS[s.kind], linewidth=1.6, label=s.kind)
+    calibration.set_ylim(bottom=0)
+
+    lags = np.arange(1, LAGS + 1)
+    style_axes(correlation, "successive responses", "lag (trials)", "autocorrelation (-)")
+    style_axes(runs, "runs of x ≥ P50 (command above 0)", "run length (trials)", "share that last as long (-)")
+    for axes, of in ((correlation, "autocorrelation"), (runs, "lasting")):
+        for s in shown:
+            _draw_band(axes, lags, getattr(s, of), _COLOURS[s.kind])
+        recorded = getattr(v, of)
+        # A share of 0 has no place on an axis of logarithms.
+        recorded = np.where(recorded > 0, recorded, np.nan) if of == "lasting" else recorded
+        axes.plot(lags, recorded, "o-", color=BLACK, markersize=4, linewidth=1.2, label="recorded")
+        axes.set_xticks(lags)
+    correlation.axhline(0, color=GREY, linewidth=0.6)
+    runs.set_yscale("log")
+    if len(there := v.lasting[v.lasting > 0]):
+        runs.set_ylim(there.min() / 3, 1.2)
+    runs.yaxis.set_major_formatter("{x:g}")
+    add_common_legend(figure, [calibration, correlation], columns=6)
+    return figure
+
+
+def _draw_band(axes: Axes, x: Any, band: Band, colour: str) -> None:
+    axes.fill_between(x, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
+    axes.plot(x, band.mean, color=colour, linewidth=1.2)
