@@ -30,7 +30,8 @@ class Evaluate(Fitting):
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
     optimum: bool = False
-    """Also compute the best return that any controller could get there, and scores; seconds, with memory minutes"""
+    """Also compute the best return that any controller could get there, and that of a mere reflex, and scores; a
+    minute, with memory some"""
     seed: int = 1
     """Decides every random draw"""
     json: bool = False

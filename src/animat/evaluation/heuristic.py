@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from animat.environment import Environment
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.rollouts import Actor, Seen, Uniforms
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.capabilities import capability
 
@@ -24,18 +24,14 @@ class HeuristicPolicy(Actor):
 
     Attributes:
         actions: what the environment is handed for each action, shape (1, actions), for one actor.
-        means: the mean command of each, the same shape; of several commands shape (1, actions, commands), and the
-            nearest is by the straight line.
+        means: the mean command of each, the same shape; of several commands shape (1, actions, commands).
     """
 
     actions: Array
     means: Float[Array, "..."]
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        wanted = _wanted(environment, observation)
-        apart = self.means - wanted[:, None]
-        distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
-        return self.actions[jnp.argmin(distance, axis=1)]
+        return nearest_action(self.actions, self.means, _wanted(environment, observation))
 
 
 @final

@@ -10,6 +10,7 @@ import numpy as np
 
 from animat.coding.mapping import Mapping, Thresholds
 from animat.environment import Animat
+from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum, best_returns
 from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Uniform, roll_out
@@ -27,6 +28,7 @@ class OptimalReturn:
         random: mean return of random stimuli.
         random_standard_error: of that.
         best: the optimal return of any controller.
+        context: how much of that a coupling from sensors to stimuli leaves undone.
     """
 
     robot: str
@@ -34,15 +36,16 @@ class OptimalReturn:
     random: float
     random_standard_error: float
     best: Optimum
+    context: ContextGap
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return vars(self) | {"best": self.best.to_dict()}
+        return vars(self) | {"best": self.best.to_dict(), "context": self.context.to_dict()}
 
     def to_text(self) -> str:
         """In a line."""
         random = f"random {self.random:.1f} ± {self.random_standard_error:.1f}"
-        return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}"
+        return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}; {self.context.to_text()}"
 
 
 def optimal_returns(
@@ -63,7 +66,7 @@ def optimal_returns(
         robot: with its task.
         mappings: from responses to commands.
         resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by 0.8 at most.
-        episodes: of random stimuli, and of the optimum's controller.
+        episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`with_intervals`).
         seed: decides every random draw.
 
@@ -85,8 +88,10 @@ def optimal_returns(
     best = with_intervals(best, environments, responses, fit, resolution=resolution, resamples=resamples, seed=seed)
     found = []
     for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
-        returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns
+        returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
         error = float(returns.std(ddof=1) / np.sqrt(returns.size))
+        of_coupling = roll_out(*case, best_coupling(*case, seed=seed), 1, episodes=episodes, seed=seed).returns[0]
+        gap = context_gap(of_coupling, returns, of_mapping)
         told = replace(of_mapping, left_out=left_out)
-        found.append(OptimalReturn(robot.name, mapping.name, float(returns.mean()), error, told))
+        found.append(OptimalReturn(robot.name, mapping.name, float(returns.mean()), error, told, gap))
     return tuple(found)

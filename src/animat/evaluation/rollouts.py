@@ -89,6 +89,18 @@ class Constant(Actor):
         return jnp.broadcast_to(self.action, uniforms.shape[:1])
 
 
+def nearest_action(
+    actions: Array, means: Float[Array, "actions *commands"], wanted: Float[Array, "episodes *commands"]
+) -> Array:
+    """The action whose mean command is the nearest to the one that is wanted; of several commands by the straight line.
+
+    Both are without their axis of commands where there is one.
+    """
+    apart = means - wanted[:, None]
+    distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
+    return actions[jnp.argmin(distance, axis=1)]
+
+
 @dataclass(frozen=True, eq=False)
 class Episodes:
     """What came of a number of episodes of each of several actors.
@@ -154,10 +166,11 @@ def roll_out(
     *,
     episodes: int,
     seed: int,
+    alike: bool = False,
 ) -> Episodes:
     """Run episodes of several actors against one simulator.
 
-    Every actor gets random numbers of its own, decided by `seed` and its place.
+    Every actor gets random numbers of its own, decided by `seed` and its place; or all meet the same.
 
     Args:
         environment: robot and mapping.
@@ -166,6 +179,7 @@ def roll_out(
         n_actors: how many there are.
         episodes: of each.
         seed: decides every random draw.
+        alike: whether all actors meet the same random numbers, so that they differ by what they do alone.
 
     Raises:
         InvalidArgument: for fewer episodes than one or more than fit, or a seed of more than 32 bits.
@@ -174,7 +188,8 @@ def roll_out(
     # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
     if not 0 <= seed < 2**32:
         raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
-    keys = jax.random.split(jax.random.key(seed), n_actors)
+    keys = jax.random.split(jax.random.key(seed), 1 if alike else n_actors)
+    keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
     returns, *counted, terminated = _roll_out(environment, episodes, simulator, actors, keys)

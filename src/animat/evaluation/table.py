@@ -14,10 +14,11 @@ from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of
+from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
-from animat.evaluation.statistics import normalised_score
+from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
@@ -27,6 +28,7 @@ from animat.recordings.findings import Finding
 from animat.responses.condition import other_stimulus
 from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
+from animat.robots.host import HostRobot
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation, ShuffledDelivery, unwrapped
@@ -82,6 +84,7 @@ class Evaluation:
         rows: the policies first, then the controls.
         findings: where the policies' training and this simulator differ, and where the optimum is not well known.
         optimum: the optimal return of any controller; None where it was not asked for, or is not known.
+        context: how much of that the best coupling leaves undone; None without an optimum of all conditions.
         no_optimum: why it is not known, though it was asked for.
         fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
     """
@@ -97,6 +100,14 @@ class Evaluation:
     optimum: Optimum | None = None
     no_optimum: str | None = None
     fixed_from_min: float | None = None
+    context: ContextGap | None = None
+
+    @property
+    def context_score(self) -> Interval | None:
+        """The policies' context score (`ContextGap.score`)."""
+        if self.context is None or self.optimum is None or self.rows[0].changed:
+            return None
+        return self.context.score(self.rows[0].mean_returns, self.optimum)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -137,6 +148,8 @@ class Evaluation:
             "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
             "optimum": None if self.optimum is None else self.optimum.to_dict(),
             "no_optimum": self.no_optimum,
+            "context": None if self.context is None else self.context.to_dict(),
+            "context_score": None if self.context_score is None else self.context_score.to_dict(),
             "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
@@ -188,7 +201,10 @@ class Evaluation:
             changed = [row.name for row in self.rows if row.changed]
             if changed:
                 meaning += f"; none for {' and '.join(changed)}, whose optimum is another"
-        return [f"  {self.optimum.to_text()}", f"  {meaning}"]
+        lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
+        if self.context is not None:
+            lines.append(f"  {self.context.to_text(self.context_score)}")
+        return lines
 
 
 def evaluate(
@@ -218,7 +234,7 @@ def evaluate(
         robot: the robot to run them on, its parameters perhaps changed; None: the one they were trained on.
         controls: names of those that are run beside the policies (`animat.evaluation.controls`); None: all.
         optimum_resolution: of the grid for the optimal return in the same environment (`best_returns`; a study's is
-            1), which takes seconds; None: it is not computed.
+            1), which takes seconds, as the best coupling does, which is then among the controls; None: neither is.
         progress: told after the policies and each control, and before the optimum.
 
     Raises:
@@ -258,6 +274,9 @@ def evaluate(
         trained_in, meaning = ShuffledDelivery(environment), "as trained: what is delivered is drawn anew"
     acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
     every = controls_of(environment, simulator, _action_labels(first), networks, n)
+    if optimum_resolution is not None and not isinstance(body, HostRobot):
+        reflex = best_coupling(environment, simulator, seed=seed)
+        every.append(Control("coupling", "the best reflex: no memory, no goal", environment, simulator, reflex))
     acting += [control for control in every if controls is None or control.name in controls]
     if controls is None and (without := lacking(body).get("heuristic")):
         findings += (Finding("no-heuristic", "note", without),)
@@ -281,6 +300,10 @@ def evaluate(
             )
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
+    context = None
+    by_name = {each.name: each.episodes.returns[0] for each in rows}
+    if optimum is not None and not optimum.left_out and {"coupling", "random"} <= set(by_name):
+        context = context_gap(by_name["coupling"], by_name["random"], optimum)
     return Evaluation(
         body.name,
         None if first.mapping is None else first.mapping.name,
@@ -291,6 +314,7 @@ def evaluate(
         optimum,
         no_optimum,
         fixed_from_min,
+        context,
     )
 
 

@@ -127,10 +127,10 @@ class TwoLinkArm(Robot[ArmState]):
             *(Quantity(part, "1", 1.0, -1.0, 1.0) for part in parts),
             Quantity("shoulder_velocity", "rad/s", usual, -fastest, fastest),
             Quantity("elbow_velocity", "rad/s", usual, -fastest, fastest),
-            Quantity("target_x", "m", arm_m, -target_m, target_m),
-            Quantity("target_y", "m", arm_m, -target_m, target_m),
-            Quantity("to_target_x", "m", arm_m, -arm_m - target_m, arm_m + target_m),
-            Quantity("to_target_y", "m", arm_m, -arm_m - target_m, arm_m + target_m),
+            Quantity("target_x", "m", arm_m, -target_m, target_m, of_goal=True),
+            Quantity("target_y", "m", arm_m, -target_m, target_m, of_goal=True),
+            Quantity("to_target_x", "m", arm_m, -arm_m - target_m, arm_m + target_m, of_goal=True),
+            Quantity("to_target_y", "m", arm_m, -arm_m - target_m, arm_m + target_m, of_goal=True),
         )
 
     def reset(self, key: Array) -> ArmState:

@@ -48,6 +48,8 @@ class Quantity:
         unit: what it is measured in, `m`.
         scale: how large it usually is, in that unit; a learner divides by it.
         low, high: bounds in that unit that no observation of an episode passes, the last one included.
+        of_goal: whether it tells of the goal, and not of the body and its surroundings: a reflex does not know it
+            (`animat.evaluation.coupling`).
     """
 
     name: str
@@ -55,6 +57,7 @@ class Quantity:
     scale: float
     low: float = -math.inf
     high: float = math.inf
+    of_goal: bool = False
 
 
 class Robot(abc.ABC, Generic[State]):

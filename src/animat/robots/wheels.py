@@ -143,8 +143,8 @@ class Wheels(Robot[WheelsState]):
         farthest_m = math.hypot(right - left, bottom - top)
         return (
             *(Quantity(f"proximity_{sensor}", "1", 1.0, 0.0, 1.0) for sensor in SENSORS),
-            Quantity("goal_distance", "m", farthest_m / 2, 0.0, farthest_m),
-            Quantity("goal_bearing", "rad", math.pi, -math.pi, math.pi),
+            Quantity("goal_distance", "m", farthest_m / 2, 0.0, farthest_m, of_goal=True),
+            Quantity("goal_bearing", "rad", math.pi, -math.pi, math.pi, of_goal=True),
         )
 
     def reset(self, key: Array) -> WheelsState:

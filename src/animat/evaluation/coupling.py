@@ -1,0 +1,218 @@
+"""The best coupling: what a reflex could do, a fixed rule from what is sensed to a stimulus, without memory or goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64
+from scipy.optimize import differential_evolution
+
+from animat.environment import Environment
+from animat.errors import InvalidArgument
+from animat.evaluation.commands import mean_commands
+from animat.evaluation.optimum import Optimum
+from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
+from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.neurons.simulator import NeuronSimulator
+from animat.robots.host import HostRobot
+
+Kind = Literal["graded", "switch"]
+KINDS: tuple[Kind, ...] = ("graded", "switch")
+LARGEST_WEIGHT = 5.0
+"""Of a quantity in units of its scale: beyond, a graded command is nearly a switch."""
+GENERATIONS, EPISODES = 30, 32
+"""Of a search; episodes of each coupling, the same starts and chances for all of them."""
+RESTARTS = 2
+"""Of each kind."""
+FRESH_EPISODES = 512
+"""In which the best of the last generations is chosen: those that it was found in flatter it."""
+REFLEX_GAP = 0.05
+"""A context gap that does not surely exceed this is none: a coupling does what the best controller does."""
+
+
+@final
+@partial(jax.tree_util.register_dataclass, data_fields=["weights", "actions", "means"], meta_fields=["kind", "seen"])
+@dataclass(frozen=True)
+class Coupling(Actor):
+    """A coupling from sensors to stimuli: the stimulus whose mean command is the nearest to
+
+        graded: tanh(W o + b),    switch: sign(W o + b)
+
+    with o the robot's observation, each number divided by its scale, without those that tell of the goal. Braitenberg's
+    vehicles, crossed and uncrossed, are among them.
+
+    Attributes:
+        weights: W and b as its last column, shape (actors, commands, seen + 1).
+        actions: what the environment is handed for each action, shape (actors, actions).
+        means: the mean command of each, shape (actors, actions), or (actors, actions, commands); None where any
+            command can be given.
+        kind: of the two above.
+        seen: which numbers of the observation it sees.
+    """
+
+    weights: Float[Array, "*actors commands weights"]
+    actions: Array
+    means: Float[Array, "*actors actions *commands"] | None
+    kind: Kind
+    seen: tuple[int, ...]
+
+    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
+        drive = observation[:, jnp.array(self.seen, jnp.int32)] @ self.weights[:, :-1].T + self.weights[:, -1]
+        wanted = jnp.tanh(drive) if self.kind == "graded" else jnp.sign(drive)
+        wanted = wanted if environment.robot.n_commands > 1 else wanted[:, 0]
+        return wanted if self.means is None else nearest_action(self.actions, self.means, wanted)
+
+
+def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int = 1) -> Coupling:
+    """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
+
+    Differential evolution, twice for each kind, over weights from -5 to 5. All couplings of a search meet the same
+    starts and chances. The best of the four last generations is chosen in fresh episodes.
+
+    Args:
+        environment: robot and mapping.
+        simulator: the neurons' answers; None without neurons.
+        seed: decides every random draw.
+
+    Raises:
+        InvalidArgument: for a robot that is stepped outside of JAX: the search takes thousands of episodes.
+
+    Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
+    """
+    if isinstance(environment.robot, HostRobot):
+        raise InvalidArgument(
+            f"robot: {environment.robot.name} is stepped in Python, and the search for the best coupling takes "
+            "thousands of episodes: only robots in JAX have one"
+        )
+    spec = environment.robot.observation_spec
+    seen = tuple(i for i, quantity in enumerate(spec) if not quantity.of_goal)
+    n_commands = environment.robot.n_commands
+    actions, means = None, None
+    if environment.n_actions is not None:
+        actions, means = mean_commands(environment, simulator)
+
+    def actor(kind: Kind, weights: Float64[np.ndarray, "actors weights"]) -> Coupling:
+        n, shaped = len(weights), weights.reshape(len(weights), n_commands, len(seen) + 1)
+        each = None if means is None else jnp.broadcast_to(jnp.asarray(means, jnp.float32), (n, *means.shape))
+        acts = jnp.zeros((n, 1)) if actions is None else jnp.broadcast_to(jnp.asarray(actions), (n, len(actions)))
+        return Coupling(jnp.asarray(shaped, jnp.float32), acts, each, kind, seen)
+
+    def mean_returns(coupling: Coupling, episodes: int, seed: int) -> Float64[np.ndarray, " actors"]:
+        n = len(coupling.weights)
+        ran = roll_out(environment, simulator, coupling, n, episodes=episodes, seed=seed, alike=True)
+        return ran.returns.mean(axis=1)  # type: ignore[no-any-return]
+
+    size = n_commands * (len(seen) + 1)
+    seeds = np.random.default_rng([seed, 31]).integers(2**31, size=(len(KINDS), RESTARTS, 2)).tolist()
+    fresh = seeds[0][0][0] + 1
+    found = []
+    for kind, of_kind in zip(KINDS, seeds, strict=True):
+        last = []
+        for draws, episodes in of_kind:
+            search = differential_evolution(
+                lambda w, kind=kind, episodes=episodes: -mean_returns(actor(kind, w.T), EPISODES, episodes),
+                [(-LARGEST_WEIGHT, LARGEST_WEIGHT)] * size,
+                maxiter=GENERATIONS,
+                popsize=max(8, -(-40 // size)),
+                tol=0.0,
+                rng=draws,
+                polish=False,
+                vectorized=True,
+                updating="deferred",
+            )
+            last.append(search.population)
+        candidates = np.concatenate(last)
+        returns = mean_returns(actor(kind, candidates), FRESH_EPISODES, fresh)
+        found.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
+    return max(found, key=lambda each: each[0])[1]
+
+
+@dataclass(frozen=True)
+class ContextGap:
+    """How much of a task a reflex leaves undone.
+
+        gap = (optimum - best coupling) / (optimum - random)
+
+    Attributes:
+        coupling: mean return of the best coupling.
+        standard_error: of that.
+        gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and the optimum's
+            grid. None where the optimum is not above random stimuli.
+    """
+
+    coupling: float
+    standard_error: float
+    gap: Interval | None
+
+    @property
+    def needs_context(self) -> bool:
+        """Whether the gap surely exceeds `REFLEX_GAP`."""
+        return self.gap is not None and self.gap.low > REFLEX_GAP
+
+    def score(self, returns: Float64[np.ndarray, " policies"], optimum: Optimum) -> Interval | None:
+        """The context score of policies, with its interval: 0 is what a coupling does, 1 the optimum.
+
+            score = (mean return - best coupling) / (optimum - best coupling)
+
+        None where the task needs no context, or of one policy alone.
+
+        Args:
+            returns: mean return of each policy.
+            optimum: on the same simulator.
+        """
+        if not self.needs_context or len(returns) < 2:
+            return None
+        mean, error = float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(len(returns)))
+        span = optimum.value - self.coupling
+        # Of a ratio whose denominator is known much better than 0: both ends of both errors, in quadrature.
+        value = (mean - self.coupling) / span
+        spread = _Z * np.hypot(error, (1 - value) * self.standard_error) / span
+        return Interval(value, value - float(spread), value + float(spread), CONFIDENCE)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "coupling": self.coupling,
+            "coupling_standard_error": self.standard_error,
+            "context_gap": None if self.gap is None else self.gap.to_dict(),
+            "needs_context": self.needs_context,
+        }
+
+    def to_text(self, score: Interval | None = None) -> str:
+        """In a line, with the policies' context score where it is known."""
+        told = f"best coupling {self.coupling:.1f} ± {self.standard_error:.1f}"
+        if self.gap is None:
+            return f"{told}; no context gap, as the optimal return is not above that of random stimuli"
+        gap = f"context gap {self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
+        needs = "" if self.needs_context else ": this task needs no more than a reflex"
+        scored = "" if score is None else f"; context score {score.value:.2f} ({score.low:.2f} to {score.high:.2f})"
+        return f"{told}; {gap}{needs}{scored}"
+
+
+_Z = 1.959964
+"""The normal distribution's quantile of the interval's ends."""
+
+
+def context_gap(
+    coupling: Float64[np.ndarray, " episodes"], random: Float64[np.ndarray, " episodes"], optimum: Optimum
+) -> ContextGap:
+    """The context gap of a task, from returns of the best coupling and of random stimuli in fresh episodes."""
+    means, errors = ([float(f(x)) for x in (coupling, random)] for f in (np.mean, _standard_error))
+    best, span = optimum.value, optimum.value - means[1]
+    gap = None
+    if span > 0:
+        value = (best - means[0]) / span
+        # d gap: by the coupling -1, by random stimuli gap, by the optimum 1 - gap, each over the span.
+        parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
+        spread = float(_Z * np.linalg.norm(parts) / span)
+        gap = Interval(value, value - spread, value + spread, CONFIDENCE)
+    return ContextGap(means[0], errors[0], gap)
+
+
+def _standard_error(returns: Float64[np.ndarray, " episodes"]) -> float:
+    return float(returns.std(ddof=1) / np.sqrt(len(returns)))

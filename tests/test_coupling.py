@@ -1,0 +1,161 @@
+"""The best coupling and the context gap: against best couplings that are known, and intervals against a bootstrap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.coding.mapping import Thresholds
+from animat.environment import Animat, WithoutNeurons
+from animat.errors import InvalidArgument
+from animat.evaluation import coupling
+from animat.evaluation.commands import mean_commands
+from animat.evaluation.coupling import Coupling, best_coupling, context_gap
+from animat.evaluation.optimum import Optimum
+from animat.evaluation.rollouts import roll_out
+from animat.neurons.synthetic import synthetic_simulator
+from animat.robots import Quantity, Robot, Wheels, robot_named
+
+
+class Sensed(NamedTuple):
+    at: jax.Array
+
+
+@dataclass(frozen=True)
+class Sensing(Robot[Sensed]):
+    """What it senses is drawn anew in each iteration, so that nothing but the sensors can help."""
+
+    episode_limit: int = 10
+    name = "sensing"
+    noise_size = 2
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return (Quantity("first", "1", 1.0), Quantity("second", "1", 1.0))
+
+    def reset(self, key: Any) -> Sensed:
+        return Sensed(jax.random.uniform(key, (2,), minval=-1.0))
+
+    def advance(self, uniforms: Any, state: Sensed, u: Any) -> tuple[Sensed, Any, Any]:
+        return Sensed(2 * uniforms - 1), self.reward(state.at, u), jnp.bool_(False)
+
+    def reward(self, at: Any, u: Any) -> Any:
+        raise NotImplementedError
+
+    def observe(self, state: Sensed) -> Any:
+        return state.at
+
+
+@dataclass(frozen=True)
+class Copying(Sensing):
+    """The best command is tanh(2 a - b + 0.5): 1 an iteration."""
+
+    def reward(self, at: Any, u: Any) -> Any:
+        return 1 - (u - jnp.tanh(2 * at[0] - at[1] + 0.5)) ** 2
+
+
+@dataclass(frozen=True)
+class Siding(Sensing):
+    """The command itself where a > 0.3, the opposite elsewhere: the best are the two outermost mean commands."""
+
+    def reward(self, at: Any, u: Any) -> Any:
+        return u * jnp.sign(at[0] - 0.3)
+
+
+def mean_return(environment: Any, simulator: Any, found: Coupling) -> float:
+    return float(roll_out(environment, simulator, found, 1, episodes=4000, seed=99).returns.mean())
+
+
+def test_the_best_coupling_of_a_continuous_command_is_found() -> None:
+    environment = WithoutNeurons(Copying(), None)
+    found = best_coupling(environment, None)
+    assert found.kind == "graded"
+    assert mean_return(environment, None, found) > 0.99 * Copying().episode_limit
+    np.testing.assert_allclose(np.asarray(found.weights)[0, 0], [2.0, -1.0, 0.5], atol=0.3)
+
+
+def test_the_best_coupling_through_neurons_is_found() -> None:
+    simulator = synthetic_simulator()
+    environment = Animat(Siding(), Thresholds(1), 5)
+    found = best_coupling(environment, simulator)
+    # By hand: a > 0.3 in 0.35 of the iterations.
+    _, means = mean_commands(environment, simulator)
+    best = Siding().episode_limit * (0.35 * means.max() - 0.65 * means.min())
+    assert abs(mean_return(environment, simulator, found) - best) < 0.01 * best + 3 * 0.05
+
+
+def test_a_coupling_does_not_see_the_goal() -> None:
+    spec = Wheels().observation_spec
+    seen = tuple(i for i, quantity in enumerate(spec) if not quantity.of_goal)
+    assert [spec[i].name for i in range(len(spec)) if i not in seen] == ["goal_distance", "goal_bearing"]
+    weights = np.random.default_rng(0).normal(size=(2, len(seen) + 1))
+    rule = Coupling(jnp.asarray(weights), jnp.zeros(1), None, "graded", seen)
+    environment = WithoutNeurons(Wheels(), None)
+    here = np.random.default_rng(1).uniform(size=(1, len(spec)))
+    there = here.copy()
+    there[0, -2:] = -5.0
+    acted = [np.asarray(rule.act(environment, jnp.asarray(o), jnp.zeros((1, 2)))) for o in (here, there)]
+    np.testing.assert_array_equal(*acted)
+    np.testing.assert_allclose(acted[0][0], np.tanh(weights[:, :-1] @ here[0, :-2] + weights[:, -1]), rtol=1e-5)
+
+
+def test_bodies_that_are_stepped_in_python_have_none() -> None:
+    with pytest.raises(InvalidArgument, match="only robots in JAX have one"):
+        best_coupling(WithoutNeurons(robot_named("gymnasium:Pendulum-v1"), None), None)
+
+
+def optimum_of(value: float, grid_error: float = 0.0) -> Optimum:
+    return Optimum(value, grid_error, value, 0.0, value, 0.0, 1000, 1)
+
+
+def test_the_gaps_interval_is_that_of_a_bootstrap() -> None:
+    rng = np.random.default_rng(5)
+    of_coupling, at_random = rng.normal(40, 20, 400), rng.normal(-10, 30, 400)
+    gap = context_gap(of_coupling, at_random, optimum_of(90.0)).gap
+    assert gap is not None and gap.value == pytest.approx((90 - of_coupling.mean()) / (90 - at_random.mean()))
+    drawn = [x[rng.integers(400, size=(20_000, 400))].mean(axis=1) for x in (of_coupling, at_random)]
+    ends = np.quantile((90 - drawn[0]) / (90 - drawn[1]), [0.025, 0.975])
+    np.testing.assert_allclose([gap.low, gap.high], ends, atol=0.1 * np.ptp(ends))
+
+
+def test_a_task_that_a_reflex_solves_has_no_score() -> None:
+    returns = np.full(100, 118.0) + np.arange(100) % 2
+    gap = context_gap(returns, returns - 200, optimum_of(120.0))
+    assert not gap.needs_context and gap.score(np.array([119.0, 118.0]), optimum_of(120.0)) is None
+    assert "this task needs no more than a reflex" in gap.to_text()
+    hopeless = context_gap(returns, returns, optimum_of(100.0))
+    assert hopeless.gap is None and "not above that of random stimuli" in hopeless.to_text()
+
+
+def test_the_context_score_is_0_for_a_coupling_and_1_for_the_optimum() -> None:
+    rng = np.random.default_rng(6)
+    of_coupling, best = rng.normal(40, 20, 400), optimum_of(140.0)
+    gap = context_gap(of_coupling, rng.normal(0, 1, 400), best)
+    for level, expected in ((of_coupling.mean(), 0.0), (140.0, 1.0), (90.0, 0.5)):
+        policies = level + np.array([-10.0, 0.0, 10.0])
+        score = gap.score(policies, best)
+        assert score is not None and score.value == pytest.approx(expected, abs=0.01) and score.low < score.value
+    drawn = of_coupling[rng.integers(400, size=(20_000, 400))].mean(axis=1)
+    policies = np.array([80.0, 90.0, 100.0, 95.0, 85.0, 100.0, 80.0, 90.0, 92.0, 88.0])
+    score = gap.score(policies, best)
+    again = rng.normal(policies.mean(), policies.std(ddof=1) / np.sqrt(10), 20_000)
+    ends = np.quantile((again - drawn) / (140 - drawn), [0.025, 0.975])
+    assert score is not None
+    np.testing.assert_allclose([score.low, score.high], ends, atol=0.05 * np.ptp(ends))
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize(("robot", "least", "most"), [("cartpole", 119.0, 120.0), ("swing-up", 37.0, 42.0)])
+def test_known_tasks(robot: str, least: float, most: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = synthetic_simulator((18.0, 26.0, 38.0, 52.0, 66.0), shape=10.0)
+    environment = Animat(robot_named(robot), Thresholds(1), 5)
+    once = mean_return(environment, simulator, best_coupling(environment, simulator))
+    assert least < once <= most
+    monkeypatch.setattr(coupling, "GENERATIONS", 2 * coupling.GENERATIONS)
+    twice = mean_return(environment, simulator, best_coupling(environment, simulator))
+    assert abs(twice - once) < 0.01 * (once + 80)
