@@ -25,7 +25,7 @@ Kind = Literal["graded", "switch"]
 KINDS: tuple[Kind, ...] = ("graded", "switch")
 LARGEST_WEIGHT = 5.0
 """Of a quantity in units of its scale: beyond, a graded command is nearly a switch."""
-GENERATIONS, EPISODES = 30, 32
+GENERATIONS, EPISODES = 60, 32
 """Of a search; episodes of each coupling, the same starts and chances for all of them."""
 RESTARTS = 2
 """Of each kind."""
