@@ -42,8 +42,9 @@ class Train(Fitting):
     """Training iterations of each; default: 400000 for cartpole, 250000 for others, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
-    shadowing: Literal["on", "off"] = "on"
-    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout"""
+    shadowing: Literal["on", "off", "drawn"] = "on"
+    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout; drawn: each
+    episode draws one of those that would have been used"""
     duration_min: float | None = None
     """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
@@ -54,6 +55,11 @@ class Train(Fitting):
     """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
     sac: tuple[str, ...] = ()
     """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
+    lessons: Path | None = None
+    """Lessons in turn, a TOML file: ranges of parameters, starts and recordings, and when to go on"""
+    assess: int | None = None
+    """Episodes of an assessment after each sixtieth of the training; the best policies so far are kept in OUT/best;
+    default: none, but 20 where lessons say when to go on"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
     out: Path = Path("policies")
@@ -68,6 +74,7 @@ class Train(Fitting):
         from animat.progress import Bar
         from animat.responses.readouts import ALL, count_readouts, read_readouts
         from animat.robots.registry import robot_named
+        from animat.training.lessons import read_lessons
         from animat.training.specification import Training
 
         # What can be refused is refused before recordings are read, which can take a while.
@@ -89,12 +96,14 @@ class Train(Fitting):
             policies=usual["policies"] if self.policies is None else self.policies,
             iterations=usual["share"] * robot.paper_iterations // 100 if self.iterations is None else self.iterations,
             seed=self.seed,
-            shadowing=self.shadowing == "on",
+            shadowing="drawn" if self.shadowing == "drawn" else self.shadowing == "on",
             duration_min=usual["duration_min"] if self.duration_min is None else self.duration_min,
             percentiles=self.percentiles,
             delivery=self.delivery,
             commands=robot.baseline_commands if mapping == "none" else None,
             algorithm=read_sac(self.sac),
+            lessons=() if self.lessons is None else read_lessons(self.lessons),
+            assess=self.assess,
         )
         from animat.execution.training import train
         from animat.training.folder import expect_folder_for, expect_trainable, is_finished
