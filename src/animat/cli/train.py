@@ -13,10 +13,12 @@ from tyro.conf import Positional
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import Fitting, say_findings
 from animat.errors import InvalidArgument, UnusableData
+from animat.records import as_json
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.training.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -147,18 +149,40 @@ class Train(Fitting):
         counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{random['mean_return']:.1f}"
         print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
+        assessed = {name: _assessed(policy, policy.best) for name, policy in trained.items() if policy.best is not None}
+        for name, told in assessed.items():
+            print(_standing(name, told))
         return {
             "policies": [str(self.out / f"{name}.safetensors") for name in trained],
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
             "random": random["mean_return"],
             "recorded_at_min": evaluation.recorded_at_min,
             "findings": [finding.to_dict() for finding in evaluation.findings],
+            **({"assessed": assessed} if assessed else {}),
         }
 
 
 _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
 """What works in a closed loop; `share`: of the paper's iterations, in per cent."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
+
+
+def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
+    """The iterations after which a policy was at each lesson, and its best assessment."""
+    from animat.training.course import ASSESSED
+
+    table = policy.assessments
+    began = {int(row[2]): int(before) for row, before in zip(table[::-1], [*table[-2::-1, 0], 0], strict=True)}
+    lessons = [{"lesson": lesson, "after_iterations": began[lesson]} for lesson in sorted(began)]
+    return {"lessons": lessons, "best": as_json(dict(zip(ASSESSED, best.assessments[-1].tolist(), strict=True)))}
+
+
+def _standing(name: str, assessed: dict[str, Any]) -> str:
+    """The same for people."""
+    best, (_, *later) = assessed["best"], assessed["lessons"]
+    success = "" if best["success"] is None else f"{best['success']:.0%} succeeded, "
+    on = "".join(f"; lesson {each['lesson']} after {each['after_iterations']:,}" for each in later)
+    return f"{name}: best after {best['iterations']:,.0f} iterations ({success}return {best['mean_return']:.1f}){on}"
 
 
 def _control(timeline: SimulatorTimeline) -> str:
