@@ -19,6 +19,7 @@ from animat.progress import Part, Progress, Silent
 from animat.training.course import rows_of
 from animat.training.folder import (
     MANIFEST,
+    TABLE,
     describe,
     expect_trainable,
     groups_of,
@@ -115,7 +116,7 @@ def train(
         for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)
         policies = {f"p{i}": _load(folder, f"p{i}.safetensors") for i in range(training.policies)}
-        if training.episodes_assessed:
+        if training.episodes_assessed and not (folder / TABLE).exists():
             write_assessments(folder, policies)
     return policies
 
