@@ -215,6 +215,15 @@ def test_a_policy_goes_on_at_its_share_each_for_itself_and_the_best_is_that_of_t
     assert max(range(6), key=keys.__getitem__) == 4
 
 
+def test_the_page_s_lessons_are_some(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "lessons.md").read_text()
+    file = tmp_path / "lessons.toml"
+    file.write_text(page.partition("```toml\n")[2].partition("```")[0])
+    lessons = read_lessons(file)
+    assert len(lessons) == 2
+    expect_trainable(Training("swing-up", None, commands=(-1.0, 1.0), lessons=lessons), is_saved=True)
+
+
 def test_a_robot_that_tells_no_success_goes_on_by_its_return() -> None:
     standing, at = course_of(
         [(0.0, -5.0), (0.0, 0.0)], [(0.0, 1.0), (0.0, 3.0)], lessons=(Lesson(until_return=0.0),), robot=Cartpole()
@@ -354,6 +363,7 @@ def test_recordings_are_drawn_of_those_that_shadowing_would_have_used() -> None:
         ("success = 0.8\nuntil_return = 4", "expected one way to go on, got success too"),
         ("[[lessons]]", "lesson 1: expected success or until_return, .*got neither"),
         ("recordings_min = [0, 10]", "recordings_min: expected only where shadowing is 'drawn'"),
+        ("until_return = 121", "until_return: expected at most 120, the highest return of cartpole, got 121"),
         ("sucess = 0.8", "sucess: no such setting"),
         ("starts.angle_rad = [", "expected TOML, got a mistake"),
     ],

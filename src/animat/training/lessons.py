@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import field
@@ -141,10 +142,15 @@ def _expect_parameters(lesson: Lesson, robot: Any) -> None:
                 "is part of the program that is compiled, and cannot vary"
             )
     # What several of them mean together is wrong at a corner, if anywhere.
+    most = -math.inf
     for corner in itertools.product(*lesson.parameters.values()):
         values = dict(zip(lesson.parameters, corner, strict=True))
         try:
-            dataclasses.replace(robot, **values)
+            most = max(most, dataclasses.replace(robot, **values).return_range[1])
         except InvalidArgument as error:
             told = ", ".join(f"{name} = {value:g}" for name, value in values.items())
             raise InvalidArgument(f"parameters: {robot.name} cannot have {told}: {error}") from error
+    if lesson.until_return is not None and lesson.until_return > most:
+        raise InvalidArgument(
+            f"until_return: expected at most {most:g}, the highest return of {robot.name}, got {lesson.until_return:g}"
+        )
