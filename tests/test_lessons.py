@@ -26,7 +26,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.robots import ROBOTS, Cartpole, SwingUp, robot_named
 from animat.robots.base import Quantity, Robot
 from animat.training.assessment import assess
-from animat.training.course import Course, best_assessment, programs_with_ranges, rows_of
+from animat.training.course import Course, programs_with_ranges, rows_of
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group, train_group
 from animat.training.lessons import Lesson, read_lessons
@@ -169,24 +169,34 @@ def test_an_assessment_counts_successes_at_the_end_of_each_episode() -> None:
     np.testing.assert_array_equal(again, returns)
 
 
-def course_of(*successes_and_returns: list[tuple[float, float]], lessons: tuple[Lesson, ...], robot: Any) -> Any:
-    """A course through assessments that are made by hand, of two policies; and where they stood after each."""
-    training = Training(robot, None, lessons=lessons, iterations=6_000, algorithm=SMALL, assess=10)
-    course = Course(training, training.environment(0), None, 2)
+def course_of(
+    *successes_and_returns: list[tuple[float, float]],
+    lessons: tuple[Lesson, ...],
+    robot: Any,
+    timeline: SimulatorTimeline | None = None,
+    n_chunks: int | None = None,
+) -> Any:
+    """A course through assessments that are made by hand, of two policies; and where they stood after each chunk."""
+    mapping = None if timeline is None else SHORT.mapping
+    training = Training(
+        robot, mapping, lessons=lessons, iterations=6_000, algorithm=SMALL, assess=10, duration_min=60.0
+    )
+    course = Course(training, training.environment(3), timeline, 2)
     made = iter(successes_and_returns)
     networks = jnp.arange(2.0)[:, None]
 
     def assessment(*_: Any) -> Any:
         rows = next(made)
-        of = lambda share: np.arange(10) < round(10 * share)  # noqa: E731
-        return np.array([[mean] * 10 for _, mean in rows]), np.array([of(share) for share, _ in rows])
+        succeeded = [np.arange(10) < round(10 * share) for share, _ in rows]
+        return np.array([[mean] * 10 for _, mean in rows]), np.array(succeeded)
 
     course._programs = (*course._programs[:2], assessment)
     course.standing = course.standing._replace(best=np.zeros((2, 1)))
     lessons_at = []
-    for index in range(len(successes_and_returns)):
+    for index in range(n_chunks or len(successes_and_returns)):
         course.assess(index, networks + 100 * index, None)
         lessons_at.append(course.standing.lesson.tolist())
+    assert next(made, None) is None
     return course.standing, lessons_at
 
 
@@ -209,10 +219,25 @@ def test_a_policy_goes_on_at_its_share_each_for_itself_and_the_best_is_that_of_t
         table[:, 0, 2:], [[1, 0.7, 9], [1, 0.9, 1], [2, 0, 5], [3, 0.5, 1], [3, 0.5, 2], [3, 0.4, 9]]
     )
     # Of the last lesson the most successes, then the largest return; of equals the last.
-    assert [best_assessment(table[:, policy]) for policy in (0, 1)] == [4, 4]
     np.testing.assert_array_equal(standing.best, [[400.0], [401.0]])
-    keys = [tuple(np.nan_to_num(row[2:])) for row in table[:, 0]]
-    assert max(range(6), key=keys.__getitem__) == 4
+    assert standing.best_at.tolist() == [4, 4]
+    for policy in (0, 1):
+        keys = [(*np.nan_to_num(row[2:]), at) for at, row in enumerate(table[:, policy])]
+        assert max(keys)[-1] == 4
+
+
+def test_with_another_simulator_the_best_so_far_is_assessed_anew() -> None:
+    """Three recordings of 20 chunks each: the best is asked again at chunks 20 and 40, before the one that is new."""
+    by_chunk = [[(0.0, 9.0)] * 2] + [[(0.0, 5.0)] * 2] * 19
+    by_chunk += [[(0.0, 3.0), (0.0, 6.0)], [(0.0, 4.0), (0.0, 4.0)]] + [[(0.0, 2.0), (0.0, 5.0)]] * 19
+    by_chunk += [[(0.0, 7.0)] * 2, [(0.0, 7.5), (0.0, 6.5)]]
+    standing, _ = course_of(
+        *by_chunk, lessons=(), robot=Cartpole(), timeline=timeline_of((0.0, 20.0, 40.0)), n_chunks=41
+    )
+    assert standing.best_at.tolist() == [40, 0]
+    np.testing.assert_array_equal(standing.best, [[4000.0], [1.0]])
+    np.testing.assert_array_equal(standing.score[:, 1], [7.5, 7.0])
+    assert standing.table[[0, 20, 39, 40], 0, 4].tolist() == [9.0, 4.0, 2.0, 7.5]
 
 
 def test_the_page_s_lessons_are_some(tmp_path: Path) -> None:
@@ -248,9 +273,12 @@ def test_policies_are_kept_at_their_best_beside_the_averaged_ones_and_tell_their
         np.testing.assert_array_equal(table[:, 0], policy.learning_curve[:, 0])
         assert np.all(np.diff(table[:, 2]) >= 0)
         assert table[-1, 2] > 1
-        row = max(range(CHUNKS), key=lambda row, table=table: (table[row, 2], table[row, 4], row))
+        row = len(best[name].assessments) - 1
         assert [line[-1] for line in lines if line[0] == name].index("1") == row
-        assert len(best[name].assessments) == len(best[name].learning_curve) == row + 1
+        assert len(best[name].learning_curve) == row + 1
+        # The best of all that were assessed with the simulator of its own ten minutes.
+        alike = [i for i in range(CHUNKS) if min(i // 10, 2) == min(row // 10, 2)]
+        assert row == max(alike, key=lambda row, table=table: (table[row, 2], table[row, 4], row))
         again = policy.best
         assert again is not None
         np.testing.assert_array_equal(again.weights[0], best[name].weights[0])

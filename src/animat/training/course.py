@@ -35,22 +35,15 @@ class Standing(NamedTuple):
         lesson: of each policy, from 0.
         table: their assessments, a row a chunk, NaN for those to come; columns as `ASSESSED`.
         best: the network of each at its best assessment.
+        best_at: the row of that assessment.
+        score: the share of successes and the mean return of `best`, on the simulator in use.
     """
 
     lesson: Int64[np.ndarray, " policies"]
     table: Float64[np.ndarray, "chunks policies columns"]
     best: Any
-
-
-def best_assessment(assessments: Float64[np.ndarray, "assessments columns"]) -> int:
-    """The row of the best one: at the latest lesson, there of the most successes, then of the largest mean return.
-
-    Among equals it is the last, as a policy learns on.
-    """
-    ranked = [
-        (lesson, np.nan_to_num(success), mean, row) for row, (*_, lesson, success, mean) in enumerate(assessments)
-    ]
-    return int(max(ranked)[-1])
+    best_at: Int64[np.ndarray, " policies"]
+    score: Float64[np.ndarray, "policies 2"]
 
 
 def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tuple[int, int]]:
@@ -115,19 +108,16 @@ class Course:
     def __init__(
         self, training: Training, environment: Environment[Any], timeline: SimulatorTimeline | None, policies: int
     ) -> None:
-        self._training = training
+        self._training, self._timeline = training, timeline
         self._stages = stages_of(training.lessons)
-        self._first_min = np.nan if timeline is None else float(timeline.start_min[0])
         varying = varying_in(self._stages, recordings=training.shadowing == "drawn")
-        rows = rows_of(training, timeline)
-        each = [
-            ranges_of(*of, training.robot, row)
-            for of, row in zip(((s, varying) for s in self._stages), rows, strict=True)
-        ]
-        self._ranges = jax.tree.map(lambda *ends: np.stack(ends), *each)
+        of_each = zip(self._stages, rows_of(training, timeline), strict=True)
+        ranges = [ranges_of(stage, varying, training.robot, rows) for stage, rows in of_each]
+        self._ranges = jax.tree.map(lambda *ends: np.stack(ends), *ranges)
         self._programs = programs_with_ranges(environment, varying, training.algorithm, training.episodes_assessed)
-        nothing = np.full((CHUNKS, policies, len(ASSESSED)), np.nan)
-        self.standing = Standing(np.zeros(policies, np.int64), nothing, None)
+        none = np.zeros(policies, np.int64)
+        to_come = np.full((CHUNKS, policies, len(ASSESSED)), np.nan)
+        self.standing = Standing(none, to_come, None, none, np.full((policies, 2), -np.inf))
 
     @property
     def ranges(self) -> Ranges:
@@ -146,23 +136,49 @@ class Course:
 
     def assess(self, index: int, deployed: Network, simulator: NeuronSimulator | None) -> None:
         """At the end of a chunk: assess the policies, keep those that are the best so far, and let them go on."""
-        training, (lesson, table, best) = self._training, self.standing
+        training, (lesson, table, best, best_at, score) = self._training, self.standing
         if not training.episodes_assessed:
             return
-        key = jax.random.fold_in(jax.random.key(training.seed), MOST_POLICIES)
-        returns, succeeded = map(np.asarray, self._programs[2](self.ranges, deployed, simulator, key))
+        minute = self._minute(index)
+        if index and self._row(minute) != self._row(self._minute(index - 1)):
+            # A culture is not as easy to control at all minutes: the best so far has to be the better one now.
+            score = self._assessed(best, simulator)
+        now = self._assessed(deployed, simulator)
         iterations = training.chunk(index)[1] * training.algorithm.environments
-        tells = hasattr(training.robot, "succeeded")
-        table, now = table.copy(), jax.device_get(deployed)
-        for policy, stage in enumerate(lesson):
-            success = succeeded[policy].mean() if tells else np.nan
-            minute = self._first_min + training.minute(index)
-            table[index, policy] = iterations, minute, stage + 1, success, returns[policy].mean(dtype=np.float64)
-            if best_assessment(table[: index + 1, policy]) == index:
-                for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(now), strict=True):
-                    kept[policy] = new[policy]
-        on = [_passes(self._stages[stage], *row[3:]) for stage, row in zip(lesson, table[index], strict=True)]
-        self.standing = Standing(np.minimum(lesson + on, len(self._stages) - 1), table, best)
+        table[index] = [(iterations, minute, stage + 1, *each) for stage, each in zip(lesson, now, strict=True)]
+        policies = np.arange(len(lesson))
+        before = np.column_stack([table[best_at, policies, 2], np.nan_to_num(score)]).tolist()
+        today = np.column_stack([lesson + 1, np.nan_to_num(now)]).tolist()
+        # Of equals the last, as a policy learns on.
+        is_best = np.array([new >= old for new, old in zip(today, before, strict=True)]) | (index == 0)
+        for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(deployed), strict=True):
+            kept[is_best] = np.asarray(new)[is_best]
+        on = [_passes(self._stages[stage], *each) for stage, each in zip(lesson, now, strict=True)]
+        self.standing = Standing(
+            np.minimum(lesson + on, len(self._stages) - 1),
+            table,
+            best,
+            np.where(is_best, index, best_at),
+            np.where(is_best[:, None], now, score),
+        )
+
+    def _assessed(self, networks: Network, simulator: NeuronSimulator | None) -> Float64[np.ndarray, "policies 2"]:
+        """Each policy's share of successes, NaN for a robot that does not tell, and mean return."""
+        key = jax.random.fold_in(jax.random.key(self._training.seed), MOST_POLICIES)
+        returns, succeeded = map(np.asarray, self._programs[2](self.ranges, networks, simulator, key))
+        success = (
+            succeeded.mean(axis=1) if hasattr(self._training.robot, "succeeded") else np.full(len(returns), np.nan)
+        )
+        return np.column_stack([success, returns.mean(axis=1, dtype=np.float64)])
+
+    def _minute(self, index: int) -> float:
+        """Of the culture's clock at a chunk, whose newest simulator is in use; NaN without one of them."""
+        if self._timeline is None or self._training.shadowing == "drawn":
+            return np.nan
+        return float(self._timeline.start_min[0]) + self._training.minute(index)
+
+    def _row(self, minute: float) -> int:
+        return 0 if self._timeline is None or np.isnan(minute) else self._timeline.row_at(minute)
 
     def note(self) -> str:
         """Which lesson each policy is at, for whoever waits; nothing where there is one only."""

@@ -21,7 +21,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
-from animat.training.course import ASSESSED, best_assessment
+from animat.training.course import ASSESSED
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
 from animat.training.settings import FORMER
@@ -122,7 +122,7 @@ def write_assessments(folder: Path, policies: Mapping[str, Policy]) -> Path:
     """Write the table of all assessments, and which of them was each policy's best."""
     rows = ["policy," + ",".join(ASSESSED) + ",best"]
     for name, policy in policies.items():
-        best = best_assessment(policy.assessments)
+        best = -1 if policy.best is None else len(policy.best.assessments) - 1
         for row, (iterations, minute, lesson, success, mean_return) in enumerate(policy.assessments.tolist()):
             told = ("" if math.isnan(number) else f"{number:.6g}" for number in (minute, lesson, success, mean_return))
             rows.append(",".join([name, f"{iterations:.0f}", *told, str(int(row == best))]))

@@ -22,7 +22,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
-from animat.training.course import Course, best_assessment
+from animat.training.course import Course
 from animat.training.host import programs_on_host
 from animat.training.networks import Network
 from animat.training.policy import Policy
@@ -188,10 +188,9 @@ class SideBySide:
         now = self._as_policy(i, self._learners.deployed, curve)
         if self._course is None or not done or not self._group.training.episodes_assessed:
             return now
-        _, table, best = self._course.standing
-        assessments = table[:done, i]
-        until = best_assessment(assessments) + 1
-        kept = replace(self._as_policy(i, best, curve[:until]), assessments=assessments[:until])
+        standing = self._course.standing
+        assessments, until = standing.table[:done, i].copy(), int(standing.best_at[i]) + 1
+        kept = replace(self._as_policy(i, standing.best, curve[:until]), assessments=assessments[:until])
         return replace(now, assessments=assessments, best=kept)
 
     def _as_policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
