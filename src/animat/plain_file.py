@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from pathlib import Path
+from typing import Any
 
 from animat.errors import InvalidFile
 
@@ -63,3 +65,20 @@ def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
         raise InvalidFile(f"{path}: expected text in UTF-8, got something else ({error.reason})") from error
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def read_toml(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:
+    """A TOML file as plain data.
+
+    Raises:
+        InvalidFile: if it cannot be read or is no TOML.
+    """
+    text = read_plain_text(path, most_bytes)
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise InvalidFile(f"{path}: expected TOML, got lists or tables nested without end") from error
+    except ValueError as error:
+        # Also a number of more digits than Python reads.
+        said = str(error).partition(";")[0]
+        raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error

@@ -13,10 +13,12 @@ from tyro.conf import Positional
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import Fitting, say_findings
 from animat.errors import InvalidArgument, UnusableData
+from animat.records import as_json
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.training.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,9 @@ class Train(Fitting):
     """Training iterations of each; default: 400000 for cartpole, 250000 for others, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
-    shadowing: Literal["on", "off"] = "on"
-    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout"""
+    shadowing: Literal["on", "off", "drawn"] = "on"
+    """on: refresh the simulators during training (parameter shadowing); off: the first one throughout; drawn: each
+    episode draws one of those that would have been used"""
     duration_min: float | None = None
     """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
@@ -54,6 +57,11 @@ class Train(Fitting):
     """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
     sac: tuple[str, ...] = ()
     """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
+    lessons: Path | None = None
+    """Lessons in turn, a TOML file: ranges of parameters, starts and recordings, and when to go on"""
+    assess: int | None = None
+    """Episodes of an assessment after each sixtieth of the training; the best policies so far are kept in OUT/best;
+    default: none, but 20 where lessons say when to go on"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
     out: Path = Path("policies")
@@ -68,6 +76,7 @@ class Train(Fitting):
         from animat.progress import Bar
         from animat.responses.readouts import ALL, count_readouts, read_readouts
         from animat.robots.registry import robot_named
+        from animat.training.lessons import read_lessons
         from animat.training.specification import Training
 
         # What can be refused is refused before recordings are read, which can take a while.
@@ -90,12 +99,14 @@ class Train(Fitting):
             policies=usual["policies"] if self.policies is None else self.policies,
             iterations=usual["share"] * robot.paper_iterations // 100 if self.iterations is None else self.iterations,
             seed=self.seed,
-            shadowing=self.shadowing == "on",
+            shadowing="drawn" if self.shadowing == "drawn" else self.shadowing == "on",
             duration_min=usual["duration_min"] if self.duration_min is None else self.duration_min,
             percentiles=self.percentiles,
             delivery=self.delivery,
             commands=robot.baseline_commands if mapping == "none" else None,
             algorithm=read_sac(self.sac),
+            lessons=() if self.lessons is None else read_lessons(self.lessons),
+            assess=self.assess,
         )
         from animat.execution.training import train
         from animat.training.folder import expect_folder_for, expect_trainable, is_finished
@@ -139,12 +150,16 @@ class Train(Fitting):
         counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{random['mean_return']:.1f}"
         print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
+        assessed = {name: _assessed(policy, policy.best) for name, policy in trained.items() if policy.best is not None}
+        for name, told in assessed.items():
+            print(_standing(name, told))
         return {
             "policies": [str(self.out / f"{name}.safetensors") for name in trained],
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
             "random": random["mean_return"],
             "recorded_at_min": evaluation.recorded_at_min,
             "findings": [finding.to_dict() for finding in evaluation.findings],
+            **({"assessed": assessed} if assessed else {}),
         }
 
 
@@ -153,6 +168,24 @@ _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50,
 _READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
 """By how many commands a robot takes."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
+
+
+def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
+    """The iterations after which a policy was at each lesson, and its best assessment."""
+    from animat.training.course import ASSESSED
+
+    table = policy.assessments
+    began = {int(row[2]): int(before) for row, before in zip(table[::-1], [*table[-2::-1, 0], 0], strict=True)}
+    lessons = [{"lesson": lesson, "after_iterations": began[lesson]} for lesson in sorted(began)]
+    return {"lessons": lessons, "best": as_json(dict(zip(ASSESSED, best.assessments[-1].tolist(), strict=True)))}
+
+
+def _standing(name: str, assessed: dict[str, Any]) -> str:
+    """The same for people."""
+    best, (_, *later) = assessed["best"], assessed["lessons"]
+    success = "" if best["success"] is None else f"{best['success']:.0%} succeeded, "
+    on = "".join(f"; lesson {each['lesson']} after {each['after_iterations']:,}" for each in later)
+    return f"{name}: best after {best['iterations']:,.0f} iterations ({success}return {best['mean_return']:.1f}){on}"
 
 
 def _control(timeline: SimulatorTimeline) -> str:

@@ -22,9 +22,9 @@ from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.robots.host import HostRobot
-from animat.training.networks import Layer, Network, forward
+from animat.training.networks import Layer, Network
 from animat.training.policy import Policy
-from animat.training.sac import as_commands, draw_action
+from animat.training.sac import as_commands, draw_action, likeliest_action
 
 Seen = Float[Array, "episodes observations"]
 Uniforms = Float[Array, "episodes drawn"]
@@ -59,10 +59,7 @@ class Networks(Actor):
         observation = observation * (environment.scales / self.scales)
         if not self.greedy:
             return draw_action(environment, self.network, observation, uniforms)
-        outputs = forward(self.network, observation)
-        if environment.n_actions is not None:
-            return jnp.argmax(outputs, axis=-1)
-        return as_commands(environment, jnp.tanh(outputs[:, : environment.n_drawn]))
+        return likeliest_action(environment, self.network, observation)
 
 
 @final

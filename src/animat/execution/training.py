@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -16,8 +16,18 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent
-from animat.training.folder import MANIFEST, describe, expect_trainable, groups_of, is_ours, write_description
-from animat.training.group import CHECKPOINT_S, Group, save_policies, train_group
+from animat.training.course import rows_of
+from animat.training.folder import (
+    MANIFEST,
+    TABLE,
+    describe,
+    expect_trainable,
+    groups_of,
+    is_ours,
+    write_assessments,
+    write_description,
+)
+from animat.training.group import BEST, CHECKPOINT_S, Group, save_policies, train_group
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import clear_away, exclusive_lock
@@ -54,7 +64,8 @@ def train(
         sources: names of the recordings, for the manifest.
 
     Returns:
-        The policies by name, `p0` first.
+        The policies by name, `p0` first. Those that were assessed have what they were at their best beside them, and in
+        the folder `best/`, and all assessments in `assessments.csv`.
 
     Raises:
         InvalidArgument: if neurons are missing for a mapping or given without one, for readouts that are not as many as
@@ -75,6 +86,7 @@ def train(
         expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
     progress = progress or Silent()
     training = training.over(timeline)
+    rows_of(training, timeline)
     manifest = describe(training, timeline, sources)
     groups = groups_of(training, timeline, manifest, fewest=2)
     if folder is None:
@@ -101,9 +113,17 @@ def train(
                     (folder / MANIFEST).unlink()
                 raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        for leftover in (*folder.glob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
+        for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)
-    return {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+        policies = {f"p{i}": _load(folder, f"p{i}.safetensors") for i in range(training.policies)}
+        if training.episodes_assessed and not (folder / TABLE).exists():
+            write_assessments(folder, policies)
+    return policies
+
+
+def _load(folder: Path, file: str) -> Policy:
+    policy = Policy.load(folder / file)
+    return replace(policy, best=Policy.load(folder / BEST / file)) if len(policy.assessments) else policy
 
 
 @final

@@ -85,6 +85,8 @@ def check_plan(
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
     if training.neural_observation:
         raise InvalidArgument("neural_observation: expected False, as no closed loop makes one, got True")
+    if training.lessons or training.assess:
+        raise InvalidArgument("lessons, assess: expected none, as a live run has no end that is known, got some")
     if (n := training.robot.n_commands) > 1:
         raise InvalidArgument(
             f"robot: expected one command, as a live run reads all channels as one, got {training.robot.name}, which "

@@ -72,6 +72,7 @@ class Robot(abc.ABC, Generic[State]):
 
     Methods that may be missing, and what needs them says so (`animat.robots.capabilities`):
 
+        succeeded(state) -> Bool[Array, ""]                            of the last state of an episode, in JAX
         heuristic(observation) -> command                              a heuristic policy, in JAX, of one observation
         draw(observation, command, earlier, height_px) -> picture      uint8, shape (height, width, 3)
         draw_paths(axes, paths)                                        whole episodes on Matplotlib's axes

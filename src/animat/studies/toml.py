@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import tomllib
 from typing import Any
 
+from animat import plain_file
 from animat.errors import InvalidArgument, InvalidFile
-from animat.plain_file import read_plain_text
 from animat.records import read_record
 from animat.studies.specification import Study
 from animat.training.settings import FORMER as FORMER_SETTINGS
@@ -46,15 +45,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises:
         InvalidFile: if it cannot be read, is no TOML or has nothing in it.
     """
-    text = read_plain_text(path, MOST_BYTES)
-    try:
-        data = tomllib.loads(text)
-    except RecursionError as error:
-        raise InvalidFile(f"{path}: expected TOML, got lists or tables nested without end") from error
-    except ValueError as error:
-        # Also a number of more digits than Python reads.
-        said = str(error).partition(";")[0]
-        raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error
+    data = plain_file.read_toml(path, MOST_BYTES)
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
     return data

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,16 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
+from animat.training.course import ASSESSED
 from animat.training.group import Group, split_groups
+from animat.training.policy import Policy
 from animat.training.settings import FORMER
 from animat.training.specification import Training
+from animat.training.varied import expect_varied, varying_in
 from animat.writing import atomic_write
 
 MANIFEST = "training.json"
+TABLE = "assessments.csv"
 _NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
 """Where a folder is another training's: they differ with the responses."""
 
@@ -45,6 +50,8 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
         check_mapping(training.mapping)
     else:
         training.environment(0)
+    if training.is_varied:
+        expect_varied(training.robot, varying_in(training.lessons, recordings=False))
     if is_saved:
         ROBOTS.expect_loadable(training.robot, in_workers=True)
         if training.mapping is not None:
@@ -109,6 +116,19 @@ def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
     with atomic_write(folder / MANIFEST) as beside:
         beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
     return folder / MANIFEST
+
+
+def write_assessments(folder: Path, policies: Mapping[str, Policy]) -> Path:
+    """Write the table of all assessments, and which of them was each policy's best."""
+    rows = ["policy," + ",".join(ASSESSED) + ",best"]
+    for name, policy in policies.items():
+        best = -1 if policy.best is None else len(policy.best.assessments) - 1
+        for row, (iterations, minute, lesson, success, mean_return) in enumerate(policy.assessments.tolist()):
+            told = ("" if math.isnan(number) else f"{number:.6g}" for number in (minute, lesson, success, mean_return))
+            rows.append(",".join([name, f"{iterations:.0f}", *told, str(int(row == best))]))
+    with atomic_write(folder / TABLE) as beside:
+        beside.write_text("\n".join(rows) + "\n")
+    return folder / TABLE
 
 
 def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,9 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
+from animat.training.course import Course
 from animat.training.host import programs_on_host
+from animat.training.networks import Network
 from animat.training.policy import Policy
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
@@ -30,6 +32,8 @@ from animat.training.specification import CHUNKS, Training
 from animat.wrappers import EpisodeLimit
 from animat.writing import atomic_write
 
+BEST = "best"
+"""The folder in a training's folder with what each policy was at its best assessment."""
 CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
 
@@ -78,13 +82,15 @@ def train_group(
     start_min = 0.0 if timeline is None else float(timeline.start_min[0])
     written = time.monotonic()
     for index in range(done, CHUNKS):
-        mean_return = together.train(
-            index, None if timeline is None else timeline.at(start_min + training.minute(index))
-        )
+        simulator = None if timeline is None else timeline.at(start_min + training.minute(index))
+        if timeline is not None and training.shadowing == "drawn":
+            simulator = timeline.simulators
+        mean_return = together.train(index, simulator)
         if checkpoint is not None and time.monotonic() - written > checkpoint_s:
             together.keep(checkpoint)
             written = time.monotonic()
-        progress.update(index + 1, CHUNKS, "" if math.isnan(mean_return) else f"return {mean_return:.1f}")
+        returned = "" if math.isnan(mean_return) else f"return {mean_return:.1f}"
+        progress.update(index + 1, CHUNKS, ", ".join(filter(None, (returned, together.note()))))
     return together.policies()
 
 
@@ -94,11 +100,16 @@ def untrained_policies(group: Group) -> list[Policy]:
 
 
 def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> list[Path]:
-    """Write a group's policies by their numbers in the training; returns the files."""
+    """Write a group's policies by their numbers in the training, and the best of each beside; returns the files."""
     files = [folder / f"p{member}.safetensors" for member in group.members]
+    best = []
     for file, policy in zip(files, policies, strict=True):
+        if policy.best is not None:
+            (folder / BEST).mkdir(exist_ok=True)
+            best.append(folder / BEST / file.name)
+            policy.best.save(best[-1])
         policy.save(file)
-    return files
+    return [*best, *files]
 
 
 @lru_cache(maxsize=8)
@@ -127,8 +138,13 @@ class SideBySide:
         training = group.training
         self._group = group
         self._environment = training.environment(0 if group.timeline is None else len(group.timeline.conditions))
-        made = programs_on_host if isinstance(training.robot, HostRobot) else programs
-        beginning, self._chunk = made(self._environment, training.algorithm)
+        self._course = None
+        if training.is_varied:
+            self._course = Course(training, self._environment, group.timeline, len(group.members))
+            beginning, self._chunk = self._course.begin, self._course.train
+        else:
+            made = programs_on_host if isinstance(training.robot, HostRobot) else programs
+            beginning, self._chunk = made(self._environment, training.algorithm)
         keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
         self._learners = beginning(keys)
         self._curve: list[np.ndarray] = []
@@ -154,24 +170,37 @@ class SideBySide:
             )
         with np.errstate(invalid="ignore"):
             self._curve.append(np.stack([iterations, episodes, returns / episodes], axis=1))
+        if self._course is not None:
+            self._course.assess(index, self._learners.deployed, simulator)
         return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")
 
+    def note(self) -> str:
+        """What there is to tell beside returns: how far the policies are in their lessons."""
+        return "" if self._course is None else self._course.note()
+
     def policies(self) -> list[Policy]:
-        """What they are now."""
-        curve = np.stack(self._curve) if self._curve else np.zeros((0, len(self._group.members), 3))
-        return [
-            _policy(
-                self._group,
-                self._environment.scales,
-                jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), self._learners.deployed),
-                curve[:, i],
-            )
-            for i in range(len(self._group.members))
-        ]
+        """What they are now, each with its best where they are assessed."""
+        return [self._policy(i) for i in range(len(self._group.members))]
+
+    def _policy(self, i: int) -> Policy:
+        done = len(self._curve)
+        curve = np.stack(self._curve)[:, i] if done else np.zeros((0, 3))
+        now = self._as_policy(i, self._learners.deployed, curve)
+        if self._course is None or not done or not self._group.training.episodes_assessed:
+            return now
+        standing = self._course.standing
+        assessments, until = standing.table[:done, i].copy(), int(standing.best_at[i]) + 1
+        kept = replace(self._as_policy(i, standing.best, curve[:until]), assessments=assessments[:until])
+        return replace(now, assessments=assessments, best=kept)
+
+    def _as_policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
+        network = jax.tree.map(lambda leaf: np.array(leaf[i]), networks)
+        return _policy(self._group, self._environment.scales, network, curve)
 
     def keep(self, checkpoint: Path) -> None:
         """Write a checkpoint."""
-        leaves = jax.tree.leaves(self._learners._replace(key=jax.random.key_data(self._learners.key)))
+        learners = self._learners._replace(key=jax.random.key_data(self._learners.key))
+        leaves = jax.tree.leaves((learners, self._standing))
         arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
         arrays |= {"fingerprint": np.array(self._group.fingerprint), "done": np.array(len(self._curve))}
         with atomic_write(checkpoint) as beside, beside.open("wb") as file:
@@ -179,9 +208,17 @@ class SideBySide:
 
     def resume(self, checkpoint: Path) -> int:
         """Go on from a checkpoint; returns how many chunks are done."""
-        done, self._learners, curve = _read_checkpoint(checkpoint, self._group.fingerprint, self._learners)
+        done, self._learners, standing, curve = _read_checkpoint(
+            checkpoint, self._group.fingerprint, self._learners, self._standing
+        )
+        if self._course is not None:
+            self._course.standing = standing
         self._curve = list(curve[:done])
         return done
+
+    @property
+    def _standing(self) -> Any:
+        return () if self._course is None else self._course.standing
 
 
 def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> Policy:
@@ -204,9 +241,11 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
     )
 
 
-def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, Learner, np.ndarray]:
-    like = like._replace(key=jax.random.key_data(like.key))
-    leaves, structure = jax.tree.flatten(like)
+def _read_checkpoint(
+    path: Path, fingerprint: str, like: Learner, standing: Any
+) -> tuple[int, Learner, Any, np.ndarray]:
+    leaves, structure = jax.tree.flatten((like._replace(key=jax.random.key_data(like.key)), standing))
+    n_standing = len(jax.tree.leaves(standing))
     try:
         # Opened here, as numpy leaves a file open that it cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -227,15 +266,17 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Learner) -> tuple[int, 
                     f"{path}: expected a checkpoint as this animat writes it, of {len(leaves[0])} policies together, "
                     f"got another's (a former version grouped 2 to 5 otherwise); to begin these anew: rm '{path}'"
                 )
-            read = [jnp.asarray(array) for array in kept]
+            # What is not on its way to JAX stays numpy's, of 64 bits.
+            n = len(leaves) - n_standing
+            read = [jnp.asarray(array) for array in kept[:n]] + kept[n:]
     except InvalidFile:
         raise
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
         raise InvalidFile(
             f"{path}: expected a checkpoint, got a file that cannot be read ({error}); remove it"
         ) from error
-    learners = jax.tree.unflatten(structure, read)
-    return done, learners._replace(key=jax.random.wrap_key_data(learners.key)), curve
+    learners, standing = jax.tree.unflatten(structure, read)
+    return done, learners._replace(key=jax.random.wrap_key_data(learners.key)), standing, curve
 
 
 def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:

@@ -70,6 +70,9 @@ class Policy:
         learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
         readouts: what is read of the neurons, by the electrodes of each command.
         neural_observation: whether it sees what the neurons remember, too (`animat.wrappers.NeuralObservation`).
+        assessments: iterations, minute of the simulators, lesson (from 1), share of successes (NaN where the robot does
+            not tell) and mean return, a row each, shape (assessments, 5); none where it was not assessed.
+        best: what it was at its best assessment, from the training; its own file has none, and lies in `best/`.
     """
 
     __repr__ = briefly
@@ -87,6 +90,8 @@ class Policy:
     learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     readouts: Readouts = ALL
     neural_observation: bool = False
+    assessments: Float[np.ndarray, "assessments 5"] = field(default_factory=lambda: np.zeros((0, 5)))
+    best: Policy | None = None
 
     def __post_init__(self) -> None:
         self._expect_network()
@@ -97,6 +102,8 @@ class Policy:
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
             raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
+        if self.assessments.ndim != 2 or self.assessments.shape[1] != 5 or self.assessments.dtype.kind != "f":
+            raise InvalidArgument(f"assessments: expected rows of five, got shape {self.assessments.shape}")
         expect_provenance(self.provenance)
         if self.mapping is not None:
             expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
@@ -235,6 +242,8 @@ class Policy:
             MAPPINGS.expect_loadable(self.mapping)
 
         arrays = {"scales": self.scales, "learning_curve": self.learning_curve}
+        if len(self.assessments):
+            arrays["assessments"] = self.assessments
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"layer{i}.weight": weight, f"layer{i}.bias": bias}
         described = {
@@ -279,6 +288,7 @@ class Policy:
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
                 provenance=described["provenance"],
                 learning_curve=arrays["learning_curve"],
+                assessments=arrays.get("assessments", np.zeros((0, 5))),
                 # Files of before read all channels as one, and their policies saw the robot alone.
                 readouts=Readouts.from_dict(described.get("readouts")),
                 neural_observation=described.get("neural_observation", False),
@@ -303,7 +313,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
             if "animat" not in metadata:
                 raise InvalidFile(f"{path}: expected a policy of animat, got a safetensors file of other origin")
             kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
-            if set(kinds) != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
+            if set(kinds) - {"assessments"} != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
                 told = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
                 raise InvalidFile(
                     f"{path}: expected a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64, got {told[:400]}"

@@ -19,7 +19,7 @@ Count = Annotated[Whole, Field(ge=1, le=10**9)]
 class Trained(TypedDict, total=False):
     """How it was trained; what is left out is not known."""
 
-    shadowing: Flag
+    shadowing: Flag | Literal["drawn"]
     duration_min: Positive | None
     chunks: Count
     percentiles: Literal["moving", "first"]

@@ -321,6 +321,16 @@ def draw_action(
     return jnp.sum(uniforms >= below, axis=-1)
 
 
+def likeliest_action(
+    environment: Environment[Any], actor: Network, observation: Float[Array, "batch observations"]
+) -> Array:
+    """The most probable action for each scaled observation; of continuous commands the middle of the distribution."""
+    outputs = forward(actor, observation)
+    if environment.n_actions is not None:
+        return jnp.argmax(outputs, axis=-1)
+    return as_commands(environment, jnp.tanh(outputs[:, : environment.n_drawn]))
+
+
 def as_commands(
     environment: Environment[Any], actions: Float[Array, "batch commands"]
 ) -> Float[Array, "batch *commands"]:

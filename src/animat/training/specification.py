@@ -5,23 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Generic, Literal, TypeVar, get_args
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 import numpy as np
+from pydantic import Field
 
 from animat.coding.decoder import expect_one_command
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
 from animat.neurons.timeline import SimulatorTimeline
+from animat.records import Whole, read_record
 from animat.registry import is_ours
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named, robot_to_dict
+from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery
 
 Percentiles = Literal["moving", "first"]
+Shadowing = bool | Literal["drawn"]
 
 CHUNKS = 60
 """Parts that training is cut into: the units of progress, refresh and checkpoint; a culture minute each by default."""
@@ -62,6 +66,7 @@ class Training:
         iterations: of the robot, for each policy; rounded up to whole rounds of `algorithm.environments`.
         seed: decides every random draw.
         shadowing: whether simulators are refreshed during training; if not, the first one is used throughout.
+            `"drawn"`: each episode draws one of all those that refreshing would have used (`animat.training.lessons`).
         duration_min: minutes of the culture's clock that the whole training stands for (the paper: 60); None: as long
             as the recordings that it is trained on (`SimulatorTimeline.span_min`).
         percentiles: `"moving"` with the simulator in use, or fixed by the `"first"` recording.
@@ -70,6 +75,9 @@ class Training:
             no closed loop runs such policies; they are evaluated on simulators.
         commands: without neurons, the commands to pick from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
+        lessons: ranges that episodes are drawn from, in turn; after a last one that goes on comes the task itself.
+        assess: episodes of the assessment at the end of each chunk, by which the best policy so far is kept; None:
+            no assessments, but where lessons are gone on with 20.
 
     Raises:
         InvalidArgument: for counts or durations that are not positive.
@@ -80,13 +88,15 @@ class Training:
     policies: int = 10
     iterations: int = 800_000
     seed: int = 1
-    shadowing: bool = True
+    shadowing: Shadowing = True
     duration_min: float | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
     neural_observation: bool = False
     commands: tuple[float, ...] | None = None
     algorithm: SAC = field(default_factory=SAC)
+    lessons: tuple[Lesson, ...] = ()
+    assess: int | None = None
 
     def __post_init__(self) -> None:
         for what, kind in (("robot", Robot), ("mapping", Mapping)):
@@ -109,7 +119,18 @@ class Training:
             )
         if self.duration_min is not None and not (math.isfinite(self.duration_min) and self.duration_min > 0):
             raise InvalidArgument(f"duration_min: expected positive minutes, got {self.duration_min:g}")
-        for name, allowed in (("percentiles", get_args(Percentiles)), ("delivery", get_args(Delivery))):
+        expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
+        if self.assess is not None:
+            read_record(Annotated[Whole, Field(ge=1, le=MOST_EPISODES)], self.assess, "assess")  # type: ignore[arg-type]
+        if self.shadowing == "drawn" and self.mapping is None:
+            raise InvalidArgument("shadowing: expected True or False without neurons, got 'drawn'")
+        if self.is_varied and isinstance(self.robot, HostRobot):
+            raise InvalidArgument(f"robot: expected one that is stepped by JAX to be assessed, got {self.robot.name}")
+        for name, allowed in (
+            ("shadowing", (True, False, "drawn")),
+            ("percentiles", get_args(Percentiles)),
+            ("delivery", get_args(Delivery)),
+        ):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
 
@@ -121,6 +142,16 @@ class Training:
             register_robot(type(self.robot))
         if self.mapping is not None and not is_ours(self.mapping):
             register_mapping(type(self.mapping))
+
+    @property
+    def is_varied(self) -> bool:
+        """Whether episodes are drawn from ranges, or policies assessed."""
+        return bool(self.lessons or self.assess or self.shadowing == "drawn")
+
+    @property
+    def episodes_assessed(self) -> int:
+        """Of each assessment; 0: there are none."""
+        return self.assess or EPISODES * any(lesson.goes_on for lesson in self.lessons)
 
     @property
     def rounds(self) -> int:
@@ -155,12 +186,14 @@ class Training:
     def to_dict(self) -> dict[str, Any]:
         """The same as plain data, for a file."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        if not self.neural_observation:
-            # Folders of before have none, and go on.
-            del plain["neural_observation"]
+        # Folders of before have none of these, and go on.
+        for name in ("neural_observation", "lessons", "assess"):
+            if not plain[name]:
+                del plain[name]
         return plain | {
             "robot": robot_to_dict(self.robot),
             "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "algorithm": asdict(self.algorithm),
             "chunks": CHUNKS,
+            **({"lessons": [asdict(lesson) for lesson in self.lessons]} if self.lessons else {}),
         }

@@ -1,0 +1,156 @@
+"""Lessons as data: from which ranges episodes are drawn, and when a policy goes on to the next one."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import field
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from animat.errors import InvalidArgument, InvalidFile, did_you_mean
+from animat.plain_file import read_toml
+from animat.records import Number, read_record, record
+from animat.robots.base import Robot
+from animat.robots.host import HostRobot
+
+EPISODES = 20
+"""Of an assessment, where lessons ask for one and nobody says how many."""
+MOST_EPISODES = 10_000
+MOST_VARIED = 10
+"""Parameters that vary at once at most: a robot is made of every combination of their ends, to see that it can be."""
+_MOST_BYTES = 2**20
+
+Range = tuple[Number, Number]
+"""The lowest and the highest value; each between them is equally likely."""
+
+
+@record
+class Lesson:
+    """Ranges that each episode is drawn from anew; whatever is not named is as the robot and its start have it.
+
+    Attributes:
+        name: for people.
+        parameters: ranges of the robot's parameters, by name.
+        starts: ranges of numbers of the robot's state at the start of an episode, by name.
+        recordings_min: the recordings that an episode's simulator is drawn from, by the minutes on the culture's clock
+            between which they started, both included; None: all. Only where simulators are drawn at all
+            (`Training.shadowing`).
+        success: the share of an assessment's episodes that must succeed for the policy to go on.
+        until_return: or the mean return that they must have, in the task's units.
+
+    Raises:
+        InvalidArgument: for a range whose low end is above the high one, or two ways to go on.
+    """
+
+    name: Annotated[str, Field(max_length=200)] = ""
+    parameters: dict[str, Range] = field(default_factory=dict)
+    starts: dict[str, Range] = field(default_factory=dict)
+    recordings_min: Range | None = None
+    success: Annotated[Number, Field(gt=0, le=1)] | None = None
+    until_return: Number | None = None
+
+    def __post_init__(self) -> None:
+        ranges = {
+            f"{table}.{name}": ends for table in ("parameters", "starts") for name, ends in vars(self)[table].items()
+        }
+        if self.recordings_min is not None:
+            ranges["recordings_min"] = self.recordings_min
+        for name, (low, high) in ranges.items():
+            if low > high:
+                raise InvalidArgument(f"{name}: expected the low end first, got [{low:g}, {high:g}]")
+        if self.success is not None and self.until_return is not None:
+            raise InvalidArgument("until_return: expected one way to go on, got success too")
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it says when a policy goes on."""
+        return self.success is not None or self.until_return is not None
+
+
+@record
+class _File:
+    lessons: tuple[Lesson, ...] = ()
+
+
+def read_lessons(path: str | os.PathLike[str]) -> tuple[Lesson, ...]:
+    """Lessons of a TOML file, a table `[[lessons]]` each, whose keys are the attributes of `Lesson`.
+
+    Raises:
+        InvalidFile: naming the file, the key, what was expected and what came.
+    """
+    data = read_toml(path, _MOST_BYTES)
+    try:
+        lessons = read_record(_File, data).lessons
+    except InvalidArgument as error:
+        raise InvalidFile(f"{path}: {error}") from error
+    if not lessons:
+        raise InvalidFile(f"{path}: expected a table [[lessons]] for each, got none")
+    return lessons
+
+
+def stages_of(lessons: Sequence[Lesson]) -> tuple[Lesson, ...]:
+    """The lessons in turn; after a last one that goes on comes the task itself."""
+    return (*lessons, *[Lesson(name="the task itself")] * (not lessons or lessons[-1].goes_on))
+
+
+def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_recordings: bool) -> None:
+    """Refuse lessons that this robot cannot be taught.
+
+    Raises:
+        InvalidArgument: naming the lesson, what was expected and what came.
+    """
+    if lessons and isinstance(robot, HostRobot):
+        raise InvalidArgument(
+            f"lessons: expected a robot that is stepped by JAX, got {robot.name}, which its own library steps"
+        )
+    for number, lesson in enumerate(lessons, 1):
+        where = f"lesson {number}"
+        if number < len(lessons) and not lesson.goes_on:
+            raise InvalidArgument(
+                f"{where}: expected success or until_return, which say when to go on to the next one, got neither"
+            )
+        if lesson.success is not None and not hasattr(robot, "succeeded"):
+            raise InvalidArgument(
+                f"{where}: success: expected a robot that tells whether an episode succeeded, got {robot.name}, which "
+                "has no method `succeeded`; go on by until_return"
+            )
+        if lesson.recordings_min is not None and not draws_recordings:
+            raise InvalidArgument(f"{where}: recordings_min: expected only where shadowing is 'drawn'")
+        try:
+            _expect_parameters(lesson, robot)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"{where}: {error}") from error
+
+
+def _expect_parameters(lesson: Lesson, robot: Any) -> None:
+    numbers = {f.name: getattr(robot, f.name) for f in dataclasses.fields(robot)}
+    if len(lesson.parameters) > MOST_VARIED:
+        raise InvalidArgument(f"parameters: expected at most {MOST_VARIED}, got {len(lesson.parameters)}")
+    for name in lesson.parameters:
+        if name not in numbers:
+            known = ", ".join(known for known, value in numbers.items() if isinstance(value, float))
+            near = did_you_mean(name, numbers) or f"; there are {known}"
+            raise InvalidArgument(f"parameters: expected parameters of {robot.name}, got {name!r}{near}")
+        if not isinstance(numbers[name], float):
+            raise InvalidArgument(
+                f"parameters.{name}: expected a parameter that is a real number, got one that is {numbers[name]!r}: it "
+                "is part of the program that is compiled, and cannot vary"
+            )
+    # What several of them mean together is wrong at a corner, if anywhere.
+    most = -math.inf
+    for corner in itertools.product(*lesson.parameters.values()):
+        values = dict(zip(lesson.parameters, corner, strict=True))
+        try:
+            most = max(most, dataclasses.replace(robot, **values).return_range[1])
+        except InvalidArgument as error:
+            told = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+            raise InvalidArgument(f"parameters: {robot.name} cannot have {told}: {error}") from error
+    if lesson.until_return is not None and lesson.until_return > most:
+        raise InvalidArgument(
+            f"until_return: expected at most {most:g}, the highest return of {robot.name}, got {lesson.until_return:g}"
+        )

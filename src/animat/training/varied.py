@@ -1,0 +1,185 @@
+"""An environment whose episodes are drawn from ranges: of the robot's parameters, its starts, and the recordings.
+
+The ranges are arrays, traced like the simulator. Another lesson changes data, not code: nothing is compiled again, and
+policies that are trained side by side can be at different lessons.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.errors import JAXTypeError
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from animat.environment import Environment, Responded, RobotState, State, Uniforms
+from animat.errors import InvalidArgument, did_you_mean, first_line
+from animat.neurons.simulator import NeuronSimulator, Stored
+from animat.robots.base import Robot
+from animat.training.lessons import Lesson
+from animat.wrappers import Wrapper
+
+Kind = TypeVar("Kind", bound=Robot[Any])
+
+
+@dataclass(frozen=True)
+class Varying:
+    """What varies in any lesson of a training; static, as it decides what is compiled.
+
+    Attributes:
+        parameters: names of the robot's.
+        starts: names of numbers of its state.
+        recordings: whether each episode draws its simulator.
+    """
+
+    parameters: tuple[str, ...]
+    starts: tuple[str, ...]
+    recordings: bool
+
+
+class Ranges(NamedTuple):
+    """The low and the high end of what varies, in the order of `Varying`.
+
+    Attributes:
+        parameters: of a robot's.
+        starts: of its state; NaN: as the robot's reset has it.
+        recordings: the first and the last row of the simulators.
+    """
+
+    parameters: Float[Stored, "*policies 2 parameters"]
+    starts: Float[Stored, "*policies 2 starts"]
+    recordings: Int[Stored, "*policies 2"]
+
+
+def varying_in(lessons: Sequence[Lesson], *, recordings: bool) -> Varying:
+    """What varies in any of the lessons."""
+    parameters = dict.fromkeys(name for lesson in lessons for name in lesson.parameters)
+    starts = dict.fromkeys(name for lesson in lessons for name in lesson.starts)
+    return Varying(tuple(parameters), tuple(starts), recordings)
+
+
+def ranges_of(lesson: Lesson, varying: Varying, robot: Robot[Any], rows: tuple[int, int]) -> Ranges:
+    """A lesson's ranges; a parameter that varies in other lessons only is as the robot has it."""
+    parameters = [lesson.parameters.get(name, (getattr(robot, name),) * 2) for name in varying.parameters]
+    starts = [lesson.starts.get(name, (np.nan, np.nan)) for name in varying.starts]
+    of_parameters, of_starts = (np.array(ends, np.float32).reshape(-1, 2).T for ends in (parameters, starts))
+    return Ranges(of_parameters, of_starts, np.array(rows, np.int32))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Varied(Wrapper[RobotState]):
+    """Draws, at each reset, what varies; the episode keeps it to its end, whatever the ranges are then.
+
+    `simulator` is a stack of them, one a recording, where recordings vary. In `State.info`: the `parameters` that were
+    drawn, and the row of the `recording`.
+
+    Attributes:
+        varying: what varies.
+        ranges: between which numbers; may be traced.
+    """
+
+    varying: Varying
+    ranges: Ranges
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        of_parameters, of_starts, of_recording = jax.random.split(jax.random.fold_in(key, 1), 3)
+        parameters = _between(of_parameters, self.ranges.parameters)
+        state = self._with(parameters).reset(key)
+        drawn = _between(of_starts, self.ranges.starts)
+        starts = {
+            name: jnp.where(jnp.isnan(value), getattr(state.robot, name), value)
+            for name, value in zip(self.varying.starts, drawn, strict=True)
+        }
+        first, last = self.ranges.recordings
+        recording = jax.random.randint(of_recording, (), first, last + 1)
+        info = state.info | {"parameters": parameters, "recording": recording}
+        return state._replace(robot=state.robot._replace(**starts) if starts else state.robot, info=info)
+
+    def observe(self, state: State) -> Float[Array, " observations"]:
+        return self._in(state).observe(state)
+
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+        return self._in(state).respond(uniforms, state, action, self._drawn(state, simulator))
+
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        after = self._in(state).advance(uniforms, state, action, self._drawn(state, simulator))
+        kept = {name: state.info[name] for name in ("parameters", "recording")}
+        return after._replace(info=after.info | kept)
+
+    def succeeded(self, state: State) -> Bool[Array, ""]:
+        """Whether an episode that ended in this state succeeded; never, for a robot that does not tell."""
+        told = getattr(self._in(state).robot, "succeeded", None)
+        return jnp.bool_(False) if told is None else told(state.robot)  # type: ignore[no-any-return]
+
+    def _in(self, state: State) -> Environment[RobotState]:
+        return self._with(state.info["parameters"])
+
+    def _with(self, parameters: Float[Array, " parameters"]) -> Environment[RobotState]:
+        values = dict(zip(self.varying.parameters, parameters, strict=True))
+        return _with_robot(self.inside, with_parameters(self.robot, values)) if values else self.inside
+
+    def _drawn(self, state: State, simulator: NeuronSimulator | None) -> NeuronSimulator | None:
+        if not self.varying.recordings:
+            return simulator
+        row = state.info["recording"]
+        return jax.tree.map(lambda stacked: stacked[row], simulator)  # type: ignore[no-any-return]
+
+
+def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
+    """The robot with other parameters, which may be traced: made without its checks, which want numbers."""
+    varied = object.__new__(type(robot))
+    for each in dataclasses.fields(robot):  # type: ignore[arg-type]
+        object.__setattr__(varied, each.name, values.get(each.name, getattr(robot, each.name)))
+    return varied
+
+
+def expect_varied(robot: Robot[Any], varying: Varying) -> None:
+    """Refuse what this robot cannot vary, seen on its shapes.
+
+    Raises:
+        InvalidArgument: for a parameter that something is compiled by, or a name that is none of the state's numbers.
+    """
+    state = jax.eval_shape(robot.reset, jax.random.key(0))
+    known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
+    for name in varying.starts:
+        if name not in known:
+            near = did_you_mean(name, known) or f"; there are {', '.join(known) or 'none'}"
+            raise InvalidArgument(f"lessons: starts: expected numbers of the state of {robot.name}, got {name!r}{near}")
+
+    def once(value: Any, name: str) -> Any:
+        varied = with_parameters(robot, {name: value})
+        state = varied.reset(jax.random.key(0))
+        command = jnp.zeros(() if robot.n_commands == 1 else robot.n_commands)
+        after, reward, _ = varied.advance(jnp.zeros(robot.noise_size), state, command)
+        return varied.observe(after), reward
+
+    for name in varying.parameters:
+        try:
+            jax.eval_shape(lambda value, name=name: once(value, name), jnp.float32(getattr(robot, name)))
+        except (JAXTypeError, TypeError, ValueError, AttributeError) as error:
+            raise InvalidArgument(
+                f"lessons: parameters.{name}: expected a parameter that {robot.name} only computes with, got one that "
+                f"cannot vary while it is compiled ({first_line(error)})"
+            ) from error
+
+
+def _is_number(leaf: Any) -> bool:
+    return getattr(leaf, "shape", None) == () and jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def _between(key: PRNGKeyArray, ends: Float[Stored, "2 numbers"]) -> Float[Array, " numbers"]:
+    low, high = jnp.asarray(ends)
+    drawn: Float[Array, " numbers"] = low + (high - low) * jax.random.uniform(key, low.shape)
+    return drawn
+
+
+def _with_robot(environment: Environment[RobotState], robot: Robot[RobotState]) -> Environment[RobotState]:
+    if isinstance(environment, Wrapper):
+        return dataclasses.replace(environment, inside=_with_robot(environment.inside, robot))
+    return dataclasses.replace(environment, robot=robot)  # type: ignore[type-var]
