@@ -19,6 +19,8 @@ from animat.compilation import FAST_TO_COMPILE
 from animat.environment import Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.host_rollouts import roll_out_on_host
+from animat.goals.robot import RobotWithGoal
+from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.robots.host import HostRobot
@@ -101,6 +103,8 @@ class Episodes:
             conditions without neurons.
         passed: how often the response was P50 or more, the same shape; of several readouts each on its own, shape
             (actors, conditions, readouts).
+        outcome: what each came to, of a robot with a goal; shapes (actors, episodes), and with a last axis of
+            objectives.
     """
 
     __repr__ = briefly
@@ -110,6 +114,7 @@ class Episodes:
     terminated: Bool[np.ndarray, "actors episodes"]
     presented: Int64[np.ndarray, "actors conditions"]
     passed: Int64[np.ndarray, "actors conditions *readouts"]
+    outcome: Outcome | None = None
 
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
@@ -177,9 +182,10 @@ def roll_out(
     keys = jax.random.split(jax.random.key(seed), n_actors)
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
-    returns, *counted, terminated = _roll_out(environment, episodes, simulator, actors, keys)
+    (returns, *counted, terminated), outcome = _roll_out(environment, episodes, simulator, actors, keys)
     lengths, presented, passed = (np.asarray(each, np.int64) for each in counted)
-    return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed)
+    came_to = None if outcome is None else Outcome(*(np.asarray(each) for each in outcome))  # type: ignore[arg-type]
+    return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed, came_to)
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=FAST_TO_COMPILE)
@@ -189,7 +195,7 @@ def _roll_out(
     simulator: NeuronSimulator | None,
     actors: Actor,
     keys: Key[Array, " actors"],
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[tuple[Array, ...], Outcome | None]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     readouts = () if simulator is None else simulator.percentiles.shape[:-1]
     n_drawn = environment.n_drawn
@@ -229,9 +235,11 @@ def _roll_out(
     # The loop is outside of the `vmap`, and ends with the last episode: controls fail long before the limit.
     first, of_iteration = jax.vmap(begin)(keys)
     each = jax.vmap(iteration)
-    _, (_, _, *counted) = jax.lax.while_loop(
+    _, (last, _, *counted) = jax.lax.while_loop(
         lambda at: (at[0] < environment.robot.episode_limit) & jnp.any(at[1][1]),
         lambda at: (at[0] + 1, each(at[1], actors, of_iteration[:, at[0]])),
         (0, first),
     )
-    return tuple(counted)
+    robot = environment.robot
+    outcome = jax.vmap(jax.vmap(robot.outcome))(last.robot) if isinstance(robot, RobotWithGoal) else None
+    return tuple(counted), outcome

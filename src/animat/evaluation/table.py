@@ -19,6 +19,7 @@ from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import normalised_score
 from animat.evaluation.verdict import Verdict
+from animat.goals.robot import RobotWithGoal
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
@@ -67,6 +68,17 @@ class Row:
             "mean_length": float(self.episodes.lengths.mean()),
             "terminated_share": float(self.episodes.terminated.mean()),
             "mean_returns": means.tolist(),
+            **self.met(),
+        }
+
+    def met(self) -> dict[str, Any]:
+        """How the goal was met, means over all episodes; nothing for a robot without one."""
+        if (outcome := self.episodes.outcome) is None:
+            return {}
+        return {
+            "success_share": float(np.mean(outcome.succeeded)),
+            "satisfaction_percent": np.mean(outcome.satisfaction, axis=(0, 1)).tolist(),
+            "margin": float(np.mean(outcome.margin)),
         }
 
 
@@ -84,6 +96,7 @@ class Evaluation:
         optimum: the optimal return of any controller; None where it was not asked for, or is not known.
         no_optimum: why it is not known, though it was asked for.
         fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
+        objectives: of the robot's goal, as texts; none of a robot without one.
     """
 
     __repr__ = briefly
@@ -97,6 +110,7 @@ class Evaluation:
     optimum: Optimum | None = None
     no_optimum: str | None = None
     fixed_from_min: float | None = None
+    objectives: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict | None:
@@ -141,6 +155,7 @@ class Evaluation:
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
             "findings": [finding.to_dict() for finding in self.findings],
+            **({"objectives": list(self.objectives)} if self.objectives else {}),
         }
 
     def to_text(self) -> str:
@@ -150,20 +165,27 @@ class Evaluation:
         if self.fixed_from_min is not None:
             on += f", percentiles fixed from {self.fixed_from_min:g} min"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
-        head = ["", "mean return", "s.e.", "iterations", "ended early", "score", ""]
+        goal = ["success", "satisfaction", "margin"] if self.objectives else []
+        head = ["", "mean return", "s.e.", "iterations", "ended early", *goal, "score", ""]
         cells = []
         for row in self.rows:
             told, score = row.to_dict(), self.score(row)
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
             numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
-            ended = f"{100 * told['terminated_share']:.0f} %"
-            cells.append([row.name, *numbers, ended, "" if score is None else f"{score:.2f}", row.meaning])
+            numbers.append(f"{100 * told['terminated_share']:.0f} %")
+            if goal:
+                satisfaction = f"{np.mean(told['satisfaction_percent']):.0f} %"
+                numbers += [f"{100 * told['success_share']:.0f} %", satisfaction, f"{told['margin']:+.2f}"]
+            cells.append([row.name, *numbers, "" if score is None else f"{score:.2f}", row.meaning])
         if self.optimum is None:
             for line in (head, *cells):
                 del line[-2]
         lines = [f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each", *lined_up(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
+        if self.objectives:
+            satisfied = zip(self.objectives, self.rows[0].met()["satisfaction_percent"], strict=True)
+            lines.append(f"  satisfied: {'; '.join(f'{name}: {percent:.0f} %' for name, percent in satisfied)}")
         if self.verdict is not None:
             lines.append(f"  {self.verdict}")
         if self.not_met:
@@ -291,6 +313,7 @@ def evaluate(
         optimum,
         no_optimum,
         fixed_from_min,
+        tuple(map(str, body.goal.objectives)) if isinstance(body, RobotWithGoal) else (),
     )
 
 

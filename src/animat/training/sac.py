@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
+from animat.robots.base import Robot
 from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
 from animat.training.networks import Network, forward, initial_networks, squashed_normal
 from animat.training.settings import SAC
@@ -249,7 +250,8 @@ def _act(
     action, exploration, noise = choose(environment, learner, state[:, :-1], uniforms)
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = jnp.logical_or(*after.ended)
-    rows = transitions(settings, state, state_of(environment, after), action, after.reward, ended)
+    reward = shaped(environment.robot, settings, learner.episodes.robot, after.robot, after.reward, ended)
+    rows = transitions(settings, state, state_of(environment, after), action, reward, ended)
 
     returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
@@ -260,6 +262,31 @@ def _act(
         exploration=ended_episodes(exploration, ended, returns),
     )
     return learner, finished_alone(exploration, ended, returns)
+
+
+def shaped(
+    robot: Robot[Any],
+    settings: SAC,
+    before: Any,
+    after: Any,
+    reward: Float[Array, " environments"],
+    ended: Bool[Array, " environments"],
+) -> Float[Array, " environments"]:
+    """Rewards as they are learned from, where the robot has a `potential`; the best policy is that of the rewards.
+
+        r + gamma (1 - d) potential(s') - potential(s)
+
+    with d for ended, in either way, as the losses have it. Along any episode the discounted terms add up to
+    -potential(s_0), whatever is done (Ng, Harada & Russell 1999). No return that is reported has them.
+
+    Args:
+        before, after: states of the robot, each number with an axis of environments.
+    """
+    if not hasattr(robot, "potential"):
+        return reward
+    potential = jax.vmap(robot.potential)
+    shaping: Array = settings.discount * jnp.where(ended, 0.0, potential(after)) - potential(before)
+    return reward + shaping
 
 
 def choose(
