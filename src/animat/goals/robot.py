@@ -146,7 +146,13 @@ class RobotWithGoal(Robot[GoalState]):
         return -self._cost * limit - self._failure * worst, best * REACHED if best else limit
 
     def caveats(self) -> tuple[str, ...]:
-        return self.robot.caveats()
+        """Those of the robot, and where episodes start in a region that ends them."""
+        import jax
+
+        start = self.robot.reset(jax.random.key(0))
+        told = zip(self.goal.objectives, self._objectives, self._seen(start), strict=True)
+        in_it = [str(given) for given, each, (_, inside) in told if inside and each.kind in ("avoid", "reach")]
+        return (*self.robot.caveats(), *(f"goal: episodes of {self.name} start in the region: {of}" for of in in_it))
 
     def departures(self) -> tuple[tuple[str, str], ...]:
         return self.robot.departures()
