@@ -95,7 +95,7 @@ def along(goal: str, xs: list[float], limit: int = 4) -> tuple[list[float], list
         ("reach x above 0.5 m; avoid x below -0.5 m", [0.1, 0.2, -0.7], [-0.5, -0.5, -104], True, False, [85, 50],
          -0.15),
         ("reach x above 0.5 m; drive x above 0 m", [0.1, -0.2, 0.9], [-0.5, -1, 50], True, True, [100, 200 / 3], 0.2),
-        ("reach x above 0.5 m weight 3; reach x below -0.5 m", [-0.7], [25], True, True, [65, 100], 0.1),
+        ("reach x above 0.5 m weight 3; reach x below -0.5 m", [-0.7], [25], True, True, [40, 100], 0.1),
         ("reach x above 0.5 m; avoid x above 0.5 m", [0.7], [-104], True, False, [100, 0], -0.1),
         ("drive x in 0.2..0.6 m and x above 0.5 m", [0.5, 0.55, 0.3, 0.6], [0, 1, 0, 1], False, True, [50], 0.0),
     ],
@@ -191,20 +191,27 @@ def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -
     places, commands = np.arange(11), (-1.0, 0.0, 1.0)
     states = jax.vmap(lambda at: robot._started(Walk(at)))(jnp.asarray(places, jnp.float32))
 
+    advance, uniforms = jax.jit(jax.vmap(robot.advance)), jnp.ones((11, 1))
+    moved = [
+        (c, share, *advance(chance * uniforms, states, jnp.full(11, u)))
+        for c, u in enumerate(commands)
+        for chance, share in ((0.0, 0.3), (1.0, 0.7))
+    ]
+
     def q_values(is_shaped: bool) -> np.ndarray:
         """By dynamic programming, with the time left in the state as the critics see it."""
         values, found = np.zeros(11), []
+        # Only the last iteration ends an episode in every state.
+        rewards = {}
+        for is_last in (False, True):
+            for i, (_, _, after, reward, terminated) in enumerate(moved):
+                ended = terminated | is_last
+                rewards[i, is_last] = shaped(robot, learner, states, after, reward, ended) if is_shaped else reward
         for left in range(1, limit + 1):
             q = np.zeros((len(commands), 11))
-            for c, u in enumerate(commands):
-                for chance, share in ((0.0, 0.3), (1.0, 0.7)):
-                    uniforms = jnp.full((11, 1), chance)
-                    after, reward, terminated = jax.vmap(robot.advance)(uniforms, states, jnp.full(11, u))
-                    ended = terminated | (left == 1)
-                    if is_shaped:
-                        reward = shaped(robot, learner, states, after, reward, ended)
-                    went_on = np.where(ended, 0.0, values[np.asarray(after.robot.at, int)])
-                    q[c] += share * (np.asarray(reward) + learner.discount * went_on)
+            for i, (c, share, after, _, terminated) in enumerate(moved):
+                went_on = np.where(terminated | (left == 1), 0.0, values[np.asarray(after.robot.at, int)])
+                q[c] += share * (np.asarray(rewards[i, left == 1]) + learner.discount * went_on)
             values = q.max(axis=0)
             found.append(q)
         return np.array(found)
@@ -329,7 +336,7 @@ def test_a_goal_travels_as_text_beside_the_robot() -> None:
     assert data["goal"] == str(robot.goal) and data["robot"]["name"] == "navigation"
     assert robot_of(data) == robot
     assert body_and_goal(Navigation()).keys() == {"robot"} and robot_of(body_and_goal(Navigation())) == Navigation()
-    with pytest.raises(InvalidArgument, match="^goal: expected a text"):
+    with pytest.raises(InvalidArgument, match="goal: expected a text"):
         robot_of({**data, "goal": 3})
 
 
