@@ -19,7 +19,8 @@ from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import normalised_score
 from animat.evaluation.verdict import Verdict
-from animat.goals.robot import RobotWithGoal
+from animat.goals.robot import objectives_of
+from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
@@ -68,18 +69,13 @@ class Row:
             "mean_length": float(self.episodes.lengths.mean()),
             "terminated_share": float(self.episodes.terminated.mean()),
             "mean_returns": means.tolist(),
-            **self.met(),
+            **self.met,
         }
 
+    @property
     def met(self) -> dict[str, Any]:
-        """How the goal was met, means over all episodes; nothing for a robot without one."""
-        if (outcome := self.episodes.outcome) is None:
-            return {}
-        return {
-            "success_share": float(np.mean(outcome.succeeded)),
-            "satisfaction_percent": np.mean(outcome.satisfaction, axis=(0, 1)).tolist(),
-            "margin": float(np.mean(outcome.margin)),
-        }
+        """How the goal was met (`animat.goals.tally.Outcome.means`); empty for a robot without one."""
+        return {} if self.episodes.outcome is None else self.episodes.outcome.means()
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +161,7 @@ class Evaluation:
         if self.fixed_from_min is not None:
             on += f", percentiles fixed from {self.fixed_from_min:g} min"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
-        goal = ["success", "satisfaction", "margin"] if self.objectives else []
+        goal = MEANS if self.objectives else ()
         head = ["", "mean return", "s.e.", "iterations", "ended early", *goal, "score", ""]
         cells = []
         for row in self.rows:
@@ -173,9 +169,7 @@ class Evaluation:
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
             numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
             numbers.append(f"{100 * told['terminated_share']:.0f} %")
-            if goal:
-                satisfaction = f"{np.mean(told['satisfaction_percent']):.0f} %"
-                numbers += [f"{100 * told['success_share']:.0f} %", satisfaction, f"{told['margin']:+.2f}"]
+            numbers += cells_of(row.met) if goal else []
             cells.append([row.name, *numbers, "" if score is None else f"{score:.2f}", row.meaning])
         if self.optimum is None:
             for line in (head, *cells):
@@ -184,8 +178,7 @@ class Evaluation:
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if self.objectives:
-            satisfied = zip(self.objectives, self.rows[0].met()["satisfaction_percent"], strict=True)
-            lines.append(f"  satisfied: {'; '.join(f'{name}: {percent:.0f} %' for name, percent in satisfied)}")
+            lines.append(f"  {told_satisfaction(self.objectives, self.rows[0].met)}")
         if self.verdict is not None:
             lines.append(f"  {self.verdict}")
         if self.not_met:
@@ -313,7 +306,7 @@ def evaluate(
         optimum,
         no_optimum,
         fixed_from_min,
-        tuple(map(str, body.goal.objectives)) if isinstance(body, RobotWithGoal) else (),
+        objectives_of(body),
     )
 
 

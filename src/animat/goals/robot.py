@@ -18,11 +18,12 @@ and failing never pays, as it costs more than all of an episode.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple, final
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from animat.errors import InvalidArgument, shown
@@ -169,11 +170,17 @@ class RobotWithGoal(Robot[GoalState]):
         self, uniforms: Float[Array, " noise_size"], state: GoalState, u: Float[Array, "*commands"]
     ) -> tuple[GoalState, Float[Array, ""], Bool[Array, ""]]:
         """One iteration of the robot, and what it is worth (see the module)."""
+        robot, _, _ = self.robot.advance(uniforms, state.robot, u)
+        outside, tally, reward, ended = self._judged(self._seen(robot), state.outside, state.tally)
+        return GoalState(robot, outside, tally), reward, ended
+
+    def _judged(
+        self, seen: Seen, outside: tuple[Int[Array, ""], ...], tally: Tally
+    ) -> tuple[tuple[Int[Array, ""], ...], Tally, Float[Array, ""], Bool[Array, ""]]:
+        """What an iteration comes to after which this is seen, and its reward and whether it ends the episode."""
         import jax.numpy as jnp
 
-        robot, _, _ = self.robot.advance(uniforms, state.robot, u)
-        seen = self._seen(robot)
-        outside = self._outside(seen, state.outside)
+        outside = self._outside(seen, outside)
         late = iter(outside)
         no = jnp.bool_(False)
         failures, reaches, running = [], [], jnp.float32(0.0)
@@ -186,8 +193,8 @@ class RobotWithGoal(Robot[GoalState]):
         failed, reached = reduce(jnp.logical_or, failures), reduce(jnp.logical_or, reaches)
         reward = jnp.where(reached, REACHED * self._largest(reaches), running - self._cost)
         reward = jnp.where(failed, -self._failure * self._largest(failures), reward).astype(jnp.float32)
-        tally = counted(self._objectives, state.tally, seen, failed, reached & ~failed)
-        return GoalState(robot, outside, tally), reward, failed | reached
+        tally = counted(self._objectives, tally, seen, failed, reached & ~failed)
+        return outside, tally, reward, failed | reached
 
     def potential(self, state: GoalState) -> Float[Array, ""]:
         """For shaping: ten times the weighted mean of the margins, those to avoid with the other sign.
@@ -207,20 +214,35 @@ class RobotWithGoal(Robot[GoalState]):
         """What an episode that has come to its end in this state came to."""
         return outcome(self._objectives, state.tally, self.episode_limit)
 
+    def outcome_of(self, observations: Float[np.ndarray, "iterations observations"]) -> Outcome:
+        """What a whole episode came to, by what was observed in it.
+
+        Args:
+            observations: at its start, and after each iteration.
+        """
+        import jax
+
+        # All of one length, for one compilation: what comes after the end is not counted.
+        missing = self.episode_limit + 1 - len(observations)
+        came_to: Outcome = jax.device_get(_outcome_along(self)(np.pad(observations, ((0, missing), (0, 0)), "edge")))
+        return came_to
+
     def _seen(self, robot: Any) -> Seen:
-        seen = dict(zip(self._spec, self.robot.observe(robot), strict=True))
+        return self._seen_in(self.robot.observe(robot))
+
+    def _seen_in(self, observation: Float[Array, " observations"]) -> Seen:
+        seen = dict(zip(self._spec, observation, strict=True))
         return [margin_of(each.region, seen, self._spec) for each in self._objectives]
 
-    def _outside(self, seen: Seen, before: Sequence[Int[Array, ""] | int]) -> tuple[Int[Array, ""], ...]:
+    def _outside(self, seen: Seen, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
         import jax.numpy as jnp
 
         timed = [inside for each, (_, inside) in zip(self._objectives, seen, strict=True) if each.within is not None]
+        before = [jnp.int32(0)] * len(timed) if before is None else before
         return tuple(jnp.where(inside, 0, of + 1).astype(jnp.int32) for inside, of in zip(timed, before, strict=True))
 
     def _started(self, robot: Any) -> GoalState:
-        timed = [0 for each in self._objectives if each.within is not None]
-        outside = self._outside(self._seen(robot), timed) if timed else ()
-        return GoalState(robot, outside, nothing_yet(self._objectives))
+        return GoalState(robot, self._outside(self._seen(robot)), nothing_yet(self._objectives))
 
     def _largest(self, flags: Sequence[Bool[Array, ""]]) -> Float[Array, ""]:
         """The largest share of the objectives that a flag is up for."""
@@ -260,6 +282,22 @@ class RobotWithGoal(Robot[GoalState]):
         return bool(jnp.allclose(after(row, node, 0.0, -1.0), after(row, node, 1.0, 1.0), atol=1e-5))
 
 
+@lru_cache(maxsize=8)
+def _outcome_along(robot: RobotWithGoal) -> Callable[[Any], Outcome]:
+    """`RobotWithGoal.outcome_of` episodes of the limit, compiled."""
+    import jax
+
+    def along(observations: Float[Array, "iterations observations"]) -> Outcome:
+        def iteration(carry: Any, observation: Array) -> tuple[Any, None]:
+            return robot._judged(robot._seen_in(observation), *carry)[:2], None
+
+        begun = robot._outside(robot._seen_in(observations[0])), nothing_yet(robot._objectives)
+        (_, tally), _ = jax.lax.scan(iteration, begun, observations[1:])
+        return outcome(robot._objectives, tally, robot.episode_limit)
+
+    return jax.jit(along)
+
+
 def with_goal(robot: Robot[Any] | str, goal: Goal | str) -> RobotWithGoal:
     """A robot with a goal in place of its own task.
 
@@ -277,6 +315,11 @@ def with_goal(robot: Robot[Any] | str, goal: Goal | str) -> RobotWithGoal:
 def without_goal(robot: Robot[Any]) -> Robot[Any]:
     """The robot alone."""
     return robot.robot if isinstance(robot, RobotWithGoal) else robot
+
+
+def objectives_of(robot: Robot[Any]) -> tuple[str, ...]:
+    """The objectives of its goal as texts; none of a robot without one."""
+    return tuple(map(str, robot.goal.objectives)) if isinstance(robot, RobotWithGoal) else ()
 
 
 def body_and_goal(robot: Robot[Any]) -> dict[str, Any]:

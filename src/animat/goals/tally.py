@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from animat.goals.goal import Objective
@@ -51,6 +52,33 @@ class Outcome(NamedTuple):
     succeeded: Bool[Array, "*episodes"]
     satisfaction: Float[Array, "*episodes objectives"]
     margin: Float[Array, "*episodes"]
+
+    def means(self) -> dict[str, Any]:
+        """Over all episodes, as plain data."""
+        satisfaction = np.asarray(self.satisfaction)
+        return {
+            "success_share": float(np.mean(self.succeeded)),
+            "satisfaction_percent": satisfaction.reshape(-1, satisfaction.shape[-1]).mean(axis=0).tolist(),
+            "margin": float(np.mean(self.margin)),
+        }
+
+
+MEANS = ("success", "satisfied", "margin")
+"""What a table calls `Outcome.means`."""
+
+
+def cells_of(means: Mapping[str, Any]) -> list[str]:
+    """`Outcome.means` in a table; of no episodes empty."""
+    if not means:
+        return [""] * len(MEANS)
+    satisfied = f"{np.mean(means['satisfaction_percent']):.0f} %"
+    return [f"{100 * means['success_share']:.0f} %", satisfied, f"{means['margin']:+.2f}"]
+
+
+def told_satisfaction(objectives: Sequence[str], means: Mapping[str, Any]) -> str:
+    """How far each objective was met, in a line."""
+    of_each = zip(objectives, means["satisfaction_percent"], strict=True)
+    return f"satisfied: {'; '.join(f'{objective}: {percent:.0f} %' for objective, percent in of_each)}"
 
 
 def nothing_yet(objectives: Sequence[Objective]) -> Tally:
