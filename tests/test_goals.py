@@ -188,7 +188,11 @@ class Walker(Robot[Walk]):
 
 @pytest.mark.parametrize(
     "goal",
-    ["reach at above 8.5; avoid at below 1.5", "drive at in 5.5..7.5; avoid at above 8.5", "maximize at above 3"],
+    [
+        "reach at above 8.5; avoid at below 1.5",
+        "drive at in 5.5..7.5; avoid at above 8.5",
+        "maximize at above 3; drive at above 6",
+    ],
 )
 def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -> None:
     robot, learner, limit = with_goal(Walker(), goal), SAC(discount=0.95), 30
@@ -223,6 +227,7 @@ def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -
     plain, with_shaping = q_values(False), q_values(True)
     potential = np.asarray(jax.vmap(robot.potential)(states))
     np.testing.assert_allclose(with_shaping, plain - potential, atol=1e-4)
+    assert np.ptp(potential) > 1
     # What is best, or as good, stays so.
     best = plain >= plain.max(axis=1, keepdims=True) - 1e-4
     assert np.array_equal(best, with_shaping >= with_shaping.max(axis=1, keepdims=True) - 3e-4)

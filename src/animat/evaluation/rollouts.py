@@ -182,7 +182,7 @@ def roll_out(
     keys = jax.random.split(jax.random.key(seed), n_actors)
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
-    (returns, *counted, terminated), outcome = _roll_out(environment, episodes, simulator, actors, keys)
+    returns, *counted, terminated, outcome = _roll_out(environment, episodes, simulator, actors, keys)
     lengths, presented, passed = (np.asarray(each, np.int64) for each in counted)
     came_to = None if outcome is None else Outcome(*(np.asarray(each) for each in outcome))  # type: ignore[arg-type]
     return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed, came_to)
@@ -195,7 +195,7 @@ def _roll_out(
     simulator: NeuronSimulator | None,
     actors: Actor,
     keys: Key[Array, " actors"],
-) -> tuple[tuple[Array, ...], Outcome | None]:
+) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     readouts = () if simulator is None else simulator.percentiles.shape[:-1]
     n_drawn = environment.n_drawn
@@ -242,4 +242,4 @@ def _roll_out(
     )
     robot = environment.robot
     outcome = jax.vmap(jax.vmap(robot.outcome))(last.robot) if isinstance(robot, RobotWithGoal) else None
-    return tuple(counted), outcome
+    return *counted, outcome

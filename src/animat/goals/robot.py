@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 FAILED, REACHED = 100.0, 50.0
 """What an episode's end costs and is worth, where all weights are the same."""
 
-POTENTIAL = 10.0
-"""Of a robot that is a whole scale within all regions: what ten iterations may pay."""
+POTENTIAL = 3.0
+"""What a robot lacks that is a whole scale or more away from where it should be: three iterations' pay."""
 
 
 class GoalState(NamedTuple):
@@ -197,14 +197,20 @@ class RobotWithGoal(Robot[GoalState]):
         return outside, tally, reward, failed | reached
 
     def potential(self, state: GoalState) -> Float[Array, ""]:
-        """For shaping: ten times the weighted mean of the margins, those to avoid with the other sign.
+        """For shaping: the weighted mean of how far it is to what is to be reached or kept, 0 in it.
 
-        potential = 10 sum (w_i m_i) / sum w,    -m_i for regions to avoid
+            potential = POTENTIAL sum (w_i min(m_i, 0)) / sum w,    over what is to be reached or driven to
+
+        What else is wanted pays on the way.
         """
-        signs = (-1.0 if each.kind == "avoid" else 1.0 for each in self._objectives)
-        margins = (margin for margin, _ in self._seen(state.robot))
-        of_each = [s * v * m for s, v, m in zip(signs, self._shares, margins, strict=True)]
-        return POTENTIAL / len(of_each) * sum(of_each[1:], of_each[0])
+        import jax.numpy as jnp
+
+        found: Array = jnp.float32(0.0)
+        seen = self._seen(state.robot)
+        for each, share, (margin, _) in zip(self._objectives, self._shares, seen, strict=True):
+            if each.kind in ("reach", "drive"):
+                found += POTENTIAL * share / len(seen) * jnp.minimum(margin, 0.0)
+        return found
 
     def succeeded(self, state: GoalState) -> Bool[Array, ""]:
         """Whether an episode that has come to its end in this state succeeded."""
