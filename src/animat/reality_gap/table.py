@@ -194,6 +194,7 @@ class RealityGap:
             "folder": str(self.session.folder),
             "budget": self.account.to_dict(),
             "findings": [finding.to_dict() for finding in self.findings],
+            **({"objectives": list(objectives)} if (objectives := objectives_of(self.loop.robot)) else {}),
         }
 
     def to_text(self) -> str:
