@@ -43,6 +43,6 @@ def test_the_published_tasks_are_goals_of_their_robots(name: str) -> None:
 
 
 def test_its_numbers_are_those_of_the_code() -> None:
-    assert f"-({FAILED:g} + c `episode_limit`)" in PAGE
+    assert f"| -{FAILED:g} n w_i / Σw - c `episode_limit`" in PAGE
     assert f"| {REACHED:g} n w_i" in PAGE
     assert f"potential = {POTENTIAL:g} Σ" in PAGE

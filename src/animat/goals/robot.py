@@ -4,8 +4,8 @@ An episode ends as failed in an iteration that enters a region to avoid, or in w
 in one that enters a region to reach. With w the weights, n of them, and c = 1 where there is anything to reach and 0
 where there is not, the reward of an iteration is
 
-    failed:     -(100 + c episode_limit) n w_i / sum w      of the objective i that failed, the largest of several
-    succeeded:  50 n w_i / sum w                            of the objective i that was reached, the largest of several
+    failed:     -100 n w_i / sum w - c episode_limit    of the objective i that failed, the largest of several
+    succeeded:  50 n w_i / sum w                        of the objective i that was reached, the largest of several
     else:       sum (w_i r_i) / sum w - c
 
     r_i:  avoid 1,  reach 0,  drive 1 within its region and 0 outside,  minimize and maximize (1 + m_i) / 2
@@ -73,7 +73,7 @@ class RobotWithGoal(Robot[GoalState]):
 
     Raises:
         InvalidArgument: for a robot that is stepped on the host or has a goal already, and for a goal of other
-            quantities or units than the robot observes, or of regions that it cannot come to.
+            quantities or units than the robot observes, or of regions in which nothing is.
     """
 
     robot: Robot[Any]
@@ -90,6 +90,8 @@ class RobotWithGoal(Robot[GoalState]):
             )
         if not isinstance(self.goal, Goal):
             raise InvalidArgument(f"goal: expected a Goal, or a text for with_goal, got {shown(self.goal)}")
+        if len(self._spec) != len(robot.observation_spec):
+            raise InvalidArgument(f"goal: expected quantities of different names, got two of one name of {robot.name}")
         _ = self._objectives
         # Of other robots they are the class's own.
         for name in ("name", "n_commands", "noise_size", "paper_iterations", "baseline_commands", "episode_limit"):
@@ -129,10 +131,6 @@ class RobotWithGoal(Robot[GoalState]):
         return float(self.goal.can_be_reached)
 
     @property
-    def _failure(self) -> float:
-        return FAILED + self._cost * self.episode_limit
-
-    @property
     def observation_spec(self) -> tuple[Quantity, ...]:
         """What the robot observes, without bounds: they may be those of episodes that its own task ends."""
         return tuple(self._spec.values())
@@ -144,7 +142,8 @@ class RobotWithGoal(Robot[GoalState]):
         worst = max((share for each, share in told if each.can_fail), default=0.0)
         best = max((share for each, share in told if each.kind == "reach"), default=0.0)
         limit = float(self.episode_limit)
-        return -self._cost * limit - self._failure * worst, best * REACHED if best else limit
+        lowest = -self._cost * limit - (FAILED * worst + self._cost * limit if worst else 0.0)
+        return lowest, best * REACHED if best else limit
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and where episodes start in a region that ends them."""
@@ -192,7 +191,8 @@ class RobotWithGoal(Robot[GoalState]):
             running += share / len(seen) * worth
         failed, reached = reduce(jnp.logical_or, failures), reduce(jnp.logical_or, reaches)
         reward = jnp.where(reached, REACHED * self._largest(reaches), running - self._cost)
-        reward = jnp.where(failed, -self._failure * self._largest(failures), reward).astype(jnp.float32)
+        failure = FAILED * self._largest(failures) + self._cost * self.episode_limit
+        reward = jnp.where(failed, -failure, reward).astype(jnp.float32)
         tally = counted(self._objectives, tally, seen, failed, reached & ~failed)
         return outside, tally, reward, failed | reached
 
