@@ -36,6 +36,7 @@ STORY = (
     "neurons",
     "coding",
     "robots",
+    "goals",
     "environment",
     "wrappers",
     "training",

@@ -22,6 +22,7 @@ from scipy import stats
 from animat.cli import main
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import AnimatError, InvalidArgument
+from animat.goals.robot import with_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots import ROBOTS, Cartpole, SwingUp, robot_named
 from animat.robots.base import Quantity, Robot
@@ -29,7 +30,7 @@ from animat.training.assessment import assess
 from animat.training.course import Course, programs_with_ranges, rows_of
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group, train_group
-from animat.training.lessons import Lesson, read_lessons
+from animat.training.lessons import Lesson, expect_lessons, read_lessons
 from animat.training.networks import Layer
 from animat.training.policy import Policy, load_policies
 from animat.training.specification import CHUNKS, Training
@@ -459,3 +460,28 @@ def test_a_course_that_is_killed_goes_on_to_the_same_bits(tmp_path: Path) -> Non
         assert bits(folder / part) == bits(tmp_path / "undisturbed" / part)
     table = "assessments.csv"
     assert (folder / table).read_bytes() == (tmp_path / "undisturbed" / table).read_bytes()
+
+
+def test_a_robot_with_a_goal_is_varied_as_its_body_is() -> None:
+    goal = "avoid pole_angle outside -12..12 deg; drive cart_position in -0.1..0.1 m within 20"
+    lesson = Lesson(parameters={"pole_length_m": (0.3, 0.5)}, starts={"position_m": (-0.4, 0.4)}, success=0.8)
+    bare, aimed = (varied(lesson, robot) for robot in (Cartpole(), with_goal(Cartpole(), goal)))
+    expect_lessons([lesson], with_goal(Cartpole(), goal), draws_recordings=False)
+    keys = jax.random.split(jax.random.key(3), 50)
+    plain, with_it = (jax.vmap(each.reset)(keys) for each in (bare, aimed))
+    for of_plain, of_body in zip(plain.robot, with_it.robot.robot, strict=True):
+        np.testing.assert_array_equal(of_plain, of_body)
+    # A start outside of what is driven to counts.
+    far = np.abs(np.asarray(with_it.robot.robot.position_m)) > 0.1
+    assert 0 < far.sum() < 50
+    np.testing.assert_array_equal(with_it.robot.outside[0], far)
+    noise = jax.random.uniform(jax.random.key(4), (50, bare.noise_size))
+    action = jnp.linspace(-1.0, 1.0, 50)
+    after, after_with = (
+        jax.vmap(each.advance, (0, 0, 0, None))(noise, state, action, None)
+        for each, state in ((bare, plain), (aimed, with_it))
+    )
+    for of_plain, of_body in zip(after.robot, after_with.robot.robot, strict=True):
+        np.testing.assert_array_equal(of_plain, of_body)
+    with pytest.raises(InvalidArgument, match="expected parameters of cartpole, got 'goal'"):
+        expect_lessons([Lesson(parameters={"goal": (0.0, 1.0)})], with_goal(Cartpole(), goal), draws_recordings=False)

@@ -18,8 +18,8 @@ from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
-from animat.training.networks import Layer, Network, forward, squashed_normal
-from animat.training.sac import Batch, Trained, continuous_losses, discrete_losses, draw_action
+from animat.training.networks import Layer, Network, draw_action, forward, squashed_normal
+from animat.training.sac import Batch, Trained, continuous_losses, discrete_losses
 from animat.training.settings import SAC
 from two_wheels import Wheels
 

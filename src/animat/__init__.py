@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from animat.evaluation.table import Evaluation as Evaluation
     from animat.evaluation.table import evaluate as evaluate
     from animat.execution.training import train as train
+    from animat.goals.robot import with_goal as with_goal
     from animat.neurons.memory import fit_memory as fit_memory
     from animat.neurons.simulator import NeuronSimulator as NeuronSimulator
     from animat.neurons.simulator import fit_empirical as fit_empirical
@@ -127,6 +128,7 @@ _WHERE = {
         "register_robot",
         "robot_named",
     ),
+    "goals.robot": ("with_goal",),
     "environment": ("Animat", "WithoutNeurons"),
     "wrappers": ("EpisodeLimit", "ShuffledDelivery", "NeuralObservation"),
     "training.settings": ("SAC",),

@@ -31,6 +31,8 @@ class Live(Stimulating):
     mapping: str = "9-thresholds"
     """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
     my_package.mappings:Steep"""
+    goal: str | None = None
+    """What is wanted of the robot in place of its own task, as --goal of animat train"""
     policies: int = 4
     """How many policies, each from its own random numbers"""
     order: Literal["mixed", "blocked"] = "mixed"
@@ -72,6 +74,7 @@ class Live(Stimulating):
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.cultures.kinds import culture_of, pulse_for
+        from animat.goals.robot import with_goal
         from animat.live.plan import Timetable, check_plan
         from animat.live.shadowing import live
         from animat.progress import Bar
@@ -91,6 +94,7 @@ class Live(Stimulating):
         default_speed = 30.0 if simulated else 1.0
         timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
         robot = robot_named(self.robot)
+        robot = robot if self.goal is None else with_goal(robot, self.goal)
         training = Training(
             robot,
             mapping_named(self.mapping),

@@ -113,6 +113,7 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
     """
     from animat.coding.checking import check_mapping
     from animat.coding.mapping import REGISTRY as MAPPINGS
+    from animat.goals.robot import without_goal
     from animat.registry import is_ours
     from animat.robots.checking import check_robot
     from animat.robots.registry import REGISTRY
@@ -127,7 +128,7 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
         got = "none" if policy.mapping is None else policy.mapping.name
         if asked not in (None, got):
             raise Mismatch(f"{name}: expected a policy with the mapping {asked}, got one with {got}")
-        if not is_ours(policy.robot):
+        if not is_ours(without_goal(policy.robot)):
             check_robot(policy.robot)
         if policy.mapping is not None and not is_ours(policy.mapping):
             check_mapping(policy.mapping)

@@ -53,6 +53,9 @@ class Train(Fitting):
     """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     delivery: Literal["chosen", "shuffled"] = "chosen"
     """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
+    goal: str | None = None
+    """What is wanted of the robot in place of its own task: "avoid pole_angle outside -12..12 deg; drive cart_position
+    in -0.1..0.1 m within 20"; also reach, minimize, maximize"""
     parameters: tuple[str, ...] = ()
     """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
     sac: tuple[str, ...] = ()
@@ -73,6 +76,7 @@ class Train(Fitting):
         """Train."""
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
+        from animat.goals.robot import with_goal
         from animat.progress import Bar
         from animat.responses.readouts import ALL, count_readouts, read_readouts
         from animat.robots.registry import robot_named
@@ -85,6 +89,7 @@ class Train(Fitting):
         if not self.out.is_dir():
             expect_writable(self.out)
         robot = robot_named(self.robot, **read_numbers("--parameters", self.parameters))
+        robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
         usual_readouts = "all" if mapping == "none" else _READOUTS.get(robot.n_commands, "all")

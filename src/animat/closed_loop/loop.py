@@ -15,12 +15,12 @@ from animat.coding.encoder import Encoder
 from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
+from animat.goals.robot import body_and_goal
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
-from animat.robots.registry import robot_to_dict
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
@@ -215,7 +215,7 @@ class Loop:
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain["adaptive"] = plain.pop("adaptive_from") is not None
         return plain | {
-            "robot": robot_to_dict(self.robot),
+            **body_and_goal(self.robot),
             "mapping": mapping_to_data(self.mapping),
             "conditions": [condition.label for condition in self.conditions],
             "percentiles": self.percentiles.tolist(),

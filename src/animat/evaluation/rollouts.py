@@ -19,12 +19,13 @@ from animat.compilation import FAST_TO_COMPILE
 from animat.environment import Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.host_rollouts import roll_out_on_host
+from animat.goals.robot import RobotWithGoal
+from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.robots.host import HostRobot
-from animat.training.networks import Layer, Network
+from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
 from animat.training.policy import Policy
-from animat.training.sac import as_commands, draw_action, likeliest_action
 
 Seen = Float[Array, "episodes observations"]
 Uniforms = Float[Array, "episodes drawn"]
@@ -110,6 +111,8 @@ class Episodes:
             conditions without neurons.
         passed: how often the response was P50 or more, the same shape; of several readouts each on its own, shape
             (actors, conditions, readouts).
+        outcome: what each came to, of a robot with a goal; shapes (actors, episodes), and with a last axis of
+            objectives.
     """
 
     __repr__ = briefly
@@ -119,6 +122,7 @@ class Episodes:
     terminated: Bool[np.ndarray, "actors episodes"]
     presented: Int64[np.ndarray, "actors conditions"]
     passed: Int64[np.ndarray, "actors conditions *readouts"]
+    outcome: Outcome | None = None
 
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
@@ -189,9 +193,10 @@ def roll_out(
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
-    returns, *counted, terminated = _roll_out(environment, episodes, simulator, actors, keys)
+    returns, *counted, terminated, outcome = _roll_out(environment, episodes, simulator, actors, keys)
     lengths, presented, passed = (np.asarray(each, np.int64) for each in counted)
-    return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed)
+    came_to = None if outcome is None else Outcome(*(np.asarray(each) for each in outcome))  # type: ignore[arg-type]
+    return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed, came_to)
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=FAST_TO_COMPILE)
@@ -201,7 +206,7 @@ def _roll_out(
     simulator: NeuronSimulator | None,
     actors: Actor,
     keys: Key[Array, " actors"],
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     readouts = () if simulator is None else simulator.percentiles.shape[:-1]
     n_drawn = environment.n_drawn
@@ -241,9 +246,11 @@ def _roll_out(
     # The loop is outside of the `vmap`, and ends with the last episode: controls fail long before the limit.
     first, of_iteration = jax.vmap(begin)(keys)
     each = jax.vmap(iteration)
-    _, (_, _, *counted) = jax.lax.while_loop(
+    _, (last, _, *counted) = jax.lax.while_loop(
         lambda at: (at[0] < environment.robot.episode_limit) & jnp.any(at[1][1]),
         lambda at: (at[0] + 1, each(at[1], actors, of_iteration[:, at[0]])),
         (0, first),
     )
-    return tuple(counted)
+    robot = environment.robot
+    outcome = jax.vmap(jax.vmap(robot.outcome))(last.robot) if isinstance(robot, RobotWithGoal) else None
+    return *counted, outcome

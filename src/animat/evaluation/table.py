@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,16 +20,16 @@ from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
+from animat.goals.robot import objectives_of
+from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
-from animat.responses.condition import other_stimulus
 from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
 from animat.robots.host import HostRobot
-from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation, ShuffledDelivery, unwrapped
 
@@ -69,7 +69,13 @@ class Row:
             "mean_length": float(self.episodes.lengths.mean()),
             "terminated_share": float(self.episodes.terminated.mean()),
             "mean_returns": means.tolist(),
+            **self.met,
         }
+
+    @property
+    def met(self) -> dict[str, Any]:
+        """How the goal was met (`animat.goals.tally.Outcome.means`); empty for a robot without one."""
+        return {} if self.episodes.outcome is None else self.episodes.outcome.means()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +93,7 @@ class Evaluation:
         context: how much of that the best coupling leaves undone; None without an optimum of all conditions.
         no_optimum: why it is not known, though it was asked for.
         fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
+        objectives: of the robot's goal, as texts; none of a robot without one.
     """
 
     __repr__ = briefly
@@ -101,6 +108,7 @@ class Evaluation:
     no_optimum: str | None = None
     fixed_from_min: float | None = None
     context: ContextGap | None = None
+    objectives: tuple[str, ...] = ()
 
     @property
     def context_score(self) -> Interval | None:
@@ -154,6 +162,7 @@ class Evaluation:
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
             "findings": [finding.to_dict() for finding in self.findings],
+            **({"objectives": list(self.objectives)} if self.objectives else {}),
         }
 
     def to_text(self) -> str:
@@ -163,20 +172,24 @@ class Evaluation:
         if self.fixed_from_min is not None:
             on += f", percentiles fixed from {self.fixed_from_min:g} min"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
-        head = ["", "mean return", "s.e.", "iterations", "ended early", "score", ""]
+        goal = MEANS if self.objectives else ()
+        head = ["", "mean return", "s.e.", "iterations", "ended early", *goal, "score", ""]
         cells = []
         for row in self.rows:
             told, score = row.to_dict(), self.score(row)
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
             numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
-            ended = f"{100 * told['terminated_share']:.0f} %"
-            cells.append([row.name, *numbers, ended, "" if score is None else f"{score:.2f}", row.meaning])
+            numbers.append(f"{100 * told['terminated_share']:.0f} %")
+            numbers += cells_of(row.met) if goal else []
+            cells.append([row.name, *numbers, "" if score is None else f"{score:.2f}", row.meaning])
         if self.optimum is None:
             for line in (head, *cells):
                 del line[-2]
         lines = [f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each", *lined_up(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
+        if self.objectives:
+            lines.append(f"  {told_satisfaction(self.objectives, self.rows[0].met)}")
         if self.verdict is not None:
             lines.append(f"  {self.verdict}")
         if self.not_met:
@@ -258,7 +271,7 @@ def evaluate(
             raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
         row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         minute = float(timeline.start_min[row])
-        findings = (*_check(first, timeline), *_not_of_a_loop(first, timeline, minute))
+        findings = (*transfer.other_timeline(first, timeline), *transfer.not_of_a_loop(first, timeline, minute))
         fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
         environment = Animat(body, first.mapping, len(timeline.conditions))
@@ -315,6 +328,7 @@ def evaluate(
         no_optimum,
         fixed_from_min,
         context,
+        objectives_of(body),
     )
 
 
@@ -336,55 +350,6 @@ def _optimum(
     case = Counted.of(environment, timeline, minute, are_fixed=are_fixed)
     best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed)
     return case.known(best, resolution=resolution, seed=seed)
-
-
-def _check(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
-    if policy.conditions != timeline.conditions:
-        raise Mismatch(
-            f"conditions: expected {', '.join(c.label for c in policy.conditions)}, which the policies pick from, got "
-            f"recordings with {', '.join(c.label for c in timeline.conditions)}"
-        )
-    if others := other_stimulus(policy.conditions, timeline.conditions):
-        raise Mismatch(f"conditions: {others} in the recordings")
-    if policy.readouts != timeline.readouts:
-        raise Mismatch(
-            f"readouts: expected {', '.join(policy.readouts.names)}, of the electrodes that the policies were trained "
-            f"on, got {', '.join(timeline.readouts.names)}, of others"
-        )
-    found = []
-    if policy.window_ms != timeline.window_ms:
-        found.append(
-            Finding(
-                "other-window",
-                "warning",
-                f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}",
-            )
-        )
-    found += transfer.other_simulator(policy.fitted, timeline.fitted)
-    first_min = next(iter(policy.recorded_at_min), None)
-    if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
-        found.append(
-            Finding(
-                "other-percentiles",
-                "warning",
-                f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
-                f"of these: here they are fixed from {timeline.start_min[0]:g} min",
-            )
-        )
-    return tuple(found)
-
-
-def _not_of_a_loop(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:
-    """Why returns on the simulator of a minute are not those of a closed loop on the culture."""
-    recorded = policy.presentation
-    yield from transfer.other_presentation(recorded, Presentation("mixed", 1 if recorded is None else recorded.pulses))
-    yield from transfer.other_calibration(recorded, timeline.presentation)
-    yield from transfer.old_calibration(minute, float(timeline.start_min[-1]))
-    has_memory = timeline.simulators.has_memory
-    yield from transfer.no_memory(timeline.findings_at(minute), timeline.presentation, has_memory=has_memory)
-    trained_until = policy.trained_until_min(float(timeline.start_min[0]))
-    if trained_until is not None:
-        yield from transfer.other_recording(float(timeline.start_min[timeline.row_at(trained_until)]), minute)
 
 
 def _action_labels(policy: Policy) -> list[str]:

@@ -8,8 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from animat.errors import Mismatch
+from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
+from animat.responses.condition import other_stimulus
 from animat.stimulation.protocol import Presentation
+from animat.training.policy import Policy
 
 UNKNOWN = "unknown-presentation"
 
@@ -114,3 +118,57 @@ def other_recording(trained_until_min: float, evaluated_at_min: float) -> Iterat
 NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", "no-memory", "other-recording")
 """Of the findings above that say why a culture would answer otherwise. Another simulator is not among them: which one
 predicts is asked for, and a loop has none."""
+
+
+def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
+    """Where simulators are otherwise than those that a policy was trained on.
+
+    Raises:
+        Mismatch: for other conditions, stimuli or readouts: it cannot act through them.
+    """
+    if policy.conditions != timeline.conditions:
+        raise Mismatch(
+            f"conditions: expected {', '.join(c.label for c in policy.conditions)}, which the policies pick from, got "
+            f"recordings with {', '.join(c.label for c in timeline.conditions)}"
+        )
+    if others := other_stimulus(policy.conditions, timeline.conditions):
+        raise Mismatch(f"conditions: {others} in the recordings")
+    if policy.readouts != timeline.readouts:
+        raise Mismatch(
+            f"readouts: expected {', '.join(policy.readouts.names)}, of the electrodes that the policies were trained "
+            f"on, got {', '.join(timeline.readouts.names)}, of others"
+        )
+    found = []
+    if policy.window_ms != timeline.window_ms:
+        found.append(
+            Finding(
+                "other-window",
+                "warning",
+                f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}",
+            )
+        )
+    found += other_simulator(policy.fitted, timeline.fitted)
+    first_min = next(iter(policy.recorded_at_min), None)
+    if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
+        found.append(
+            Finding(
+                "other-percentiles",
+                "warning",
+                f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
+                f"of these: here they are fixed from {timeline.start_min[0]:g} min",
+            )
+        )
+    return tuple(found)
+
+
+def not_of_a_loop(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:
+    """Why returns on the simulator of a minute are not those of a closed loop on the culture."""
+    recorded = policy.presentation
+    yield from other_presentation(recorded, Presentation("mixed", 1 if recorded is None else recorded.pulses))
+    yield from other_calibration(recorded, timeline.presentation)
+    yield from old_calibration(minute, float(timeline.start_min[-1]))
+    has_memory = timeline.simulators.has_memory
+    yield from no_memory(timeline.findings_at(minute), timeline.presentation, has_memory=has_memory)
+    trained_until = policy.trained_until_min(float(timeline.start_min[0]))
+    if trained_until is not None:
+        yield from other_recording(float(timeline.start_min[timeline.row_at(trained_until)]), minute)

@@ -27,10 +27,12 @@ from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
 from animat.evaluation.verdict import beside
+from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
 from animat.reality_gap.answered import answered
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.goals import outcomes
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import (
     BOOTSTRAPS_ON_HOST,
@@ -203,7 +205,7 @@ def run_policies(
             best = _wait_for(optimum, progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
-    rows = _rows(agents, tuple(policies), predicted, session)
+    rows = _rows(agents, tuple(policies), predicted, session, outcomes(loop.robot, session))
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
@@ -300,7 +302,11 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
 
 
 def _rows(
-    agents: Sequence[Agent], names: tuple[str, ...], predicted: Mapping[str, Predicted], session: Session
+    agents: Sequence[Agent],
+    names: tuple[str, ...],
+    predicted: Mapping[str, Predicted],
+    session: Session,
+    came_to: Mapping[int, Outcome],
 ) -> tuple[Row, ...]:
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         episodes = [episode for episode in session.episodes if episode.agent in of]
@@ -308,6 +314,7 @@ def _rows(
         actions = max(1, sum(each.actions for each in acted))
         trials = max(1, sum(each.trials for each in acted))
         of_them = together([predicted[each] for each in of])
+        met = [came_to[episode.number] for episode in episodes if episode.number in came_to]
         return Row(
             name=name,
             meaning=meaning,
@@ -318,6 +325,7 @@ def _rows(
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,
             bursts=sum(each.bursts for each in acted) / trials,
             late=sum(each.late for each in acted) / trials,
+            met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +14,8 @@ from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.evaluation.verdict import Beside, Verdict
+from animat.goals.robot import objectives_of
+from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
@@ -39,6 +41,8 @@ class Row:
         bursts: share of responses that were.
         late: share of trials that came late.
         beside: the policies' measured returns beside these; None for the policies, and where either has none.
+        met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without one,
+            and where no episode came to its end.
     """
 
     name: str
@@ -51,6 +55,7 @@ class Row:
     bursts: float
     late: float
     beside: Beside | None = None
+    met: dict[str, Any] = field(default_factory=dict)
 
     @property
     def prediction(self) -> Interval:
@@ -97,6 +102,7 @@ class Row:
             "late": self.late,
             "p": None if self.beside is None else self.beside.p,
             "wins": None if self.beside is None else self.beside.wins,
+            **self.met,
         }
 
 
@@ -188,11 +194,12 @@ class RealityGap:
             "folder": str(self.session.folder),
             "budget": self.account.to_dict(),
             "findings": [finding.to_dict() for finding in self.findings],
+            **({"objectives": list(objectives)} if (objectives := objectives_of(self.loop.robot)) else {}),
         }
 
     def to_text(self) -> str:
         """A table for a terminal."""
-        cells = []
+        cells, objectives = [], objectives_of(self.loop.robot)
         for row in self.rows:
             told, prediction = row.to_dict(), row.prediction
             anew = f"{prediction.low:.1f} to {prediction.high:.1f}"
@@ -201,15 +208,33 @@ class RealityGap:
                 between = "unknown" if gap["low"] is None else f"{gap['low']:+.1f} to {gap['high']:+.1f}"
                 measured = [f"{told['measured']:.1f}", f"{gap['value']:+.1f}", between]
             p = "" if row.beside is None else f"{row.beside.p:.2g}"
-            counts = [str(len(row.measured)), f"{row.pulses_per_action:.1f}"]
+            counts = [
+                *(cells_of(row.met) if objectives else []),
+                str(len(row.measured)),
+                f"{row.pulses_per_action:.1f}",
+            ]
             cells.append([row.name, f"{told['predicted']:.1f}", anew, *measured, *counts, p, row.meaning])
         interval = "95 % interval"
-        head = ["", "predicted", interval, "measured", "gap", interval, "episodes", "pulses/action", "p", ""]
+        head = [
+            "",
+            "predicted",
+            interval,
+            "measured",
+            "gap",
+            interval,
+            *(MEANS if objectives else ()),
+            "episodes",
+            "pulses/action",
+            "p",
+            "",
+        ]
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
             f"{self.calibrated_at_min:g} min",
             *lined_up(head, cells),
         ]
+        if self.rows[0].met:
+            lines.append(f"  {told_satisfaction(objectives, self.rows[0].met)}")
         if self.optimum is not None:
             share = ""
             if self.gap_share is not None:

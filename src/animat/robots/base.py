@@ -77,6 +77,8 @@ class Robot(abc.ABC, Generic[State]):
         draw(observation, command, earlier, height_px) -> picture      uint8, shape (height, width, 3)
         draw_paths(axes, paths)                                        whole episodes on Matplotlib's axes
         value_grid() -> animat.robots.grid.Grid                        for the optimal return
+        potential(state) -> float                                      shapes what is learned from, not what is best
+        succeeded(state) -> bool                                       of the last state of an episode
     """
 
     name: ClassVar[str]

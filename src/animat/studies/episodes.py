@@ -27,7 +27,11 @@ COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "
 - episode: from 0.
 - return, iterations: of the episode.
 - ended: `terminated` by itself, or `truncated` at the episode limit.
+
+And of robots with a goal (`animat.goals.tally.Outcome`): `SUCCEEDED`, 1 or 0; `MARGIN`; and of each objective, from 0,
+the `SATISFACTION` in %.
 """
+SUCCEEDED, MARGIN, SATISFACTION = "succeeded", "margin", "satisfaction_"
 POLICY = "policy"
 RANDOM = "random"
 FORMER_AGENTS = {"made by hand": "heuristic"}
@@ -55,7 +59,13 @@ def tabulated(
         "iterations": ran.lengths.ravel(),
         "ended": np.where(ran.terminated, "terminated", "truncated").ravel(),
     }
-    return DataFrame(told, columns=list(COLUMNS))
+    if (outcome := ran.outcome) is not None:
+        told |= {SUCCEEDED: outcome.succeeded.astype(float).ravel(), MARGIN: outcome.margin.ravel()}
+        told |= {
+            f"{SATISFACTION}{i}": of.ravel()
+            for i, of in enumerate(np.moveaxis(np.asarray(outcome.satisfaction), -1, 0))
+        }
+    return DataFrame(told)
 
 
 def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
@@ -73,7 +83,9 @@ def read_episodes(paths: Iterable[Path]) -> DataFrame:
     """The table, put together from its files; raises InvalidFile if one cannot be read."""
     import pandas as pd
 
-    parts = [pd.DataFrame(read_arrays(path), columns=list(COLUMNS)) for path in paths]
+    files = [read_arrays(path) for path in paths]
+    of_goals = [name for arrays in files for name in arrays if name.startswith((SUCCEEDED, MARGIN, SATISFACTION))]
+    parts = [pd.DataFrame(arrays, columns=list(dict.fromkeys((*COLUMNS, *of_goals)))) for arrays in files]
     table = pd.concat(parts, ignore_index=True).replace({"agent": FORMER_AGENTS})
     table["arm"] = table["arm"].str.replace(*FORMER_MAPPING, regex=False)
     return table

@@ -18,6 +18,7 @@ from animat.stimulation.protocol import Presentation
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
+from animat.studies.goals import goals_shown
 from animat.studies.heuristic import not_outperforming
 from animat.studies.learned import beside_the_optimum, learned_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
@@ -136,6 +137,8 @@ def _scores(study: Study, results: Results) -> Section:
             "this, as they are trained on several."
         )
         tables.insert(0, beside_the_optimum(study, learned))
+    if results.goals:
+        tables.append(goals_shown(results.goals))
     return Section("Scores", tuple(paragraphs), tables=tuple(tables))
 
 

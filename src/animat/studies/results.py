@@ -144,6 +144,27 @@ class BesideHeuristic:
 
 
 @dataclass(frozen=True)
+class ObjectiveMet:
+    """How far episodes of an arm's policies or of a control met an objective of a robot's goal, and all of the goal.
+
+    Attributes:
+        success_share, margin: of the goal, the same for all of its objectives.
+        objective: as a text.
+        satisfaction: of the objective, %.
+    """
+
+    robot: str
+    arm: str
+    agent: str
+    at_min: float
+    episodes: int
+    success_share: float
+    margin: float
+    objective: str
+    satisfaction: float
+
+
+@dataclass(frozen=True)
 class Results:
     """All that was found."""
 
@@ -153,6 +174,7 @@ class Results:
     heuristic: tuple[BesideHeuristic, ...]
     optima: tuple[StudyOptimum, ...]
     findings: tuple[Finding, ...]
+    goals: tuple[ObjectiveMet, ...] = ()
 
 
 def write_typed(path: Path, value: Any) -> Path:

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, Strict, ValidatorFunctionWrapHandler
 
 from animat.coding.mapping import Thresholds, mapping_named
 from animat.errors import InvalidArgument, shown
+from animat.goals.robot import with_goal
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.registry import is_ours, place_of
 from animat.robots.base import MOST_AT_ONCE, Robot
@@ -95,6 +96,7 @@ class RobotSpec:
         iterations: of training, for each policy; None: the paper's.
         parameters: in place of its defaults, such as `pole_mass_kg`.
         optimum_resolution: of its optimal return, in place of the study's.
+        goal: what is wanted of it in place of its own task (`animat.goals.text`); None: its own task.
     """
 
     name: Name
@@ -102,6 +104,7 @@ class RobotSpec:
     optimum_resolution: Resolution | None = None
     parameters: Numbers = Field(default_factory=dict)
     kind: str = ""
+    goal: str | None = None
 
     def __post_init__(self) -> None:
         key = "kind" if self.kind else "name"
@@ -110,7 +113,7 @@ class RobotSpec:
         except InvalidArgument as error:
             raise InvalidArgument(f"{key}: {error}") from error
         try:
-            robot = self.robot()
+            robot = robot_named(self.kind or self.name, **self.parameters)
         except InvalidArgument as error:
             raise InvalidArgument(f"parameters: {error}") from error
         if self.name == "culture":
@@ -118,13 +121,16 @@ class RobotSpec:
         if robot.n_commands > 1:
             told = f"expected a robot of one command, as a study reads all channels as one, got {robot.n_commands}"
             raise InvalidArgument(f"{key}: {told} of {robot.name}: train it with animat train --readouts")
+        if self.goal is not None:
+            with_goal(robot, self.goal)
         if not is_ours(robot):
             # Workers know it by that.
             object.__setattr__(self, "kind", place_of(kind))
 
     def robot(self) -> Robot[Any]:
-        """The robot itself."""
-        return robot_named(self.kind or self.name, **self.parameters)
+        """The robot itself, with its goal."""
+        robot = robot_named(self.kind or self.name, **self.parameters)
+        return robot if self.goal is None else with_goal(robot, self.goal)
 
     @property
     def trained_for(self) -> int:
@@ -348,7 +354,12 @@ class Study:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return asdict(self)
+        plain = asdict(self)
+        for robot in plain["robots"]:
+            if robot["goal"] is None:
+                # Studies of before have none, and go on.
+                del robot["goal"]
+        return plain
 
 
 def _expect_unlike(what: str, names: Sequence[str]) -> None:

@@ -18,6 +18,7 @@ from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.studies.episodes import POLICY, RANDOM, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
+from animat.studies.goals import goals_met
 from animat.studies.heuristic import beside_heuristic
 from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
 from animat.studies.paper import PRINTED
@@ -26,6 +27,7 @@ from animat.studies.results import (
     BesideHeuristic,
     ComparedReturns,
     ControlReturns,
+    ObjectiveMet,
     Results,
     Score,
     StudyOptimum,
@@ -76,6 +78,7 @@ class Tabulate(StudyTask):
             heuristic=tuple(row for spec in study.robots for row in beside_heuristic(study, table, spec)),
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
+            goals=tuple(goals_met(study, table)),
         )
         files = [write_typed(results_file(folder), results)]
         for name, kind in (
@@ -86,6 +89,8 @@ class Tabulate(StudyTask):
             ("optima", StudyOptimum),
         ):
             files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
+        if results.goals:
+            files.append(write_records(table_file(folder, "goals"), ObjectiveMet, results.goals))
         told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
         files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))

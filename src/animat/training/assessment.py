@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from animat.neurons.simulator import NeuronSimulator
-from animat.training.networks import Network
-from animat.training.sac import likeliest_action
+from animat.training.networks import Network, likeliest_action
 from animat.training.varied import Varied
 from animat.wrappers import EpisodeLimit
 

@@ -17,6 +17,7 @@ from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.differences import description_in, fingerprint_of, first_difference, of_another
 from animat.errors import InvalidFile, Mismatch
+from animat.goals.robot import without_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
@@ -53,7 +54,7 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
     if training.is_varied:
         expect_varied(training.robot, varying_in(training.lessons, recordings=False))
     if is_saved:
-        ROBOTS.expect_loadable(training.robot, in_workers=True)
+        ROBOTS.expect_loadable(without_goal(training.robot), in_workers=True)
         if training.mapping is not None:
             MAPPINGS.expect_loadable(training.mapping, in_workers=True)
 

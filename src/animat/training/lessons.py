@@ -13,6 +13,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from animat.errors import InvalidArgument, InvalidFile, did_you_mean
+from animat.goals.robot import without_goal
 from animat.plain_file import read_toml
 from animat.records import Number, read_record, record
 from animat.robots.base import Robot
@@ -127,8 +128,9 @@ def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_record
             raise InvalidArgument(f"{where}: {error}") from error
 
 
-def _expect_parameters(lesson: Lesson, robot: Any) -> None:
-    numbers = {f.name: getattr(robot, f.name) for f in dataclasses.fields(robot)}
+def _expect_parameters(lesson: Lesson, robot: Robot[Any]) -> None:
+    body: Any = without_goal(robot)
+    numbers = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}
     if len(lesson.parameters) > MOST_VARIED:
         raise InvalidArgument(f"parameters: expected at most {MOST_VARIED}, got {len(lesson.parameters)}")
     for name in lesson.parameters:
@@ -146,7 +148,8 @@ def _expect_parameters(lesson: Lesson, robot: Any) -> None:
     for corner in itertools.product(*lesson.parameters.values()):
         values = dict(zip(lesson.parameters, corner, strict=True))
         try:
-            most = max(most, dataclasses.replace(robot, **values).return_range[1])
+            varied: Robot[Any] = dataclasses.replace(body, **values)
+            most = max(most, (varied if body is robot else robot).return_range[1])
         except InvalidArgument as error:
             told = ", ".join(f"{name} = {value:g}" for name, value in values.items())
             raise InvalidArgument(f"parameters: {robot.name} cannot have {told}: {error}") from error

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
+
+from animat.environment import Environment
 
 
 class Layer(NamedTuple):
@@ -65,3 +67,37 @@ def squashed_normal(
     # log(1 - tanh(z)^2), in the form that does not lose its digits for large |z|
     log_slope = 2.0 * (math.log(2.0) - z - jax.nn.softplus(-2.0 * z))
     return jnp.tanh(z), jnp.sum(log_normal - log_slope, axis=-1)
+
+
+def draw_action(
+    environment: Environment[Any],
+    actor: Network,
+    observation: Float[Array, "batch observations"],
+    uniforms: Float[Array, "batch drawn"],
+) -> Array:
+    """Draw an action from the policy for each scaled observation, by the inverse of its cumulative distribution.
+
+    Of shape (batch,); of several continuous commands (batch, commands).
+    """
+    outputs = forward(actor, observation)
+    if environment.n_actions is None:
+        return as_commands(environment, squashed_normal(outputs, uniforms)[0])
+    below = jnp.cumsum(jax.nn.softmax(outputs), axis=-1)[:, :-1]
+    return jnp.sum(uniforms >= below, axis=-1)
+
+
+def likeliest_action(
+    environment: Environment[Any], actor: Network, observation: Float[Array, "batch observations"]
+) -> Array:
+    """The most probable action for each scaled observation; of continuous commands the middle of the distribution."""
+    outputs = forward(actor, observation)
+    if environment.n_actions is not None:
+        return jnp.argmax(outputs, axis=-1)
+    return as_commands(environment, jnp.tanh(outputs[:, : environment.n_drawn]))
+
+
+def as_commands(
+    environment: Environment[Any], actions: Float[Array, "batch commands"]
+) -> Float[Array, "batch *commands"]:
+    """Continuous actions as the robot takes them: one command is a number."""
+    return actions[:, 0] if environment.robot.n_commands == 1 else actions

@@ -22,6 +22,7 @@ from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
+from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import AT_FIRST
 from animat.plain_file import expect_plain_file, is_folder
 from animat.records import Number, read_record
@@ -30,7 +31,6 @@ from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
-from animat.robots.registry import robot_from_dict, robot_to_dict
 from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance
 from animat.writing import atomic_write
@@ -60,7 +60,7 @@ class Policy:
     Attributes:
         weights, biases: of the three layers, shapes (inputs, outputs) and (outputs,).
         scales: what observations are divided by first, shape (observations,).
-        robot: the robot it was trained on.
+        robot: the robot it was trained on, with its goal where it had one.
         mapping: from a response to a command; None for a policy without neurons.
         conditions: what the actions are, for a policy that acts through neurons.
         commands: what the actions are, for one without neurons; None there means continuous commands.
@@ -237,7 +237,7 @@ class Policy:
         """
         from safetensors.numpy import save
 
-        ROBOTS.expect_loadable(self.robot)
+        ROBOTS.expect_loadable(without_goal(self.robot))
         if self.mapping is not None:
             MAPPINGS.expect_loadable(self.mapping)
 
@@ -249,7 +249,7 @@ class Policy:
         described = {
             "format": FORMAT,
             "hidden_activation": HIDDEN_ACTIVATION,
-            "robot": robot_to_dict(self.robot),
+            **body_and_goal(self.robot),
             "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "conditions": [asdict(condition) for condition in self.conditions],
             "commands": self.commands,
@@ -280,7 +280,7 @@ class Policy:
                 weights=tuple(arrays[f"layer{i}.weight"] for i in range(_LAYERS)),
                 biases=tuple(arrays[f"layer{i}.bias"] for i in range(_LAYERS)),
                 scales=arrays["scales"],
-                robot=robot_from_dict(described["robot"]),
+                robot=robot_of(described),
                 mapping=None if described["mapping"] is None else mapping_from_data(described["mapping"]),
                 conditions=abbreviated([Condition(**condition) for condition in described["conditions"]]),
                 commands=None if described["commands"] is None else tuple(described["commands"]),

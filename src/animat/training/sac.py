@@ -26,8 +26,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
+from animat.robots.base import Robot
 from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
-from animat.training.networks import Network, forward, initial_networks, squashed_normal
+from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit
 
@@ -249,7 +250,8 @@ def _act(
     action, exploration, noise = choose(environment, learner, state[:, :-1], uniforms)
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = jnp.logical_or(*after.ended)
-    rows = transitions(settings, state, state_of(environment, after), action, after.reward, ended)
+    reward = shaped(environment.robot, settings, learner.episodes.robot, after.robot, after.reward, ended)
+    rows = transitions(settings, state, state_of(environment, after), action, reward, ended)
 
     returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
@@ -260,6 +262,31 @@ def _act(
         exploration=ended_episodes(exploration, ended, returns),
     )
     return learner, finished_alone(exploration, ended, returns)
+
+
+def shaped(
+    robot: Robot[Any],
+    settings: SAC,
+    before: Any,
+    after: Any,
+    reward: Float[Array, " environments"],
+    ended: Bool[Array, " environments"],
+) -> Float[Array, " environments"]:
+    """Rewards as they are learned from, where the robot has a `potential`; the best policy is that of the rewards.
+
+        r + gamma (1 - d) potential(s') - potential(s)
+
+    with d for ended, in either way, as the losses have it. Along any episode the discounted terms add up to
+    -potential(s_0), whatever is done (Ng, Harada & Russell 1999). No return that is reported has them.
+
+    Args:
+        before, after: states of the robot, each number with an axis of environments.
+    """
+    if not hasattr(robot, "potential"):
+        return reward
+    potential = jax.vmap(robot.potential)
+    shaping: Array = settings.discount * jnp.where(ended, 0.0, potential(after)) - potential(before)
+    return reward + shaping
 
 
 def choose(
@@ -302,40 +329,6 @@ def transitions(
     of_action = action.reshape(len(state), -1).astype(jnp.float32)
     row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
     return jnp.concatenate([state, next_state, of_action, row], axis=1)
-
-
-def draw_action(
-    environment: Environment[Any],
-    actor: Network,
-    observation: Float[Array, "batch observations"],
-    uniforms: Float[Array, "batch drawn"],
-) -> Array:
-    """Draw an action from the policy for each scaled observation, by the inverse of its cumulative distribution.
-
-    Of shape (batch,); of several continuous commands (batch, commands).
-    """
-    outputs = forward(actor, observation)
-    if environment.n_actions is None:
-        return as_commands(environment, squashed_normal(outputs, uniforms)[0])
-    below = jnp.cumsum(jax.nn.softmax(outputs), axis=-1)[:, :-1]
-    return jnp.sum(uniforms >= below, axis=-1)
-
-
-def likeliest_action(
-    environment: Environment[Any], actor: Network, observation: Float[Array, "batch observations"]
-) -> Array:
-    """The most probable action for each scaled observation; of continuous commands the middle of the distribution."""
-    outputs = forward(actor, observation)
-    if environment.n_actions is not None:
-        return jnp.argmax(outputs, axis=-1)
-    return as_commands(environment, jnp.tanh(outputs[:, : environment.n_drawn]))
-
-
-def as_commands(
-    environment: Environment[Any], actions: Float[Array, "batch commands"]
-) -> Float[Array, "batch *commands"]:
-    """Continuous actions as the robot takes them: one command is a number."""
-    return actions[:, 0] if environment.robot.n_commands == 1 else actions
 
 
 def learn(

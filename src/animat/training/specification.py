@@ -14,12 +14,13 @@ from animat.coding.decoder import expect_one_command
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
+from animat.goals.robot import body_and_goal, without_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.records import Whole, read_record
 from animat.registry import is_ours
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
-from animat.robots.registry import register_robot, robot_named, robot_to_dict
+from animat.robots.registry import register_robot, robot_named
 from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery
@@ -59,7 +60,7 @@ class Training:
     """Everything that decides how policies come out, but for the recordings.
 
     Attributes:
-        robot: the robot to be driven, or its name.
+        robot: the robot to be driven, or its name; with a goal or without (`animat.goals.robot.with_goal`).
         mapping: from responses to commands, or its name; None trains the baseline without neurons, which moves the
             robot directly.
         policies: how many are trained, each from its own random numbers.
@@ -139,7 +140,7 @@ class Training:
         if isinstance(self.robot, HostRobot):
             self.robot.prepare()
         else:
-            register_robot(type(self.robot))
+            register_robot(type(without_goal(self.robot)))
         if self.mapping is not None and not is_ours(self.mapping):
             register_mapping(type(self.mapping))
 
@@ -191,7 +192,7 @@ class Training:
             if not plain[name]:
                 del plain[name]
         return plain | {
-            "robot": robot_to_dict(self.robot),
+            **body_and_goal(self.robot),
             "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "algorithm": asdict(self.algorithm),
             "chunks": CHUNKS,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar, final
 
@@ -19,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.environment import Environment, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument, did_you_mean, first_line
+from animat.goals.robot import RobotWithGoal, without_goal
 from animat.neurons.simulator import NeuronSimulator, Stored
 from animat.robots.base import Robot
 from animat.training.lessons import Lesson
@@ -65,7 +67,8 @@ def varying_in(lessons: Sequence[Lesson], *, recordings: bool) -> Varying:
 
 def ranges_of(lesson: Lesson, varying: Varying, robot: Robot[Any], rows: tuple[int, int]) -> Ranges:
     """A lesson's ranges; a parameter that varies in other lessons only is as the robot has it."""
-    parameters = [lesson.parameters.get(name, (getattr(robot, name),) * 2) for name in varying.parameters]
+    body = without_goal(robot)
+    parameters = [lesson.parameters.get(name, (getattr(body, name),) * 2) for name in varying.parameters]
     starts = [lesson.starts.get(name, (np.nan, np.nan)) for name in varying.starts]
     of_parameters, of_starts = (np.array(ends, np.float32).reshape(-1, 2).T for ends in (parameters, starts))
     return Ranges(of_parameters, of_starts, np.array(rows, np.int32))
@@ -90,16 +93,13 @@ class Varied(Wrapper[RobotState]):
     def reset(self, key: PRNGKeyArray) -> State:
         of_parameters, of_starts, of_recording = jax.random.split(jax.random.fold_in(key, 1), 3)
         parameters = _between(of_parameters, self.ranges.parameters)
-        state = self._with(parameters).reset(key)
-        drawn = _between(of_starts, self.ranges.starts)
-        starts = {
-            name: jnp.where(jnp.isnan(value), getattr(state.robot, name), value)
-            for name, value in zip(self.varying.starts, drawn, strict=True)
-        }
+        environment = self._with(parameters)
+        state = environment.reset(key)
+        drawn = dict(zip(self.varying.starts, _between(of_starts, self.ranges.starts), strict=True))
         first, last = self.ranges.recordings
         recording = jax.random.randint(of_recording, (), first, last + 1)
         info = state.info | {"parameters": parameters, "recording": recording}
-        return state._replace(robot=state.robot._replace(**starts) if starts else state.robot, info=info)
+        return state._replace(robot=_started(environment.robot, state.robot, drawn), info=info)
 
     def observe(self, state: State) -> Float[Array, " observations"]:
         return self._in(state).observe(state)
@@ -132,7 +132,14 @@ class Varied(Wrapper[RobotState]):
 
 
 def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
-    """The robot with other parameters, which may be traced: made without its checks, which want numbers."""
+    """The robot with other parameters, which may be traced: made without its checks, which want numbers.
+
+    A goal stays as it is, in the units and scales of the robot as it was.
+    """
+    if isinstance(robot, RobotWithGoal):
+        with_goal = copy(robot)
+        object.__setattr__(with_goal, "robot", with_parameters(robot.robot, values))
+        return with_goal
     varied = object.__new__(type(robot))
     for each in dataclasses.fields(robot):  # type: ignore[arg-type]
         object.__setattr__(varied, each.name, values.get(each.name, getattr(robot, each.name)))
@@ -145,7 +152,7 @@ def expect_varied(robot: Robot[Any], varying: Varying) -> None:
     Raises:
         InvalidArgument: for a parameter that something is compiled by, or a name that is none of the state's numbers.
     """
-    state = jax.eval_shape(robot.reset, jax.random.key(0))
+    state = jax.eval_shape(without_goal(robot).reset, jax.random.key(0))
     known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
     for name in varying.starts:
         if name not in known:
@@ -161,12 +168,21 @@ def expect_varied(robot: Robot[Any], varying: Varying) -> None:
 
     for name in varying.parameters:
         try:
-            jax.eval_shape(lambda value, name=name: once(value, name), jnp.float32(getattr(robot, name)))
+            jax.eval_shape(lambda value, name=name: once(value, name), jnp.float32(getattr(without_goal(robot), name)))
         except (JAXTypeError, TypeError, ValueError, AttributeError) as error:
             raise InvalidArgument(
                 f"lessons: parameters.{name}: expected a parameter that {robot.name} only computes with, got one that "
                 f"cannot vary while it is compiled ({first_line(error)})"
             ) from error
+
+
+def _started(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
+    """The start of an episode with the numbers that were drawn; NaN: as it was."""
+    if not drawn:
+        return state
+    body = state.robot if isinstance(robot, RobotWithGoal) else state
+    body = body._replace(**{n: jnp.where(jnp.isnan(value), getattr(body, n), value) for n, value in drawn.items()})
+    return robot.started(body) if isinstance(robot, RobotWithGoal) else body
 
 
 def _is_number(leaf: Any) -> bool:

@@ -1,0 +1,46 @@
+"""How far a study's policies met the goals of its robots, objective by objective."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from animat.goals.robot import RobotWithGoal
+from animat.report.html import Table
+from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED
+from animat.studies.results import ObjectiveMet
+from animat.studies.specification import Study
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
+    """Of each robot with a goal: what its policies and controls came to at each minute.
+
+    Args:
+        table: of episodes.
+    """
+    for spec in study.robots:
+        robot = spec.robot()
+        if not isinstance(robot, RobotWithGoal):
+            continue
+        at = table[(table["robot"] == spec.name) & ~table["over_time"]]
+        for (arm, agent, at_min), rows in at.groupby(["arm", "agent", "at_min"], sort=False):
+            met = len(rows), float(rows[SUCCEEDED].mean()), float(rows[MARGIN].mean())
+            for i, objective in enumerate(robot.goal.objectives):
+                satisfaction = float(rows[f"{SATISFACTION}{i}"].mean())
+                yield ObjectiveMet(spec.name, arm, agent, at_min, *met, str(objective), satisfaction)
+
+
+def goals_shown(rows: Sequence[ObjectiveMet]) -> Table:
+    """An objective of each arm and control a row."""
+    names = ("robot", "arm", "agent", "at_min", "episodes", "success_share", "margin", "objective", "satisfaction")
+    return Table(
+        "Goals",
+        ("robot", "arm", "agent", "at (min)", "episodes", "success", "margin", "objective", "satisfied (%)"),
+        tuple(tuple(getattr(row, name) for name in names) for row in rows),
+        note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
+        "goal, or from success, in scales of the quantities: above 0 it succeeded.",
+        beside="tables/goals.csv",
+    )
