@@ -23,7 +23,7 @@ from animat.robots.host import HostRobot
 
 Kind = Literal["graded", "switch"]
 KINDS: tuple[Kind, ...] = ("graded", "switch")
-LARGEST_WEIGHT = 5.0
+LARGEST_WEIGHT = 12.0
 """Of a quantity in units of its scale: beyond, a graded command is nearly a switch."""
 GENERATIONS, EPISODES = 60, 32
 """Of a search; episodes of each coupling, the same starts and chances for all of them."""
@@ -71,7 +71,7 @@ class Coupling(Actor):
 def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int = 1) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 
-    Differential evolution, twice for each kind, over weights from -5 to 5. All couplings of a search meet the same
+    Differential evolution, twice for each kind, over weights from -12 to 12. All couplings of a search meet the same
     starts and chances. The best of the four last generations is chosen in fresh episodes.
 
     Args:
