@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pickle
 import signal
@@ -339,10 +340,8 @@ def test_the_alarm_of_others_and_bodies_that_catch_everything(monkeypatch: pytes
 
     def swallows() -> None:
         for _ in range(2):
-            try:
+            with contextlib.suppress(BaseException):
                 time.sleep(5)
-            except BaseException:
-                pass
 
     monkeypatch.setattr(host, "PATIENCE_S", 0.1)
     before = signal.signal(signal.SIGALRM, lambda *_: None)

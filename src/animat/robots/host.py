@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Answer = TypeVar("Answer")
 
 PATIENCE_S = 120.0
-"""How long a step of all bodies that are side by side may take, or making or resetting one, before it counts as hung."""
+"""How long a step of all bodies side by side may take, or making or resetting one, before it counts as hung."""
 
 LONGEST_KEPT = 20_000
 """Iterations of an episode of which the commands are kept, so that a checkpoint can go on within it."""
