@@ -29,6 +29,7 @@ from animat.evaluation.table import evaluate
 from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.host import Bodies, Standing
+from animat.robots.registry import REGISTRY
 from animat.training.folder import describe
 from animat.training.group import Group, train_group
 from animat.training.host import programs_on_host
@@ -380,3 +381,10 @@ def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_told() -> None:
     robot = named("Slider", episode_limit=host.LONGEST_KEPT + 1)
     (caveat,) = robot.caveats()
     assert "20,001 iterations" in caveat and not Standing.of_none(robot, 2).commands.size
+
+
+def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:
+    # Made without parameters it has no limit, and is refused.
+    assert REGISTRY.name_of(f"{TOY}Endless-v0") == named("Endless", episode_limit=9).name
+    with pytest.raises(InvalidArgument, match="No module named 'nobody_has_this'"):
+        REGISTRY.name_of("gymnasium:nobody_has_this:Rover-v0")

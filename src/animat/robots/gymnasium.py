@@ -132,6 +132,11 @@ class GymnasiumRobot(HostRobot):
             "checkpoints cannot be kept: at each of them episodes begin anew",
         )
 
+    @staticmethod
+    def import_module(id: str) -> None:
+        """Import the module that an id names, if it names one; errors as those of `named`."""
+        _imported(id)
+
     @classmethod
     @lru_cache(maxsize=32)  # a study asks for its robots often
     def named(cls, id: str, /, *, episode_limit: int | None = None, **settings: float) -> GymnasiumRobot:
