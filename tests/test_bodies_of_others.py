@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pickle
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -25,8 +29,10 @@ from animat.evaluation.table import evaluate
 from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.host import Bodies, Standing
+from animat.robots.registry import REGISTRY
 from animat.training.folder import describe
 from animat.training.group import Group, train_group
+from animat.training.host import programs_on_host
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
@@ -294,3 +300,91 @@ def test_mujoco_bodies_are_trained(tmp_path: Path) -> None:
     assert np.all(row.lengths == 50) and np.all(np.isfinite(row.returns))
     random = roll_out(WithoutNeurons(robot, None), None, Uniform(), 1, episodes=3, seed=1)
     assert not np.array_equal(random.returns, row.returns)
+
+
+def test_a_body_that_exits_is_told_as_one_that_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    def leave(self: Any) -> None:
+        raise SystemExit(0)
+
+    bodies = Bodies(replace(named("Slider"), settings=(("after", 0.0),)), [(1,)])
+    bodies.begin()
+    monkeypatch.setattr(bodies_of_others.Slider, "_break", leave)
+    with pytest.raises(BodyFailed, match=r"Slider-v0: expected step to succeed, got SystemExit"):
+        bodies.step(np.zeros((1, 1)))
+    monkeypatch.setattr(bodies_of_others.Slider, "_seen", leave)
+    with pytest.raises(BodyFailed, match=r"Slider-v0: expected reset to succeed, got SystemExit"):
+        bodies.begin()
+
+
+def test_replay_may_take_longer_than_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = named("Slider")
+    first = Bodies(robot, [(1,), (2,)])
+    first.begin()
+    for _ in range(15):
+        first.step(np.zeros((2, 1), np.float32))
+    monkeypatch.setattr(host, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(bodies_of_others.Slider, "_seen", slowly(bodies_of_others.Slider._seen))
+    second = Bodies(robot, [(1,), (2,)])
+    assert second.stand(first.standing)
+
+
+def slowly(call: Any) -> Any:
+    def called(*arguments: Any) -> Any:
+        time.sleep(0.02)
+        return call(*arguments)
+
+    return called
+
+
+def test_the_alarm_of_others_and_bodies_that_catch_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = named("Slider")
+
+    def swallows() -> None:
+        for _ in range(2):
+            with contextlib.suppress(BaseException):
+                time.sleep(5)
+
+    monkeypatch.setattr(host, "PATIENCE_S", 0.1)
+    before = signal.signal(signal.SIGALRM, lambda *_: None)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 100.0)
+        assert host.tried(robot, "step", lambda: 3) == 3
+        assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 100.0
+        with pytest.raises(BodyFailed, match="it hangs"):
+            host.tried(robot, "step", lambda: (swallows(), time.sleep(5)))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_a_body_that_cuts_itself_off_early_does_not_end_the_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = bodies_of_others.Slider.step
+
+    def cut_off_at_five(self: Any, action: Any) -> Any:
+        observation, reward, ended, _, info = step(self, action)
+        return observation, reward, ended, self.steps % 5 == 0, info
+
+    monkeypatch.setattr(bodies_of_others.Slider, "step", cut_off_at_five)
+    robot = replace(named("Slider", gain=0.0), episode_limit=8)
+    asked = training(robot, policies=1, iterations=480)
+    beginning, chunk = programs_on_host(asked.environment(0), SMALL)
+    learners, finished = chunk(beginning(jax.random.split(jax.random.key(1), 1)), None, 0, 12)
+    assert finished.episodes.sum() > 0
+    # Of each transition the last number; no body ever ended by itself, nor came to the limit.
+    assert not np.asarray(learners.replay)[0, : 12 * SMALL.environments, -1].any()
+    assert (np.asarray(learners.episodes.robot.iterations) < 5).all()
+
+
+def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_told() -> None:
+    with pytest.raises(InvalidArgument, match="episode_limit: expected from 1 to"):
+        named("Slider", episode_limit=0)
+    robot = named("Slider", episode_limit=host.LONGEST_KEPT + 1)
+    (caveat,) = robot.caveats()
+    assert "20,001 iterations" in caveat and not Standing.of_none(robot, 2).commands.size
+
+
+def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:
+    # Made without parameters it has no limit, and is refused.
+    assert REGISTRY.name_of(f"{TOY}Endless-v0") == named("Endless", episode_limit=9).name
+    with pytest.raises(InvalidArgument, match="No module named 'nobody_has_this'"):
+        REGISTRY.name_of("gymnasium:nobody_has_this:Rover-v0")

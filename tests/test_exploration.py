@@ -136,6 +136,8 @@ def test_actions_are_held_until_the_policy_alone_does_better(
     episodes, returns = zip(alone, with_held, strict=True)
     exploration = nothing_held(8, 1)._replace(episodes=jnp.array(episodes, float), returns=jnp.array(returns, float))
     assert bool(is_worth_it(exploration)) == expected
+    # A single environment holds nothing that could be compared with.
+    assert not is_worth_it(exploration._replace(left=exploration.left[:1]))
     uniforms = jnp.zeros((8, 3))
     taken, _ = jax.jit(partial(explore, ENVIRONMENT))(exploration, jnp.full(8, 7), uniforms)
     assert bool((np.asarray(taken) != 7).any()) == expected

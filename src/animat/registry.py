@@ -86,7 +86,8 @@ class Registry(Generic[Thing]):
 
         Args:
             name: what their names begin with, before a colon; in files it is the name of all of them.
-            family: their class. `family.named(own_name, **parameters)` looks a thing up; with all of its parameters, as
+            family: their class. `family.import_module(own_name)` imports what things of this name are made of;
+                `family.named(own_name, **parameters)` looks a thing up; with all of its parameters, as
                 files have them, the class itself makes it, and nothing is looked up.
         """
         self._families[name] = family
@@ -130,9 +131,10 @@ class Registry(Generic[Thing]):
 
     def name_of(self, name: str) -> str:
         """The name of what is named so; errors as those of `named`."""
-        if self._family_of(name) is not None:
-            # Whoever names it has it looked up, so that what it is made of is imported.
-            return str(self.named(name).name)  # type: ignore[attr-defined]
+        if (family := self._family_of(name)) is not None:
+            # Not looked up: its parameters, without which it may not be made, are not known here.
+            family.import_module(name.partition(":")[2])
+            return name
         return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]
 
     def _family_of(self, name: Any) -> type[Any] | None:

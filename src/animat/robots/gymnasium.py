@@ -16,7 +16,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument, first_line, shown
 from animat.records import Flag, Number, Whole, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Iterations, Quantity
-from animat.robots.host import Body, HostRobot, within
+from animat.robots.host import LONGEST_KEPT, Body, HostRobot, within
 from animat.robots.registry import REGISTRY
 
 FAMILY = "gymnasium"
@@ -120,12 +120,22 @@ class GymnasiumRobot(HostRobot):
         _imported(self.id)
 
     def caveats(self) -> tuple[str, ...]:
-        if self.keeps_state:
+        if self.keeps_episodes:
             return ()
+        if self.keeps_state:
+            return (
+                f"{self.name}: an episode of {self.episode_limit:,} iterations is longer than the {LONGEST_KEPT:,} of "
+                "which the commands are kept: at each checkpoint episodes begin anew",
+            )
         return (
             f"{self.name}: the same seed and commands do not give the same episode, so what a body does between two "
             "checkpoints cannot be kept: at each of them episodes begin anew",
         )
+
+    @staticmethod
+    def import_module(id: str) -> None:
+        """Import the module that an id names, if it names one; errors as those of `named`."""
+        _imported(id)
 
     @classmethod
     @lru_cache(maxsize=32)  # a study asks for its robots often
@@ -148,7 +158,7 @@ class GymnasiumRobot(HostRobot):
         at_first = cls(id, tuple(settings.items()), 1, (0.0,), (1.0,), 0, (1.0,), False)
         with within(at_first, "being made"):
             body = _Environment(id, tuple(settings.items()))
-        limit = episode_limit or body.limit
+        limit = body.limit if episode_limit is None else episode_limit
         if limit is None:
             raise InvalidArgument(
                 f"{FAMILY}:{id}: expected a limit of an episode, got an environment without one: "
@@ -177,7 +187,7 @@ class _Environment(Body):
         name = f"{FAMILY}:{id}"
         try:
             env: Any = gymnasium.make(id, disable_env_checker=True, **dict[str, Any](settings))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             # Anything may go wrong in somebody else's environment.
             raise InvalidArgument(f"{name}: expected an environment of Gymnasium, got {_why(error)}") from error
         _expect_sound_mujoco(name, env)
@@ -222,7 +232,7 @@ def _imported(id: str) -> None:
         ) from error
 
 
-def _why(error: Exception) -> str:
+def _why(error: Exception | SystemExit) -> str:
     """What Gymnasium says, with our extra for MuJoCo, which brings a version without faults."""
     said = first_line(error)
     return f'{said.partition(",")[0]}: pip install "animat[mujoco]"' if "mujoco" in said.lower() else said

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Answer = TypeVar("Answer")
 
 PATIENCE_S = 120.0
-"""How long a step of all bodies that are side by side may take, before the body counts as hung."""
+"""How long a step of all bodies side by side may take, or making or resetting one, before it counts as hung."""
 
 LONGEST_KEPT = 20_000
 """Iterations of an episode of which the commands are kept, so that a checkpoint can go on within it."""
@@ -59,6 +59,11 @@ class HostRobot(Robot[Any]):
 
     keeps_state: bool
     """Whether the same seed and commands give the same episode, whatever was before it."""
+
+    @property
+    def keeps_episodes(self) -> bool:
+        """Whether a checkpoint can go on within an episode."""
+        return self.keeps_state and self.episode_limit <= LONGEST_KEPT
 
     @abc.abstractmethod
     def body(self) -> Body:
@@ -133,7 +138,7 @@ class Standing(NamedTuple):
     @classmethod
     def of_none(cls, robot: HostRobot, bodies: int) -> Standing:
         """Of bodies that have not begun."""
-        kept = robot.episode_limit if robot.keeps_state and robot.episode_limit <= LONGEST_KEPT else 0
+        kept = robot.episode_limit if robot.keeps_episodes else 0
         return cls(
             np.zeros((bodies, len(robot.observation_spec)), np.float32),
             np.zeros(bodies, np.int32),
@@ -152,8 +157,7 @@ class Bodies:
 
     def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]]) -> None:
         self.robot, self._seeds = robot, [tuple(seed) for seed in seeds]
-        with within(robot, "being made"):
-            self._bodies = [tried(robot, "being made", robot.body) for _ in seeds]
+        self._bodies = [tried(robot, "being made", robot.body) for _ in seeds]
         self._at = Standing.of_none(robot, len(self._bodies))
 
     def __len__(self) -> int:
@@ -176,9 +180,8 @@ class Bodies:
 
     def begin(self, which: Sequence[int] | None = None) -> Float32[np.ndarray, "bodies observations"]:
         """Start an episode of each, or of some; returns the last observations of all."""
-        with within(self.robot, "reset"):
-            for body in range(len(self._bodies)) if which is None else which:
-                self._begin(body)
+        for body in range(len(self._bodies)) if which is None else which:
+            self._begin(body)
         return self._expect_finite(self._at.observation).copy()
 
     def step(self, commands: Float[np.ndarray, "bodies commands"]) -> Stepped:
@@ -195,7 +198,7 @@ class Bodies:
             try:
                 for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
                     observation[i], reward[i], terminated[i], truncated[i] = body.step(action)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise _failed(robot, "step", error) from error
         if kept.shape[1]:
             kept[np.arange(len(bodies)), iterations] = commands
@@ -215,9 +218,7 @@ class Bodies:
         for part, kept in zip(self._at, at, strict=True):
             part[...] = kept
         if at.commands.shape[1] and at.episodes.all():
-            with within(self.robot, "step"):
-                came = all(self._came(body, at) for body in range(len(self._bodies)))
-            if came:
+            if all(self._came(body, at) for body in range(len(self._bodies))):
                 return True
             self._at.episodes[:] = at.episodes
         self.begin()
@@ -249,12 +250,13 @@ class Bodies:
 def tried(robot: HostRobot, what: str, call: Callable[..., Answer], *arguments: Any) -> Answer:
     """Call what is somebody else's; whatever it raises becomes one line that names the robot (BodyFailed)."""
     try:
-        return call(*arguments)
-    except Exception as error:
+        with within(robot, what):
+            return call(*arguments)
+    except (Exception, SystemExit) as error:
         raise _failed(robot, what, error) from error
 
 
-def _failed(robot: HostRobot, what: str, error: Exception) -> Exception:
+def _failed(robot: HostRobot, what: str, error: Exception | SystemExit) -> Exception:
     # What the house has said in one line stays as it is.
     if isinstance(error, AnimatError):
         return error
@@ -282,11 +284,14 @@ def within(robot: HostRobot, what: str) -> Iterator[None]:
         raise _TooLongError
 
     before = signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    # Again every second, as a bare `except:` would swallow it once.
+    others = signal.setitimer(signal.ITIMER_REAL, PATIENCE_S, 1.0)
     try:
         yield
     except _TooLongError:
         raise BodyFailed(f"{robot.name}: expected {what} within {PATIENCE_S:g} s, got no answer: it hangs") from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL if before is None else before)
+        if others[0]:
+            signal.setitimer(signal.ITIMER_REAL, *others)

@@ -100,7 +100,12 @@ def ended_episodes(
 
 
 def is_worth_it(exploration: Exploration) -> Bool[Array, ""]:
-    """Whether the policy alone does no better, as far as is known: of no episodes the mean is NaN."""
+    """Whether the policy alone does no better, as far as is known: of no episodes the mean is NaN.
+
+    Never of a single environment, in which nothing is ever held.
+    """
+    if len(exploration.left) < 2:
+        return jnp.array(False)
     alone, with_held = exploration.returns / exploration.episodes
     is_better: Bool[Array, ""] = alone > with_held
     return ~is_better

@@ -57,6 +57,7 @@ class Moved(NamedTuple):
 
     observation: Float[Array, "environments observations"]
     reward: Float[Array, " environments"]
+    terminated: Bool[Array, " environments"]
     ended: Bool[Array, " environments"]
     begun: Float[Array, "environments observations"]
 
@@ -92,10 +93,12 @@ def learn_and_act(
     uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
     written = index * settings.environments
 
-    before, (observation, reward, ended, begun) = learner.episodes, moved
+    before, (observation, reward, terminated, ended, begun) = learner.episodes, moved
     after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons)
     state, next_state = state_of(environment, before), state_of(environment, after)
-    rows = transitions(settings, state, next_state, acted.action, reward, ended)
+    # Critics see the time left: at the limit the return ends. Where a body cut an episode off before, it goes on.
+    is_last = terminated | (after.iteration >= environment.robot.episode_limit)
+    rows = transitions(settings, state, next_state, acted.action, reward, is_last)
     returns = learner.returns + reward
     finished = finished_alone(learner.exploration, ended, returns)
     learner = learner._replace(
@@ -181,7 +184,8 @@ class _Chunks:
             stepped = bodies.step(commands)
             ended = np.flatnonzero(stepped.ended)
             begun = bodies.begin(ended.tolist()) if len(ended) else stepped.observation
-            moved = Moved(stepped.observation, stepped.reward.astype(np.float32), stepped.ended, begun)  # type: ignore[arg-type]
+            reward = stepped.reward.astype(np.float32)
+            moved = Moved(stepped.observation, reward, stepped.terminated, stepped.ended, begun)  # type: ignore[arg-type]
             learners, acted, of_round = self._learn_and_act(
                 learners, acted, self._by_policy(moved), simulator, np.int32(index)
             )
