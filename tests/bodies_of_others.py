@@ -37,7 +37,7 @@ class Slider(gymnasium.Env[Any, Any]):
         # Of a body whose episodes depend on what was before them.
         self.at += self.made * (self.fault == "remembers")
         self.made += 0.01
-        return self._seen(), {}
+        return {"at": self.at} if self.fault == "starts" else self._seen(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps += 1
@@ -80,4 +80,13 @@ for name, fault in (
     ("Hangs", "hangs"),
 ):
     gymnasium.register(f"{name}-v0", Slider, max_episode_steps=20, kwargs={"fault": fault})
+gymnasium.register("Starts-v0", Slider, max_episode_steps=20, kwargs={"fault": "starts"})
+gymnasium.register(
+    "Wrapped-v0",
+    Slider,
+    max_episode_steps=20,
+    additional_wrappers=(
+        gymnasium.wrappers.RescaleAction.wrapper_spec(min_action=np.float32(-0.5), max_action=np.float32(0.5)),
+    ),
+)
 gymnasium.register("Endless-v0", Slider)

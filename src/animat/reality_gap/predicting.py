@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from itertools import repeat
 from typing import Any, NamedTuple
 
@@ -105,13 +106,16 @@ def predict(
         )
 
     found: dict[str, Predicted] = {}
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as side_by_side:
+    # A body on the host hangs in the first thread or is not noticed (`animat.robots.host.within`).
+    on_host = isinstance(environment.robot, HostRobot)
+    with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        side_by_side = map if pool is None else pool.map
         # First one of each kind: two of a kind that start together would both be compiled.
         kinds = {(type(acting[i][0]), group[0].delivery == "silent"): i for i, group in enumerate(groups)}
-        list(side_by_side.map(rolled, kinds.values(), repeat(0)))
+        list(side_by_side(rolled, kinds.values(), repeat(0)))
         for number, group in enumerate(groups):
             progress.update(number, len(groups), f"predicting {group[0].name}")
-            episodes = list(side_by_side.map(rolled, repeat(number), range(len(simulators))))
+            episodes = list(side_by_side(rolled, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
             passes = _stacked([Passes(each.presented, each.passed) for each in episodes])
             for row, agent in enumerate(group):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import re
 import sys
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, final
+from typing import Annotated, Any, final
 
 import numpy as np
 from jaxtyping import Float
@@ -55,8 +56,6 @@ class GymnasiumRobot(HostRobot):
         InvalidArgument: for parameters that no environment has.
     """
 
-    packages: ClassVar[tuple[str, ...]] = ("gymnasium",)
-
     id: str
     settings: tuple[tuple[str, Number], ...]
     episode_limit: Iterations
@@ -98,6 +97,17 @@ class GymnasiumRobot(HostRobot):
             return level
         low, high = np.array(self.low), np.array(self.high)
         return np.clip(low + shares * (high - low), low, high)  # type: ignore[no-any-return]
+
+    @property
+    def versions(self) -> dict[str, str]:
+        import gymnasium
+
+        entry = str(gymnasium.spec(self.id.rpartition(":")[2]).entry_point)
+        engines = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "Box2D"}
+        engine = next((engine for made_in, engine in engines.items() if entry.startswith(made_in)), "")
+        known = importlib.metadata.packages_distributions()
+        of = ["gymnasium", *known.get(engine, ()), *known.get(entry.partition(".")[0].partition(":")[0], ())]
+        return {name: importlib.metadata.version(name) for name in dict.fromkeys(of)}
 
     def body(self) -> Body:
         module = self.id.rpartition(":")[0]
@@ -182,27 +192,26 @@ class _Environment(Body):
 
     def __init__(self, id: str, settings: tuple[tuple[str, float], ...]) -> None:
         import gymnasium
-        from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+        from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
         name = f"{FAMILY}:{id}"
         try:
-            env: Any = gymnasium.make(id, disable_env_checker=True, **dict[str, Any](settings))
+            env: Any = gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **dict[str, Any](settings))
+            actions, observations = env.action_space, env.observation_space
         except (Exception, SystemExit) as error:
             # Anything may go wrong in somebody else's environment.
             raise InvalidArgument(f"{name}: expected an environment of Gymnasium, got {_why(error)}") from error
         _expect_sound_mujoco(name, env)
-        self.limit: int | None = None
-        while isinstance(env, OrderEnforcing | PassiveEnvChecker | TimeLimit):
-            if isinstance(env, TimeLimit):
-                self.limit = env._max_episode_steps
+        self.limit: int | None = gymnasium.spec(id.rpartition(":")[2]).max_episode_steps
+        while isinstance(env, OrderEnforcing | PassiveEnvChecker):
             env = env.env
         self._env, self._step = env, env.step
-        self.low, self.high, self.levels = _commands(name, env.action_space)
-        self._shape, self._dtype = env.action_space.shape, env.action_space.dtype
-        self._start = int(getattr(env.action_space, "start", 0))
-        self.bounds = _observed(name, env.observation_space)
+        self.low, self.high, self.levels = _commands(name, actions)
+        self._shape, self._dtype = actions.shape, actions.dtype
+        self._start = int(getattr(actions, "start", 0))
+        self.bounds = _observed(name, observations)
         self.observed = len(self.bounds)
-        self._is_flat = env.observation_space.shape == (self.observed,)
+        self._name, self._is_flat = name, observations.shape == (self.observed,)
 
     def reset(self, seed: int) -> Float[np.ndarray, " observations"]:
         return self._flat(self._env.reset(seed=seed)[0])
@@ -216,7 +225,9 @@ class _Environment(Body):
         if not self._is_flat:
             observation = np.reshape(observation, -1)
         if len(observation) != self.observed:
-            raise InvalidArgument(f"observation: expected {self.observed} numbers, got {len(observation)}")
+            raise InvalidArgument(
+                f"{self._name}: expected observations of {self.observed} numbers, got one of {len(observation)}"
+            )
         return observation  # type: ignore[no-any-return]
 
 
@@ -235,7 +246,10 @@ def _imported(id: str) -> None:
 def _why(error: Exception | SystemExit) -> str:
     """What Gymnasium says, with our extra for MuJoCo, which brings a version without faults."""
     said = first_line(error)
-    return f'{said.partition(",")[0]}: pip install "animat[mujoco]"' if "mujoco" in said.lower() else said
+    is_missing = type(error).__name__ == "DependencyNotInstalled" or isinstance(error, ImportError)
+    if is_missing and "mujoco" in said.lower():
+        return f'{said.partition(",")[0]}: pip install "animat[mujoco]"'
+    return said
 
 
 def _expect_sound_mujoco(name: str, env: Any) -> None:

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
@@ -54,8 +54,10 @@ class HostRobot(Robot[Any]):
     by its commands so far.
     """
 
-    packages: ClassVar[tuple[str, ...]] = ()
-    """Installed packages that decide what its bodies do, besides ours."""
+    @property
+    def versions(self) -> dict[str, str]:
+        """Of the installed packages that decide what its bodies do, besides ours."""
+        return {}
 
     keeps_state: bool
     """Whether the same seed and commands give the same episode, whatever was before it."""
@@ -90,7 +92,7 @@ class HostRobot(Robot[Any]):
         """Refused: it is stepped on the host."""
         raise InvalidArgument(
             f"robot: expected one that is stepped in JAX, got {self.name}, which is stepped on the host: train, "
-            "evaluate and run take it, and nothing else does"
+            "evaluate, run, live and studies take it, and nothing else does"
         )
 
     def observe(self, state: Float[Array, " observations"]) -> Float[Array, " observations"]:
@@ -235,7 +237,12 @@ class Bodies:
 
     def _begin(self, body: int) -> None:
         seed = np.random.SeedSequence((*self._seeds[body], int(self._at.episodes[body]))).generate_state(1)[0]
-        self._at.observation[body] = tried(self.robot, "reset", self._bodies[body].reset, int(seed))
+
+        def reset() -> None:
+            # What it gives may be anything.
+            self._at.observation[body] = self._bodies[body].reset(int(seed))
+
+        tried(self.robot, "reset", reset)
         self._at.episodes[body] += 1
         self._at.iterations[body] = 0
 

@@ -13,10 +13,13 @@ from typing import Any
 from animat.differences import description_in, fingerprint_of, first_difference, of_another
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
+from animat.goals.robot import without_goal
 from animat.recordings.formats.csv import stimuli_beside
+from animat.robots.host import HostRobot
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
+from animat.training.settings import LEARNER
 from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished
 
 MANIFEST = "study.json"
@@ -41,11 +44,14 @@ def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
 
         # Another one gives other spikes, also within one version of animat.
         versions["virtual tissue"] = f"revision {REVISION}"
+    for spec in study.robots:
+        if isinstance(robot := without_goal(spec.robot()), HostRobot):
+            versions |= robot.versions
     told: dict[str, Any] = {
         "study": study.to_dict(),
         "sources": sources,
         # Another version may round otherwise, or draw other figures.
-        "versions": {"python": platform.python_version(), **versions},
+        "versions": {"python": platform.python_version(), "learner": f"revision {LEARNER}", **versions},
         "seeds": {"culture": study.culture.seed, "training and evaluation": study.seed},
     }
     # By way of JSON, in which a tuple and a list are the same.

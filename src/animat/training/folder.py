@@ -16,7 +16,7 @@ import numpy as np
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.differences import description_in, fingerprint_of, first_difference, of_another
-from animat.errors import InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.goals.robot import without_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots.checking import check_robot
@@ -25,8 +25,8 @@ from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.course import ASSESSED
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
-from animat.training.settings import FORMER
-from animat.training.specification import Training
+from animat.training.settings import FORMER, LEARNER
+from animat.training.specification import CHUNKS, Training
 from animat.training.varied import expect_varied, varying_in
 from animat.writing import atomic_write
 
@@ -47,6 +47,7 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
         InvalidArgument: naming what of the robot or the mapping was expected, what came, and what can be done.
     """
     check_robot(training.robot)
+    _expect_whole_episodes(training)
     if training.mapping is not None:
         check_mapping(training.mapping)
     else:
@@ -59,15 +60,27 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
             MAPPINGS.expect_loadable(training.mapping, in_workers=True)
 
 
+def _expect_whole_episodes(training: Training) -> None:
+    """Refuse a body whose episodes begin anew at each checkpoint, and never come to their end before."""
+    robot, rounds = training.robot, training.iterations // (CHUNKS * training.algorithm.environments)
+    if isinstance(robot, HostRobot) and not robot.keeps_episodes and robot.episode_limit > rounds:
+        needed = robot.episode_limit * CHUNKS * training.algorithm.environments
+        raise InvalidArgument(
+            f"iterations: expected {needed:,} or more, or an episode_limit of {rounds} or less, as the episodes of "
+            f"{robot.name} cannot be kept in a checkpoint and begin anew at each sixtieth of the training, got "
+            f"{training.iterations:,} iterations and episodes of {robot.episode_limit:,}"
+        )
+
+
 def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
     """What decides how policies come out, as plain data, with a fingerprint over all of it."""
-    packages = ["animat", "jax", "jaxlib", "numpy", "optax"]
+    versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
     if isinstance(training.robot, HostRobot):
-        packages += training.robot.packages
+        versions |= training.robot.versions
     manifest: dict[str, Any] = {
         "training": training.to_dict(),
         "simulators": None if timeline is None else _described(timeline),
-        "versions": {name: importlib.metadata.version(name) for name in packages},
+        "versions": {**versions, "learner": f"revision {LEARNER}"},
     }
     # By way of JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))

@@ -9,6 +9,8 @@ from pydantic import Field
 from animat.errors import InvalidArgument
 from animat.records import Number, Positive, Share, Whole, record
 
+LEARNER = 2
+"""Revision of the learner, raised with every change after which a training gives other policies. 2: exploration."""
 MOST_POLICIES = 1_000
 MOST_ITERATIONS = 2_000_000_000
 """Iterations are counted in 32 bits, with room for a last round of all environments."""

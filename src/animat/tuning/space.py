@@ -108,8 +108,8 @@ def read_space(given: Mapping[str, Any], study: Study) -> Space:
             if name in (*THROUGH_NEURONS, *FITTING):
                 raise InvalidArgument(f"{where}: expected a list of choices, got a table")
             space[name] = read_record(Range, among, where)
-        elif isinstance(among, list) and len(among) > 1 and len({repr(each) for each in among}) == len(among):
-            space[name] = tuple(among)
+        elif isinstance(among, list) and len(among) > 1 and all(each not in among[:i] for i, each in enumerate(among)):
+            space[name] = tuple(_whole(each, own_settings(study)[name]) for each in among)
         else:
             raise InvalidArgument(
                 f"{where}: expected a range {{ low = ..., high = ... }} or a list of two or more different choices, "
@@ -142,8 +142,7 @@ def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], 
     """That the study could be run with every setting of the search: a range is possible where its ends are."""
     for value in (among.low, among.high) if isinstance(among, Range) else among:
         try:
-            if isinstance(value, float) and isinstance(own_settings(study)[name], int) and value.is_integer():
-                value = int(value)
+            value = _whole(value, own_settings(study)[name])
             if name == "mapping" and value == "none":
                 raise InvalidArgument("expected mappings, got 'none'; without neurons nothing else is comparable")
             tried = with_settings(study, {name: value})
@@ -151,6 +150,11 @@ def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], 
                 mapping_named(tried.arms[0].mapping)
         except InvalidArgument as error:
             raise InvalidArgument(f"{where}: {error}") from error
+
+
+def _whole(value: Any, own: Any) -> Any:
+    """A number as whole as the study's own: TOML may have 64.0 for a count."""
+    return int(value) if isinstance(value, float) and isinstance(own, int) and value.is_integer() else value
 
 
 def own_settings(study: Study) -> dict[str, Any]:
