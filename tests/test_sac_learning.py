@@ -135,7 +135,8 @@ def test_only_what_was_written_is_learned_from() -> None:
 
 @pytest.mark.parametrize("commands", [DISCRETE, None])
 def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[float, ...] | None) -> None:
-    # One transition remembered, so the batch is known: that row, over and over. Entropy is not paid for yet.
+    # One transition remembered, so the batch is known: that row, over and over. One environment holds no actions, so the
+    # entropy counts.
     settings = SAC(environments=1, gradient_steps=1, batch=4, replay=10, hidden=8, tau=0.25, learning_rate=0.01)
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
@@ -147,10 +148,10 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
 
     def loss(trained: Trained) -> jax.Array:
         if commands is not None:
-            return sum(discrete_losses(trained, before.targets, batch, settings, 0.0), jnp.float32(0))
+            return sum(discrete_losses(trained, before.targets, batch, settings, 1.0), jnp.float32(0))
         # The noise of the update is drawn inside; the critics' output at the start hardly depends on it.
         return sum(
-            continuous_losses(trained, before.targets, batch, jnp.full((2, 4, 1), 0.5), settings, 0.0), jnp.float32(0)
+            continuous_losses(trained, before.targets, batch, jnp.full((2, 4, 1), 0.5), settings, 1.0), jnp.float32(0)
         )
 
     gradient = jax.jit(jax.grad(loss))(before.trained)

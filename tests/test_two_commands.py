@@ -221,7 +221,7 @@ def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy
 
 def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
     table = evaluate(baseline, None, episodes=40, optimum_resolution=0.5)
-    assert [row.name for row in table.rows] == ["policies", "random", "heuristic"]
+    assert [row.name for row in table.rows] == ["policies", "random", "heuristic", "coupling"]
     assert table.no_optimum is not None and "expected one command for an optimal return, got 2" in table.no_optimum
     # The heuristic policy is the robot's own, for any commands can be given.
     wheels = Wheels(episode_limit=8)
@@ -367,9 +367,10 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
         "--parameters",
         "episode_limit=8",
     ]
-    assert main(["train", "my_wheels:Wheels", *few]) == 1
+    assert main(["train", "my_wheels:Wheels", *few, "--readouts", "all"]) == 1
     assert "expected 2, one for each command of two-wheels, got 1; halves make two" in capsys.readouterr().err
-    assert main(["train", "my_wheels:Wheels", *few, "--readouts", "halves"]) == 0
+    # Two commands read halves, unless asked otherwise.
+    assert main(["train", "my_wheels:Wheels", *few]) == 0
     assert "5 Hz: left 0." in capsys.readouterr().out
     asked = ["--recordings", "recordings", "--episodes", "2"]
     assert main(["evaluate", *asked, "--optimum"]) == 0
