@@ -135,8 +135,8 @@ def test_only_what_was_written_is_learned_from() -> None:
 
 @pytest.mark.parametrize("commands", [DISCRETE, None])
 def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[float, ...] | None) -> None:
-    # One transition remembered, so the batch is known: that row, over and over. One environment holds no actions, so the
-    # entropy counts.
+    # One transition remembered, so the batch is known: that row, over and over. One environment holds no actions, so
+    # the entropy counts.
     settings = SAC(environments=1, gradient_steps=1, batch=4, replay=10, hidden=8, tau=0.25, learning_rate=0.01)
     environment = WithoutNeurons(Cartpole(), commands)
     before = start(environment, settings, jax.random.key(3))
