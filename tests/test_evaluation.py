@@ -265,7 +265,7 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
 
     class Noting:
         def update(self, done: float, total: float, note: str = "") -> None:
-            assert done <= total == 9
+            assert done <= total == 10
             told.append(note)
 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
@@ -273,7 +273,7 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
     environment = Animat(SHORT, Thresholds(1), 3)
     assert found.optimum is not None
     assert replace(found.optimum, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
-    assert told[-2:] == ["shuffled", "optimal return"]
+    assert told[-2:] == ["coupling", "optimal return"]
     assert set(found.optimum.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))
@@ -292,7 +292,10 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
 
     # Nothing else changes by it, and nothing is told of it where it was not asked for.
     assert plainly.optimum is None and plainly.no_optimum is None
-    assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in data["rows"]]
+    # The best coupling is the last row; it comes with the optimum alone.
+    shared, (reflex,) = data["rows"][:-1], data["rows"][-1:]
+    assert reflex["name"] == "coupling" and reflex["mean_return"] == data["context"]["coupling"]
+    assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in shared]
     assert "score" not in plainly.to_text() and "optimal return" not in plainly.to_text()
     assert {row["normalised_score"] for row in plainly.to_dict()["rows"]} == {None}
 
