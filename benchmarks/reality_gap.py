@@ -12,8 +12,9 @@ recorded at 0 and 10 min (without options at 0 and 5), policies are trained on t
 culture from where the last recording left it.
 Everything is kept under `--out`, one folder each; what is there already is not done again.
 
-With `--backends` each culture is opened once, recorded once as in `memory9`, and run: the virtual culture with so many
-channels, the CL1 through its SDK's simulator and the MaxOne through the tests' stand-in, both over the same tissue.
+With `--backends` each culture is opened once, recorded at 0 and 5 min as without options, and run by policies that
+are trained as without options: the virtual culture with so many channels, the CL1 through its SDK's simulator and the
+MaxOne through the tests' stand-in, both over the same tissue.
 """
 
 from __future__ import annotations
@@ -151,33 +152,34 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
     None for a session that did not end by its plan.
     """
     from animat.cultures.kinds import pulse_for
+    from animat.cultures.living_series import record_living_series
     from animat.reality_gap import Calibration, run_policies
-    from animat.recordings.formats.nwb import write_nwb
+    from animat.recordings.reading import read_recording
     from animat.responses.series import extract_series
     from animat.stimulation.protocol import CLOSED_LOOP
     from animat.training.policy import load_policies
 
-    way = WAYS["memory9"]
     folder = options.out / f"culture{seed}" / f"{backend}{channels or ''}" / robot
     table = folder / "once.json"
     if not table.exists():
+        # A culture that was left half way is not there again.
+        attempt = next(path for i in itertools.count() if not (path := folder / f"attempt{i}").exists())
         with backends.opened(backend, channels, seed) as culture:
             pulse = pulse_for(backend)
             protocol = replace(CLOSED_LOOP, patterns=min(100, len(culture.patterns)), pulse=pulse)
-            recording = culture.record(protocol, seed=seed)
-            recordings = folder / f"recordings{int(culture.now_s)}"
-            recordings.mkdir(parents=True, exist_ok=True)
-            write_nwb(recording, recordings / "recording.nwb")
-            given = training_options(way, robot, options.policies, options.iterations)
-            out = str(free(folder / "policies"))
-            expect(["train", robot, "--recordings", str(recordings), *given, "--out", out])
+            series = record_living_series(
+                culture, protocol, attempt / "recordings", sessions=2, interval_min=5, seed=seed
+            )
+            out = str(attempt / "policies")
+            iterations = ["--iterations", str(options.iterations)] if options.iterations else []
+            expect(["train", robot, "--recordings", str(attempt / "recordings"), *iterations, "--out", out])
             policies = load_policies(out)
-            calibration = Calibration.of_series(extract_series([recording]), next(iter(policies.values())))
+            recordings = extract_series([read_recording(file) for file in series.files])
             gap = run_policies(
                 policies,
                 culture,
-                calibration,
-                free(folder / "session"),
+                Calibration.of_series(recordings, next(iter(policies.values()))),
+                attempt / "session",
                 episodes=options.episodes,
                 with_controls=options.controls,
                 pulse=pulse,
@@ -185,10 +187,10 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
             )
         outcome = gap.to_dict()
         if outcome["session"]["ended_by"] != "plan":
-            print(f"{folder}: no row: {outcome['session']['ended']}", file=sys.stderr)
+            print(f"{attempt}: no row: {outcome['session']['ended']}", file=sys.stderr)
             return None
         table.write_text(json.dumps(outcome) + "\n")
-    return told(seed, way, "adaptive", read_table(table))
+    return told(seed, None, "adaptive", read_table(table))
 
 
 FORMER = {"lived": "measured", "limit": "optimum"}

@@ -22,6 +22,8 @@ class Slider(gymnasium.Env[Any, Any]):
         self.made, self.steps = 0.0, 0
         if fault == "levels":
             self.action_space = Discrete(3, start=-1)
+        elif fault == "pair":
+            self.action_space = Box(-1.0, 1.0, (2,), np.float32)
         elif fault in ("dict", "multi-binary"):
             self.action_space = Dict(a=SEEN) if fault == "dict" else MultiBinary(3)
         elif fault == "unbounded":
@@ -90,3 +92,4 @@ gymnasium.register(
     ),
 )
 gymnasium.register("Endless-v0", Slider)
+gymnasium.register("Pair-v0", Slider, max_episode_steps=20, kwargs={"fault": "pair"})

@@ -48,10 +48,10 @@ def pytest_configure(config: pytest.Config) -> None:
 def caches() -> Iterator[None]:
     """Compile each program once a machine, not once a run of the tests; libraries that want a cache have one."""
     # Not before XLA's flags are set.
-    from animat.compilation import keep_compilations, user_cache
+    from animat.compilation import keep_compilations, pynwb_importable
 
     keep_compilations()
-    with user_cache():
+    with pynwb_importable():
         yield
 
 

@@ -156,6 +156,7 @@ def test_links_that_reach_nothing_and_too_long_steps_are_refused() -> None:
         TwoLinkArm(damping_n_m_s=0.1)
 
 
+@pytest.mark.oracle
 def test_the_heuristic_brings_the_tip_to_the_target() -> None:
     environment = WithoutNeurons(TwoLinkArm(), None)
     by_rule = roll_out(environment, None, Heuristic(), 1, episodes=100, seed=1).returns

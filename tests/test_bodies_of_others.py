@@ -27,10 +27,12 @@ from animat.errors import BodyFailed, InvalidArgument
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
+from animat.reality_gap.predicting import episodes_on_host
 from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.host import Bodies, Standing
 from animat.robots.registry import REGISTRY
+from animat.studies.paths import record_paths
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group, train_group
 from animat.training.host import programs_on_host
@@ -52,6 +54,11 @@ def named(name: str, **parameters: Any) -> GymnasiumRobot:
 def training(robot: Any, mapping: Any = None, **more: Any) -> Training:
     settings = {"policies": 2, "iterations": 2_400, "duration_min": 60.0, "algorithm": SMALL} | more
     return Training(robot, mapping, **settings)
+
+
+@pytest.mark.parametrize(("limit", "episodes"), [(20, 20), (200, 20), (500, 8), (1000, 4), (5000, 4)])
+def test_long_episodes_are_predicted_from_fewer(limit: int, episodes: int) -> None:
+    assert episodes_on_host(named("Slider", episode_limit=limit)) == episodes
 
 
 def test_spaces_become_commands_observations_and_limits() -> None:
@@ -154,7 +161,13 @@ class Stopping:
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(("name", "mapping"), [("Slider", None), ("Levels", Thresholds(1)), ("Remembers", None)])
+@pytest.mark.parametrize(
+    ("name", "mapping"),
+    [
+        ("Slider", None),
+        *(pytest.param(*each, marks=pytest.mark.oracle) for each in (("Levels", Thresholds(1)), ("Remembers", None))),
+    ],
+)
 def test_stopped_and_started_again_it_ends_in_the_same_bits(name: str, mapping: Any, tmp_path: Path) -> None:
     timeline = None if mapping is None else timeline_of()
     asked = training(named(name), mapping)
@@ -174,6 +187,7 @@ def test_stopped_and_started_again_it_ends_in_the_same_bits(name: str, mapping: 
     assert 0 < episodes <= 2_400
 
 
+@pytest.mark.oracle
 def test_it_learns_what_can_be_learned(tmp_path: Path) -> None:
     """To stay in the middle: the reward of any other place is less; of random commands it drifts away by their mean."""
     asked = training(named("Slider"), policies=1, iterations=16_000, algorithm=replace(SMALL, hidden=32, batch=64))
@@ -201,6 +215,7 @@ def test_evaluation_counts_whole_episodes_whatever_their_number() -> None:
     assert np.corrcoef(starts, -still.returns[0])[0, 1] > 0.9
 
 
+@pytest.mark.oracle
 def test_through_neurons_conditions_are_counted_and_the_optimum_needs_a_grid(tmp_path: Path) -> None:
     policies = trained(training(named("Levels"), Thresholds(1)), timeline_of(), tmp_path)
     table = evaluate(policies, timeline_of(), episodes=6, optimum_resolution=1.0)
@@ -282,6 +297,7 @@ def test_a_module_that_is_not_installed_is_named(capsys: pytest.CaptureFixture[s
         assert words in told and told.count("\n") == 1
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(("name", "words"), [("Raises", "a wheel came off"), ("Nan", "NaN"), ("Hangs", "it hangs")])
 def test_a_fault_in_training_costs_nothing_that_was_finished(
     name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -300,6 +316,7 @@ def test_a_fault_in_training_costs_nothing_that_was_finished(
     assert train_group(group, checkpoint, Stopping(10**9), checkpoint_s=0.0)
 
 
+@pytest.mark.oracle
 def test_it_trains_evaluates_and_is_listed_on_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -362,6 +379,7 @@ def slowly(call: Any) -> Any:
     return called
 
 
+@pytest.mark.oracle
 def test_the_alarm_of_others_and_bodies_that_catch_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = named("Slider")
 
@@ -383,6 +401,7 @@ def test_the_alarm_of_others_and_bodies_that_catch_everything(monkeypatch: pytes
         signal.signal(signal.SIGALRM, before)
 
 
+@pytest.mark.oracle
 def test_a_body_that_cuts_itself_off_early_does_not_end_the_return(monkeypatch: pytest.MonkeyPatch) -> None:
     step = bodies_of_others.Slider.step
 
@@ -414,3 +433,16 @@ def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:
     assert REGISTRY.name_of(f"{TOY}Endless-v0") == named("Endless", episode_limit=9).name
     with pytest.raises(InvalidArgument, match="No module named 'nobody_has_this'"):
         REGISTRY.name_of("gymnasium:nobody_has_this:Rover-v0")
+
+
+def test_an_episode_of_two_commands_is_kept_whole() -> None:
+    """What a study keeps of an episode: a number a command, and where the body came by them."""
+    robot = named("Pair")
+    environment = WithoutNeurons(robot, None)
+    kept = record_paths(environment, None, Uniform(), 2, seed=3)
+    assert kept.commands.shape == (2, 20, 2) and kept.observations.shape == (2, 21, 2)
+    for actor, (observations, commands) in enumerate(kept.whole()):
+        body = Bodies(robot, [(3, actor)])
+        body.begin()
+        for seen, command in zip(observations[1:], commands, strict=True):
+            np.testing.assert_array_equal(body.step(np.array([command], np.float32)).observation[0], seen)

@@ -48,7 +48,7 @@ WHOLE = 3000
 _whole: list[Any] = []
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.lists(st.integers(1, 700), min_size=1, max_size=30))
 def test_pieces_do_not_change_what_is_read(pieces: list[int]) -> None:
     if not _whole:

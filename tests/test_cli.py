@@ -77,6 +77,7 @@ def test_what_training_reports_is_what_the_deployed_policies_get(
     assert f"1 policy in {tmp_path}; mean return on the simulator at 10 min: {reported['returns']['p0']:.1f}" in printed  # type: ignore[index]
 
 
+@pytest.mark.oracle
 def test_settings_of_the_algorithm_are_those_that_policies_are_trained_with(recordings: Path, tmp_path: Path) -> None:
     few = ["--policies", "1", "--iterations", "640", "--sac", "discount=0.9", "hidden=8", "environments=16"]
     assert main(["train", "cartpole", "--recordings", str(recordings), *few, "--out", str(tmp_path)]) == 0
@@ -130,6 +131,21 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     told = last_json(capsys.readouterr().out)
     assert told["recorded_at_min"] == 0.0
     assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
+
+
+@pytest.mark.oracle
+def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "3"]
+    assert main([*command, "--interventions", "--json"]) == 0
+    said = capsys.readouterr().out
+    told: dict[str, Any] = last_json(said)["whose_work"]  # type: ignore[assignment]
+    names = [row["name"] for row in told["rows"]]
+    changed = ["ideal actuator", "random spikes", "silent", "shuffled", "yoked", "turned round"]
+    assert names == ["as they are", *changed]
+    of_each = last_json(said)["policies"].values()  # type: ignore[attr-defined]
+    assert told["rows"][0]["mean_return"] == pytest.approx(np.mean(list(of_each)))
+    assert "whose work is it: the same policies" in said and "the robot has one goal alone" in said
+    assert main([*command[:2], "--episodes", "2", "--interventions"]) == 1
 
 
 @pytest.mark.oracle
@@ -518,7 +534,10 @@ def test_inspect_refuses_its_options_before_the_files(
         (
             ["train", "unicycle"],
             1,
-            ["robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'unicycle'", "module:Class"],
+            [
+                "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'unicycle'",
+                "module:Class",
+            ],
         ),
         (["train", "cartpole", "--polices", "3"], 2, ["animat: unknown option --polices; did you mean --policies?"]),
         (["record", "--sesions=2"], 2, ["animat: unknown option --sesions=2; did you mean --sessions?"]),

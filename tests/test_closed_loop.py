@@ -194,7 +194,12 @@ def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Ro
             progress=SimpleNamespace(update=lambda *told: said.append(told)),
         )
     last = [tick for tick in session.ticks if tick.episode == 5 and tick.reward is not None]
-    assert said[-1] == (6, 6, f"{last[0].agent}: return {sum(tick.reward or 0.0 for tick in last):.1f}")
+    returns = [[sum(t.reward or 0.0 for t in session.ticks if t.episode == i)] for i in range(6)]
+    names_of = [next(t.agent for t in session.ticks if t.episode == i) for i in range(6)]
+    means = {name: np.mean([r for r, of in zip(returns, names_of, strict=True) if of == name]) for name in names_of}
+    so_far = ", ".join(f"{name} {mean:.1f}" for name, mean in means.items())
+    assert said[-1] == (6, 6, f"{last[0].agent}: return {returns[-1][0]:.1f}; means: {so_far}")
+    assert [done for done, *_ in said] == sorted(done for done, *_ in said)
     assert {tick.handled for tick in session.ticks} == {"used", "repeated"}
     assert_table_is_the_session(tmp_path, names)
     said = read_recording(session.recording_file).provenance["session_description"]
@@ -205,6 +210,7 @@ def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Ro
     assert session.ticks_file.read_bytes() == written
 
 
+@pytest.mark.oracle
 def test_on_the_virtual_culture_too(tmp_path: Path) -> None:
     loop = loop_of(pulses=5, percentiles=np.linspace(0, 40, 11), burst_threshold=0.9)
     with small_culture() as culture:

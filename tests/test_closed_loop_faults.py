@@ -27,7 +27,7 @@ from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.request import Request
 from animat.cultures.safety import SIMULATED_LIMITS
-from animat.errors import InvalidFile, UnsafeStimulus, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, UnsafeStimulus, UnusableData
 from animat.recordings.reading import read_recording
 from animat.robots import Navigation
 from animat.stimulation.pulse import BALANCED_PULSE
@@ -172,6 +172,50 @@ def test_a_connection_that_is_lost_between_two_stimuli(tmp_path: Path) -> None:
             assert session.ending.by == "culture"
             assert "the connection to the culture is lost" in session.ending.message
             assert_safe(session, culture, 3)
+
+
+@pytest.mark.parametrize("at", [0, 1, 8])
+def test_a_file_ends_the_session_before_the_next_pulse(tmp_path: Path, at: int) -> None:
+    pulses: list[int] = []
+
+    def asking(culture: FakeCulture, observed: Observed) -> Observed:
+        pulses.append(culture.pulses)
+        (tmp_path / "STOP").touch()
+        return observed
+
+    with FakeCulture(fault=asking, at=at) as culture:
+        session = run(tmp_path, culture, robot=LONG)
+        # Those of the delivery under way had been given when the file was made.
+        assert pulses == [culture.pulses]
+        assert session.ending.by == "person"
+        assert session.ending.message == "stopped by a person (the file STOP)"
+        assert read_session(tmp_path).ending == session.ending
+        assert culture.is_stopped and culture.halted and culture.after_halt == 0
+
+
+def test_a_file_ends_a_session_whose_culture_is_still_answering(tmp_path: Path, little_grace: None) -> None:
+    released = threading.Event()
+
+    def answering(culture: FakeCulture, observed: Observed) -> Observed:
+        (tmp_path / "STOP").touch()
+        released.wait(60)
+        return observed
+
+    with FakeCulture(fault=answering, at=8) as culture:
+        try:
+            session = run(tmp_path, culture, robot=LONG)
+            assert session.ending.by == "person"
+            assert_safe(session, culture, 7)
+        finally:
+            released.set()
+
+
+def test_a_file_of_before_is_refused_and_no_pulse_is_given(tmp_path: Path) -> None:
+    (tmp_path / "STOP").touch()
+    with FakeCulture() as culture, pytest.raises(InvalidArgument, match="STOP: expected none yet"):
+        run(tmp_path, culture)
+    assert culture.deliveries == 0
+    assert [file.name for file in tmp_path.iterdir()] == ["STOP"]
 
 
 @pytest.fixture
@@ -631,6 +675,7 @@ with FakeCulture(fault=slowly, at=0) as culture:
 """
 
 
+@pytest.mark.oracle
 def test_killed_outright_it_loses_at_most_a_second(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent

@@ -15,9 +15,10 @@ from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation import coupling
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.coupling import Coupling, best_coupling, context_gap
+from animat.evaluation.coupling import ContextGap, Coupling, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import roll_out
+from animat.evaluation.statistics import Interval
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Quantity, Robot, Wheels, robot_named
 
@@ -71,6 +72,7 @@ def mean_return(environment: Any, simulator: Any, found: Coupling) -> float:
     return float(roll_out(environment, simulator, found, 1, episodes=4000, seed=99).returns.mean())
 
 
+@pytest.mark.oracle
 def test_the_best_coupling_of_a_continuous_command_is_found() -> None:
     environment = WithoutNeurons(Copying(), None)
     found = best_coupling(environment, None)
@@ -79,6 +81,7 @@ def test_the_best_coupling_of_a_continuous_command_is_found() -> None:
     np.testing.assert_allclose(np.asarray(found.weights)[0, 0], [2.0, -1.0, 0.5], atol=0.3)
 
 
+@pytest.mark.oracle
 def test_the_best_coupling_through_neurons_is_found() -> None:
     simulator = synthetic_simulator()
     environment = Animat(Siding(), Thresholds(1), 5)
@@ -143,7 +146,7 @@ def test_the_context_score_is_0_for_a_coupling_and_1_for_the_optimum() -> None:
     drawn = of_coupling[rng.integers(400, size=(20_000, 400))].mean(axis=1)
     policies = np.array([80.0, 90.0, 100.0, 95.0, 85.0, 100.0, 80.0, 90.0, 92.0, 88.0])
     score = gap.score(policies, best)
-    again = rng.normal(policies.mean(), policies.std(ddof=1) / np.sqrt(10), 20_000)
+    again = policies.mean() + policies.std(ddof=1) / np.sqrt(10) * rng.standard_t(9, 20_000)
     ends = np.quantile((again - drawn) / (140 - drawn), [0.025, 0.975])
     assert score is not None
     np.testing.assert_allclose([score.low, score.high], ends, atol=0.05 * np.ptp(ends))
@@ -159,3 +162,24 @@ def test_known_tasks(robot: str, least: float, most: float, monkeypatch: pytest.
     monkeypatch.setattr(coupling, "GENERATIONS", 2 * coupling.GENERATIONS)
     twice = mean_return(environment, simulator, best_coupling(environment, simulator))
     assert abs(twice - once) < 0.01 * (once + 80)
+
+
+@pytest.mark.parametrize("n", [2, 4, 10])
+def test_the_scores_interval_holds_the_true_score_as_often_as_it_says(n: int) -> None:
+    rng = np.random.default_rng(n)
+    gap, best = ContextGap(40.0, 0.0, Interval(0.7, 0.6, 0.8, 0.95)), optimum_of(140.0)
+    scores = [gap.score(rng.normal(90.0, 20.0, n), best) for _ in range(4_000)]
+    holds = np.mean([score is not None and score.low <= 0.5 <= score.high for score in scores])
+    assert holds == pytest.approx(0.95, abs=0.015)
+
+
+def test_the_optimums_grid_is_in_the_scores_interval() -> None:
+    gap = ContextGap(40.0, 0.0, Interval(0.7, 0.6, 0.8, 0.95))
+    score = gap.score(np.array([90.0, 90.0]), optimum_of(140.0, 10.0))
+    assert score is not None and score.high - score.value == pytest.approx(0.5 * 10 / 100)
+
+
+def test_of_one_episode_there_is_no_gap() -> None:
+    gap = context_gap(np.array([40.0]), np.array([-10.0]), optimum_of(90.0))
+    assert gap.gap is None and not gap.needs_context and gap.to_dict()["coupling_standard_error"] is None
+    assert gap.to_text() == "best coupling 40.0; no context gap of one episode"

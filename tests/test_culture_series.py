@@ -106,6 +106,7 @@ def test_a_state_that_is_behind_its_recordings_catches_up(undisturbed: list[Path
     assert same(record(tmp_path / "behind"), undisturbed)
 
 
+@pytest.mark.oracle
 def test_killed_after_the_last_recording_its_state_is_made_too(
     undisturbed: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

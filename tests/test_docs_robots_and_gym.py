@@ -37,7 +37,7 @@ def test_the_examples_run(page: str, tmp_path, monkeypatch, capsys) -> None:
     examples = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
     assert examples
     for example in examples:
-        if "MoviePy" in example and not importlib.util.find_spec("moviepy"):
+        if "RecordVideo" in example and not importlib.util.find_spec("moviepy"):
             continue
         exec(compile(example, page, "exec"), names)
     assert page != "gymnasium.md" or "delivered" in capsys.readouterr().out

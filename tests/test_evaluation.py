@@ -193,6 +193,7 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
         assert row.name in evaluation.to_text()
 
 
+@pytest.mark.oracle
 def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() -> None:
     """Held ones are the first recording's, whichever answers; the truth is a roll-out with them put in by hand."""
     timeline = timeline_of()
@@ -331,6 +332,7 @@ def test_without_neurons_the_optimum_is_a_pole_kept_up_to_the_end() -> None:
     assert "none for" not in evaluation.to_text()
 
 
+@pytest.mark.oracle
 def test_where_there_is_no_optimum_or_no_score_a_line_says_so() -> None:
     wide = replace(WITHOUT_NEURONS, robot=Cartpole(angle_limit_rad=1.0, episode_limit=10))
     unknown = evaluate({"a": wide}, None, episodes=3, optimum_resolution=0.25)
@@ -356,6 +358,7 @@ def test_shuffling_makes_every_policy_a_random_one() -> None:
     assert abs(rows["random"].mean() - rows["shuffled"].mean()) < 4 * error
 
 
+@pytest.mark.oracle
 def test_without_neurons_there_is_nothing_to_silence() -> None:
     evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=4)
     assert [row.name for row in evaluation.rows] == ["policies", "random", "constant -1", "constant +1", "heuristic"]
@@ -389,6 +392,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
         evaluate({"a": policy}, fit_timeline([responses_of([1.0, 2.0], [3.0, 4.0])]))
 
 
+@pytest.mark.oracle
 def test_another_presentation_or_window_is_said() -> None:
     timeline = timeline_of()
     other = fit_timeline(

@@ -66,6 +66,7 @@ def test_the_folder_is_held_while_a_culture_is_opened_and_taken_away_if_that_fai
     assert not (tmp_path / "in").exists()
 
 
+@pytest.mark.oracle
 def test_a_session_that_still_runs_is_not_recovered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*command("run on recordings", tmp_path), "--culture", "replay", "--episodes", "1"]) == 0
     session = tmp_path / "in" / "out"

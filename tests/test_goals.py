@@ -22,7 +22,7 @@ from animat.goals.goal import Goal, Objective
 from animat.goals.region import Ball, Range
 from animat.goals.robot import RobotWithGoal, body_and_goal, robot_of, with_goal, without_goal
 from animat.goals.text import read_goal
-from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, SwingUp, robot_named
+from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, Shuttle, SwingUp, robot_named
 from animat.robots.capabilities import lacking
 from animat.robots.checking import check_robot
 from animat.robots.grid import grid_for, no_grid
@@ -102,17 +102,26 @@ def along(goal: str, xs: list[float], limit: int = 4) -> tuple[list[float], list
         ("reach x above 0.5 m; drive x above 0 m", [0.1, -0.2, 0.9], [-0.5, -1, 50], True, True, [100, 200 / 3], 0.2),
         ("reach x above 0.5 m weight 3; reach x below -0.5 m", [-0.7], [25], True, True, [40, 100], 0.1),
         ("reach x above 0.5 m; avoid x above 0.5 m", [0.7], [-104], True, False, [100, 0], -0.1),
+        # It may fail in the iteration in which it reaches; and beside an open edge it is not inside.
+        ("reach x above 0.5 m; drive x in -0.1..0.1 m within 1", [0.2, 0.9], None, True, False, None, -0.4),
+        ("minimize x below 0.0 m", [0.2, 0.2, 0.2, 0.0], None, False, False, None, 0.0),
         ("drive x in 0.2..0.6 m and x above 0.5 m", [0.5, 0.55, 0.3, 0.6], [0, 1, 0, 1], False, True, [50], 0.0),
     ],
 )  # fmt: skip
 def test_rewards_ends_and_outcome_are_those_counted_by_hand(
-    goal: str, xs: list[float], rewards: list[float], ends: bool, succeeded: bool, satisfaction: list[float], margin
+    goal: str,
+    xs: list[float],
+    rewards: list[float] | None,
+    ends: bool,
+    succeeded: bool,
+    satisfaction: list[float] | None,
+    margin: float,
 ) -> None:
     got, ended, outcome = along(goal, xs)
-    assert got == pytest.approx(rewards, abs=1e-5)
+    assert rewards is None or got == pytest.approx(rewards, abs=1e-5)
     assert ended == [False] * (len(xs) - 1) + [ends]
     assert bool(outcome.succeeded) is succeeded
-    assert np.asarray(outcome.satisfaction).tolist() == pytest.approx(satisfaction, abs=1e-3)
+    assert satisfaction is None or np.asarray(outcome.satisfaction).tolist() == pytest.approx(satisfaction, abs=1e-3)
     assert float(outcome.margin) == pytest.approx(margin, abs=1e-5)
 
 
@@ -133,6 +142,7 @@ GOALS = st.lists(OBJECTIVES, min_size=1, max_size=4, unique=True).map("; ".join)
 PATHS = st.lists(st.integers(-10, 10).map(lambda i: i / 10 + 0.031), min_size=6, max_size=6)
 
 
+@pytest.mark.oracle
 @settings(max_examples=30, deadline=None)
 @given(GOALS, PATHS, st.sampled_from([0.5, 0.99, 1.0]))
 def test_shaping_adds_up_to_the_start_whatever_is_done_and_outcome_and_margin_agree(
@@ -244,6 +254,7 @@ CARTPOLE = "avoid pole_angle outside -12..12 deg; avoid cart_position outside -0
 NAVIGATION = "reach x, y around 0.7, 0.7 radius 0.1 m"
 
 
+@pytest.mark.oracle
 def test_the_cartpole_as_a_goal_has_its_own_rewards_and_ends() -> None:
     own, robot = Cartpole(), with_goal("cartpole", CARTPOLE)
     assert robot.return_range == own.return_range
@@ -319,6 +330,16 @@ def test_what_a_robot_can_do_besides_it_still_can() -> None:
     assert slider == with_goal(Slider(), "reach x above 50 cm") or slider.goal != read_goal("reach x above 50 cm")
     assert hash(robot) == hash(pickle.loads(pickle.dumps(robot))) and pickle.loads(pickle.dumps(robot)) == robot
     assert replace(robot, robot=SwingUp(mass_kg=2.0)).robot.mass_kg == 2.0
+
+
+def test_its_own_goal_can_be_switched_where_the_body_s_can() -> None:
+    robot, plain = with_goal(Shuttle(), "reach cart_position above 0.2 m"), Shuttle()
+    state, other = robot.reset(jax.random.key(1)), robot.reset(jax.random.key(2))._replace()
+    other = other._replace(robot=other.robot._replace(cue=-state.robot.cue))
+    switched = robot.with_goal_of(state, other)
+    assert float(switched.robot.cue) == -float(state.robot.cue)
+    assert switched.robot == plain.with_goal_of(state.robot, other.robot)
+    assert not hasattr(with_goal(Cartpole(), "avoid pole_angle above 12 deg"), "with_goal_of")
 
 
 def test_roll_outs_tell_what_each_episode_came_to() -> None:
@@ -405,13 +426,15 @@ def test_units_are_those_of_the_robot() -> None:
         ("avoid pole_angle in 1.. rad", "expected a number"),
         ("avoid pole_angle above nan rad", "finite"),
         ("reach pole_angle above 1 rad and pole_angle below 0 rad", "an empty region"),
+        ("drive pole_angle outside 0..1 deg and pole_angle in 0.2..0.5 deg", "an empty region"),
+        ("avoid pole_angle above 1 rad weight 1e308", "weight: expected at most"),
         ("reach pole_angle, cart_position around 0, 0 radius 1 m", "expected a quantity in rad"),
         ("reach cart_position, cart_position around 0 radius 1 m", "a centre of 2 numbers"),
         ("reach cart_position around 0 radius -1 m", "radius: expected more than 0"),
         ("drive pole_angle in -1..1 deg within 0", "within: expected at least 1"),
         ("drive pole_angle in -1..1 deg within 2.5", "within: expected a whole number"),
         ("avoid pole_angle above 1 rad within 3", "within: expected it of drive only"),
-        ("drive pole_angle in -1..1 deg weight -1", "weight: expected more than 0"),
+        ("drive pole_angle in -1..1 deg weight -1", "weight: expected at least 1e-06"),
         ("drive pole_angle in -1..1 deg weight 1 weight 2", "got 'weight'"),
         ("maximize pole_angle below 3 rad", "maximize: expected one quantity above a threshold"),
         ("minimize x, y around 3, 3 radius 1 m", "minimize: expected one quantity below a threshold"),

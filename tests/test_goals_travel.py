@@ -42,6 +42,7 @@ GOAL = "avoid pole_angle outside -12..12 deg; avoid cart_position outside -0.5..
 TINY = SAC(environments=4, gradient_steps=1, batch=8, replay=64, hidden=4)
 
 
+@pytest.mark.oracle
 def test_what_is_learned_from_is_shaped_and_what_is_reported_is_not() -> None:
     robot = with_goal("navigation", "reach x, y around 0.7, 0.7 radius 0.1 m")
     environment = EpisodeLimit(WithoutNeurons(robot, (-1.0, 1.0)))
@@ -64,6 +65,7 @@ def test_trainings_without_a_goal_are_told_as_before() -> None:
     assert "goal" not in own.to_dict()["robots"][0] and "goal" not in study_to_toml(own)
 
 
+@pytest.mark.oracle
 def test_policies_carry_their_goal_and_are_evaluated_with_it(tmp_path: Path) -> None:
     robot = with_goal("cartpole", GOAL)
     training = Training(robot, None, policies=1, iterations=64, commands=(-1.0, 1.0), algorithm=TINY)
@@ -93,6 +95,7 @@ def test_a_fingerprint_is_of_the_goal_too() -> None:
     assert len({describe_study(each, {})["fingerprint"] for each in studies}) == 2
 
 
+@pytest.mark.oracle
 def test_the_command_line_takes_a_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(tmp_path / "policies")
     sac = [f"{name}={getattr(TINY, name)}" for name in ("environments", "gradient_steps", "batch", "replay", "hidden")]

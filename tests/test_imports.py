@@ -19,6 +19,7 @@ GROUND = (
     "ctrl_c",
     "differences",
     "errors",
+    "extras",
     "lined_up",
     "plain_file",
     "progress",
@@ -49,6 +50,7 @@ STORY = (
     "report",
     "studies",
     "tuning",
+    "watch",
     "gym",
     "cli",
 )

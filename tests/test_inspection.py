@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,15 @@ def test_stimuli_that_leave_no_quiet_are_said_to_be_untested() -> None:
     assert names(extract_responses(answered))["window-not-tested"] == "note"
     # An empty window needs no comparison.
     assert names(extract_responses(recording([], stimulus_s)))["dead-window"] == "refuse"
+
+
+def test_a_burst_in_the_only_quiet_there_is_makes_no_window_dead() -> None:
+    # Before the first of many fast stimuli there is a fifth of a second of quiet, and a burst fills it.
+    stimulus_s = np.arange(1, 9, 0.05)
+    burst = [(t, 0) for t in np.arange(0.8, 0.98, 1e-3)]
+    answered = recording([*burst, *((t + 0.005, 0) for t in stimulus_s)], stimulus_s)
+    found = names(extract_responses(answered))
+    assert found["window-not-tested"] == "note" and "dead-window" not in found
 
 
 def test_a_response_in_a_single_moment_is_one() -> None:
@@ -261,7 +271,8 @@ def test_figures_name_units_and_conditions() -> None:
     labels = [condition.label for condition in responses.conditions]
     raster = draw_raster(source, responses)
     legend = [text.get_text() for text in axes_of(raster)[1].get_legend().get_texts()]
-    assert legend == ["window 2-10 ms", "stimulus", *labels]
+    assert legend == ["window 2-10 ms", "stimulus"]
+    assert [text.get_text() for text in axes_of(raster)[1].get_yticklabels()] == labels
     histograms = draw_response_histograms(responses)
     titles = [axes.get_title(loc="left") for axes in axes_of(histograms)]
     assert [title.split(":")[0] for title in titles] == labels
@@ -272,9 +283,30 @@ def test_figures_name_units_and_conditions() -> None:
     assert len(panels.axes) == 4
     for figure in (raster, psth, panels):
         for axes in axes_of(figure):
-            assert axes.get_xlabel().endswith(UNITS), axes.get_xlabel()
+            assert axes.get_label() == "<colorbar>" or axes.get_xlabel().endswith(UNITS), axes.get_xlabel()
             assert axes.get_ylabel().endswith(UNITS), axes.get_ylabel()
     assert histograms.get_supxlabel().endswith(UNITS)
+
+
+def test_a_raster_of_many_spikes_shades_rates_and_names_only_conditions_with_rows() -> None:
+    """Dots run into one where there are more than can be told apart."""
+    few = answering({5: 10.0, 10: 10.0})
+    lower = axes_of(draw_raster(few, extract_responses(few)))[1]
+    assert len(lower.images) == 0 and len(lower.collections) == 1
+    many = SyntheticCulture(seed=1).record(0.0)
+    responses = extract_responses(many)
+    lower = axes_of(draw_raster(many, responses))[1]
+    (image,) = lower.images
+    rows = image.get_array()
+    # The rate of a row within the window is its response, as it is read: the window is whole bins.
+    assert rows.shape == (300, 70)
+    chosen = np.linspace(0, len(responses) - 1, 300).round().astype(int)
+    chosen = chosen[np.argsort(responses.condition[chosen], kind="stable")]
+    np.testing.assert_allclose(rows[:, 22:30].mean(axis=1), responses.rate_hz[chosen], atol=0.5)
+    assert [text.get_text() for text in lower.get_yticklabels()] == [c.label for c in responses.conditions]
+    without = replace(responses, condition=np.where(responses.condition == 2, 1, responses.condition))
+    lower = axes_of(draw_raster(many, without))[1]
+    assert [text.get_text() for text in lower.get_yticklabels()] == ["5 Hz", "10 Hz", "40 Hz", "80 Hz"]
 
 
 def test_an_artefact_does_not_dwarf_the_response_in_the_figure() -> None:

@@ -8,6 +8,8 @@ import os
 import random
 import re
 import shutil
+import signal
+import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
@@ -20,7 +22,7 @@ from animat.errors import AnimatError, InvalidFile
 from animat.execution.jobs import Job, Jobs, in_order
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, digest_of, receipt_path
-from animat.execution.task import Task, carry_out, reported
+from animat.execution.task import Task, carry_out, carry_out_alone, reported
 from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.synthetic import synthetic_recording
@@ -218,3 +220,34 @@ def test_a_recording_is_known_by_what_it_says_not_by_what_nwb_adds(tmp_path: Pat
     assert receipt.changed(tmp_path) == ["a.nwb"]
     made.write_bytes(made.read_bytes()[:1000])
     assert receipt.changed(tmp_path) == ["a.nwb"]
+
+
+@pytest.mark.parametrize("freezes", [False, True])
+def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
+    freezes: bool, ours: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.execution.task.SILENT_S", 1.0 if freezes else 60.0)
+    (notice := tmp_path / "told" / "a.json").parent.mkdir()
+    log = tmp_path / "log"
+    elsewhere = ours.submit(carry_out_alone, Join("a", log=log, takes_s=0.5), tmp_path, notice)
+    while not log.exists():
+        time.sleep(0.01)
+    (at_work,) = [pid for pid in children() if str(notice.with_suffix(".lock")) in open_files(pid)]
+    if freezes:
+        os.kill(at_work, signal.SIGSTOP)
+    try:
+        carry_out_alone(Join("a", log=log), tmp_path, notice)
+    finally:
+        os.kill(at_work, signal.SIGCONT)
+    elsewhere.result()
+    order = ["begins", "begins", "ends", "ends"] if freezes else ["begins", "ends", "begins", "ends"]
+    assert [line.split()[1] for line in log.read_text().splitlines()] == order
+    assert (tmp_path / "a").read_text() == "(a)"
+
+
+def children() -> list[int]:
+    return [int(pid) for file in Path("/proc/self/task").glob("*/children") for pid in file.read_text().split()]
+
+
+def open_files(pid: int) -> set[str]:
+    return {str(each.readlink()) for each in Path(f"/proc/{pid}/fd").iterdir()}

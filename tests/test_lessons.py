@@ -109,6 +109,7 @@ def test_an_episode_moves_as_the_robot_with_the_parameter_that_was_drawn(name: s
         np.testing.assert_allclose(moved, wanted, rtol=2e-5, atol=2e-6)
 
 
+@pytest.mark.oracle
 def test_an_episode_is_answered_by_the_simulator_that_it_drew_with_its_percentiles() -> None:
     timeline = timeline_of(kind="memory")
     plain = Animat(Cartpole(), SHORT.mapping, 3)  # type: ignore[arg-type]
@@ -155,6 +156,7 @@ class Counter(Robot[CounterState]):
         return state.at > state.goal
 
 
+@pytest.mark.oracle
 def test_an_assessment_counts_successes_at_the_end_of_each_episode() -> None:
     """Beyond 12 an episode ends, else after ten strides; its goal is drawn, and decides over success."""
     network = (Layer(jnp.zeros((1, 2)), jnp.zeros((1, 2))),)
@@ -258,6 +260,7 @@ def test_a_robot_that_tells_no_success_goes_on_by_its_return() -> None:
     assert np.isnan(standing.table[:2, :, 3]).all()
 
 
+@pytest.mark.oracle
 def test_policies_are_kept_at_their_best_beside_the_averaged_ones_and_tell_their_lessons(tmp_path: Path) -> None:
     policies = trained(TAUGHT, timeline_of(), tmp_path)
     best = load_policies(tmp_path / "best")
@@ -308,6 +311,7 @@ class Stopping:
             raise Stop
 
 
+@pytest.mark.oracle
 def test_a_course_that_is_stopped_goes_on_to_the_same_bits_and_compiles_nothing_for_another_lesson(
     tmp_path: Path,
 ) -> None:
@@ -342,6 +346,7 @@ train(TAUGHT, timeline_of(), Path(sys.argv[1]), checkpoint_s=0.0, workers=1)
 """
 
 
+@pytest.mark.oracle
 def test_assessments_alone_change_nothing_of_what_is_learned(tmp_path: Path) -> None:
     plain, assessed = (
         trained(each, timeline_of(), tmp_path / str(each.assess)) for each in (SHORT, replace(SHORT, assess=3))
@@ -428,6 +433,7 @@ def test_a_lesson_that_does_not_name_what_another_varies_is_as_the_robot_has_it(
     assert float(state.robot.angle_rad) == np.float32(np.pi)
 
 
+@pytest.mark.oracle
 def test_the_command_teaches_and_tells_where_each_policy_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, out = tmp_path / "lessons.toml", tmp_path / "policies"
     file.write_text("[[lessons]]\nstarts.angle_rad = [-0.3, 0.3]\nuntil_return = -1\n")
@@ -462,6 +468,7 @@ def test_a_course_that_is_killed_goes_on_to_the_same_bits(tmp_path: Path) -> Non
     assert (folder / table).read_bytes() == (tmp_path / "undisturbed" / table).read_bytes()
 
 
+@pytest.mark.oracle
 def test_a_robot_with_a_goal_is_varied_as_its_body_is() -> None:
     goal = "avoid pole_angle outside -12..12 deg; drive cart_position in -0.1..0.1 m within 20"
     lesson = Lesson(parameters={"pole_length_m": (0.3, 0.5)}, starts={"position_m": (-0.4, 0.4)}, success=0.8)

@@ -265,6 +265,7 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
         live(ONE, culture, PROTOCOL, tmp_path / "live")
 
 
+@pytest.mark.oracle
 def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(tmp_path: Path) -> None:
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")

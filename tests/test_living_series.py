@@ -58,6 +58,7 @@ def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
             assert recording.start_min == pytest.approx(30.0 + 2.0 * session)
 
 
+@pytest.mark.oracle
 def test_what_is_due_next_is_recorded_and_what_was_missed_is_told(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         first = record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=1.0)

@@ -115,6 +115,7 @@ def test_numpy_and_jax_agree(mapping, percentiles, values) -> None:
     np.testing.assert_allclose(of_jax, of_numpy.astype(np.float32), atol=0 if mapping != Linear() else 1e-6)
 
 
+@pytest.mark.oracle
 @settings(deadline=None)  # the first example compiles
 @given(percentiles_hz.filter(lambda p: len(set(p)) == 11), mappings)
 def test_a_vmapped_mapping_is_the_mapping_of_each(percentiles, mapping) -> None:
@@ -151,6 +152,7 @@ def test_other_numbers_of_thresholds_are_refused(count: int) -> None:
         Thresholds(count)
 
 
+@pytest.mark.oracle
 def test_robots_and_mappings_are_named_and_stored_without_jax() -> None:
     """A policy's file carries both as data; whoever runs a policy need not have JAX."""
     code = """

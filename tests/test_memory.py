@@ -108,6 +108,7 @@ MEMORIES = st.builds(
 )
 
 
+@pytest.mark.oracle
 @settings(max_examples=100, deadline=None)
 @given(
     st.lists(
@@ -188,6 +189,7 @@ def loaded(n: int, seed: int, *, slope: float) -> Responses:
     return replace(responses_of(*[[1.0]] * 3), presented=every, place=np.arange(n), **columns)
 
 
+@pytest.mark.oracle
 def test_the_load_is_what_was_presented_in_the_seconds_before() -> None:
     responses = loaded(300, 1, slope=-60.0)
     simulator = fit_memory(responses, memory=Memory(0.0, 0.0, 0.5, 2.0))
@@ -203,6 +205,7 @@ def test_the_load_is_what_was_presented_in_the_seconds_before() -> None:
         history = simulator.answer(jnp.int32(c), jnp.float32(0.5), history).history
 
 
+@pytest.mark.oracle
 def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> None:
     times_known = [loaded(600, seed, slope=-60.0) for seed in range(10)]
     assert all(fit_memory(each).memory.load_s == 1.0 for each in times_known)
@@ -265,6 +268,7 @@ def test_responses_that_are_all_the_same_have_no_slopes() -> None:
     assert np.all(np.isfinite(fit_memory(same, memory=Memory(0.3, 0.5, 0.7, 2.0)).toward))
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("slope", [-60.0, 60.0])
 def test_runs_of_one_condition_are_answered_as_they_are(slope: float) -> None:
     """After ten of one frequency the culture answers otherwise than in random order: its simulator knows."""
@@ -363,6 +367,7 @@ def test_a_rest_and_what_has_no_condition_are_in_the_past() -> None:
     np.testing.assert_allclose(simulator.after_hz[0], np.array([0, 4, 2, 5]) * 125.0)
 
 
+@pytest.mark.oracle
 def test_a_known_chain_is_answered_as_it_is() -> None:
     """Two conditions, four chances: the share of high answers after a low and a high one, within chance."""
     low, high = (0.1, 0.5), (0.3, 0.9)
@@ -415,6 +420,7 @@ def test_presentations_that_do_not_fit_are_refused() -> None:
         Presented(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested[1:])
 
 
+@pytest.mark.oracle
 def test_simulators_of_recordings_of_different_lengths_stack() -> None:
     series = [chain(n, after_low=(0.1, 0.5), after_high=(0.3, 0.9), start_min=float(n)) for n in (200, 300)]
     timeline = fit_timeline(series, kind="memory")
@@ -563,6 +569,7 @@ def independent(seed: int, n: int = 500) -> Responses:
     )
 
 
+@pytest.mark.oracle
 def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator() -> None:
     none = 0
     for seed in range(60):
@@ -652,6 +659,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     assert 51 <= covered <= 60
 
 
+@pytest.mark.oracle
 def test_an_environment_without_neurons_has_its_optimum_whatever_simulator_is_beside_it() -> None:
     """As a case of its own, and beside one whose neurons remember."""
     alone = best_return(WithoutNeurons(Stairs(5), (-1.0, 1.0)), None, grid=STEPS, episodes=10)

@@ -144,7 +144,8 @@ def test_conditions_left_out_leave_the_others_and_their_history_alone() -> None:
     assert set(kept.presentations[0].condition.tolist()) == {NO_CONDITION, 0, 1}
 
 
-@pytest.mark.parametrize("mapping", [Thresholds(1), pytest.param(Thresholds(9), marks=pytest.mark.oracle)])
+@pytest.mark.oracle
+@pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None:
     environment = Animat(SHORT, mapping, 5)
     for spread in ((1.0,) * 5, (0.01, 1.0, 1.0, 1.0, 100.0)):

@@ -149,6 +149,7 @@ def test_navigation_tried_to_the_end() -> None:
     assert abs(found.monte_carlo - truth) < 4 * found.standard_error + 0.1
 
 
+@pytest.mark.oracle
 def test_navigation_with_ten_levels_tried_to_the_end() -> None:
     environment = Animat(Navigation(episode_limit=4), Thresholds(9), 5)
     found = best_return(environment, SIMULATOR, resolution=0.5, episodes=0)
@@ -272,6 +273,7 @@ def test_a_response_on_the_threshold_is_above_it() -> None:
     np.testing.assert_allclose(commands.probabilities, [[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]], atol=1e-6)
 
 
+@pytest.mark.oracle
 def test_continuous_commands_have_the_mean_and_spread_of_samples() -> None:
     environment = Animat(Navigation(), Linear(), 5)
     commands = commands_of(environment, SIMULATOR)

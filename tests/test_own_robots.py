@@ -95,7 +95,7 @@ def test_names_stand_for_robots_and_mappings() -> None:
     assert pickle.loads(pickle.dumps(named)) == named
     assert Training(Navigation(), None).mapping is None
     for arguments, words in (
-        (("cart", None), "robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'cart'"),
+        (("cart", None), "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'cart'"),
         (("cartpole", "2-thresholds"), "mapping: expected one of 1-threshold"),
         ((7, None), "robot: expected a robot or the name of one, got 7"),
         ((Cartpole, None), "robot: expected a robot or the name of one, got <class"),
@@ -186,6 +186,7 @@ def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
         assert np.all(np.isfinite(policy.act_greedily(np.array([scale], np.float32))))
 
 
+@pytest.mark.oracle
 def test_a_robot_of_another_size_is_trained_and_loaded(tmp_path: Path) -> None:
     # Its track is of so many metres that the scale is 5e7.
     robot = robot_named("cartpole", track_length_m=1e8)
@@ -198,6 +199,7 @@ def test_a_method_that_is_missing_is_named() -> None:
         type("Blind", (Slider,), {"observe": Robot.observe})()
 
 
+@pytest.mark.oracle
 def test_robots_that_keep_to_the_contract_pass() -> None:
     for robot in (Slider(), Cartpole.as_printed(), Navigation.as_printed(), *map(robot_named, ROBOTS)):
         check_robot(robot)
@@ -261,6 +263,7 @@ class LaterNaN(Slider):
         return At(state.x_m + 0.1), jnp.sqrt(1.0 - state.x_m), jnp.bool_(False)
 
 
+@pytest.mark.oracle
 def test_a_reward_that_is_no_number_later_is_named() -> None:
     with pytest.raises(UnusableData, match="later: expected finite rewards and observations, got NaN or infinite ones"):
         train(training(LaterNaN(), None), None, None)

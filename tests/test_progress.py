@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
+import re
+import struct
 import subprocess
 import sys
+import termios
+import time
 
 import pytest
 
-from animat.progress import Bar, Part
+from animat.progress import Bar, Part, Phase, in_phase
 
 SCRIPT = """
 from animat.progress import Bar
@@ -20,9 +25,27 @@ with Bar("counting") as progress:
 """
 
 
-def test_what_is_printed_under_a_bar_goes_where_it_should() -> None:
+PHASES = """
+import time
+from animat.progress import Bar, in_phase
+with Bar("never told of") as progress:
+    progress = in_phase(progress, "predicting")
+    progress.update(1, 4, "p0")
+    loop = in_phase(progress, "closed loop", 30, "episodes")
+    for i in range(3):
+        loop.update(i, 30, f"p{i}: return 101.2 so far; means: p0 99.1, [p1] 98.2, random 20.3, constant 5 Hz 11.1")
+        time.sleep(0.3)
+"""
+
+
+def drawn_by(script: str, columns: int = 80) -> tuple[str, str]:
+    """What a script prints, and what it draws on a terminal."""
     terminal, line = pty.openpty()
-    ran = subprocess.run([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, stderr=line, text=True)
+    fcntl.ioctl(line, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    ran = subprocess.run(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=line, text=True, env={**env, "TERM": "xterm"}
+    )
     os.close(line)
     drawn = b""
     while True:
@@ -34,9 +57,27 @@ def test_what_is_printed_under_a_bar_goes_where_it_should() -> None:
             break
         drawn += piece
     os.close(terminal)
-    assert ran.stdout == "the result\n"
-    assert b"counting" in drawn
-    assert b"the result" not in drawn
+    return ran.stdout, re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", drawn.decode())
+
+
+def test_what_is_printed_under_a_bar_goes_where_it_should() -> None:
+    printed, drawn = drawn_by(SCRIPT)
+    assert printed == "the result\n"
+    assert "counting" in drawn
+    assert "the result" not in drawn
+
+
+@pytest.mark.parametrize("columns", [80, 40])
+def test_each_phase_has_a_bar_that_fits_the_terminal(columns: int) -> None:
+    _, drawn = drawn_by(PHASES, columns)
+    lines = [line.rstrip() for line in re.split(r"[\r\n]+", drawn)]
+    assert max(map(len, lines)) <= columns
+    assert "never told of" not in drawn
+    if columns == 80:
+        assert any(re.match(r"predicting  ━+ 100 % 0:00:00", line) for line in lines)
+        assert any(re.match(r"closed loop [━╸╺]+   3 % 0:00:0", line) for line in lines)
+        assert any(line.startswith("1 of 30 episodes, ") for line in lines)
+        assert any("p1: return 101.2 so far; means: p0 99.1, [p1]" in line for line in lines)
 
 
 def test_a_line_comes_every_ten_seconds_where_there_is_no_terminal(
@@ -45,19 +86,66 @@ def test_a_line_comes_every_ten_seconds_where_there_is_no_terminal(
     now_s = 0.0
     monkeypatch.setattr("animat.progress.time.monotonic", lambda: now_s)
     with Bar("counting") as progress:
-        # Two in a hundred a second; a second part begins at 40 s, four times as slow.
-        for now_s in (1.0, 9.9, 10.0, 15.0, 21.0, 40.0):
+        # Two in a hundred a second; a second phase begins at 40 s, a quarter as fast.
+        for now_s in (1.0, 2.0, 10.0, 15.0, 21.0, 40.0):
             progress.update(2 * now_s, 100, f"at {now_s:g} s")
-        for now_s in (41.0, 55.0, 65.0):
+        in_phase(progress, "again", 400, "apples")
+        for now_s in (41.0, 43.0, 55.0, 65.0):
             progress.update((now_s - 41) / 2, 100)
     told = [
         "counting: 20 %, 40 s left, at 10 s",
         "counting: 42 %, 29 s left, at 21 s",
         "counting: 80 %, 10 s left, at 40 s",
-        "counting: 7 %, 3 min left",
-        "counting: 12 %, 3 min left",
+        "again: 7 %, 28 of 400 apples, 2.0 a second, 3 min left",
+        "again: 12 %, 48 of 400 apples, 2.0 a second, 3 min left",
     ]
     assert capsys.readouterr() == ("", "\n".join(told) + "\n")
+
+
+def test_work_that_reports_nothing_for_long_is_told_of_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("animat.progress.LINE_EVERY_S", 0.02)
+    monkeypatch.setattr("animat.progress._LOOK_EVERY_S", 0.01)
+    told = ""
+    with Bar("solving") as progress:
+        progress.update(0, 1, "optimal return")
+        until_s = time.monotonic() + 5
+        while told.count("\n") < 2 and time.monotonic() < until_s:
+            time.sleep(0.01)
+            told += capsys.readouterr().err
+    assert told.startswith("solving: 0 %, optimal return\n" * 2)
+
+
+def test_nothing_is_said_about_the_rest_before_there_is_something_to_tell_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A share of a rounding's size made an estimate of 1,647,536,472,192,901 minutes."""
+    at_s = 0.0
+    monkeypatch.setattr("animat.progress.time.monotonic", lambda: at_s)
+    phase = Phase("study")
+    left = []
+    for at, share in ((0.0, 0.0), (5.0, 1e-16), (10.0, 2e-16), (20.0, 0.004), (30.0, 0.02), (60.0, 0.04)):
+        at_s = at
+        phase.update(share, 1)
+        left.append(phase.left())
+    assert left == ["", "", "", "", "10 min left", "24 min left"]
+    # Ends are ends, whatever sums of parts come to.
+    for at, share in ((70.0, -1e-16), (80.0, 1 + 1e-12)):
+        at_s = at
+        phase.update(share, 1)
+        left.append(phase.left())
+    assert (phase.share, left[-1]) == (1.0, "")
+
+
+def test_compiling_and_going_on_from_a_checkpoint_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("animat.progress.time.monotonic", lambda: now_s)
+    phase = Phase("training", 1000, "iterations")
+    # 20 s of compiling, half of it from the checkpoint, then one in a hundred every two seconds.
+    for second in range(81):
+        now_s = float(second)
+        phase.update(0.0 if now_s < 20 else 0.5 + (now_s - 20) / 200, 1)
+    assert phase.left() == "40 s left"
+    assert phase.counted() == ["800 of 1,000 iterations", "5.0 a second"]
 
 
 def test_parts_make_up_the_whole() -> None:

@@ -9,7 +9,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import HeuristicController
+from animat.closed_loop.agents import CouplingController, HeuristicController
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -28,13 +28,16 @@ from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.coupling import Coupling
 from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.table import evaluate
 from animat.evaluation.verdict import Beside
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
+from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
@@ -46,7 +49,7 @@ from animat.recordings.recording import RecordedCulture, Recording
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
-from animat.robots import Cartpole, Navigation, Robot
+from animat.robots import Cartpole, Navigation, Robot, Shuttle
 from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.selection import Selection
@@ -109,6 +112,7 @@ def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Resp
         return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=told.append), told
 
 
+@pytest.mark.oracle
 def test_the_table_holds_what_the_simulator_and_the_session_say(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,6 +195,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     assert gap.verdict() in text
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     tmp_path: Path, series: list[Responses]
@@ -519,6 +524,60 @@ def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[
         np.testing.assert_array_equal(np.asarray(predicted), chosen)
 
 
+@pytest.mark.parametrize("kind", ["graded", "switch"])
+def test_a_coupling_is_the_same_on_simulator_and_culture(kind: Literal["graded", "switch"]) -> None:
+    rng = np.random.default_rng(2)
+    environment: Animat[Any] = Animat(Shuttle(), Thresholds(9), 5)
+    weights, means = rng.normal(size=(1, 1, 3)), np.linspace(-0.8, 0.8, 5)[None]
+    floats = (jnp.asarray(each, jnp.float32) for each in (weights, means))
+    coupling = Coupling(next(floats), jnp.arange(5)[None], next(floats), kind, (0, 1))
+    acts = CouplingController(coupling, environment.scales)
+    observed = rng.uniform(-0.5, 0.5, (500, 3))
+    one = jax.tree.map(lambda x: x[0], coupling)
+    predicted = one.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
+    chosen = [acts.act(each, rng) for each in observed]
+    np.testing.assert_array_equal(np.asarray(predicted), chosen)
+    assert len(set(chosen)) > 1
+
+
+@pytest.mark.oracle
+@pytest.mark.usefixtures("few_bootstraps")
+def test_whose_work_it_is_in_a_loop(tmp_path: Path, series: list[Responses]) -> None:
+    gap, policies = run(tmp_path, series, with_interventions=True)
+    rows, found = {row.name: row for row in gap.rows}, {each.name: each for each in gap.whose_work}
+    measured = gap.rows[0].measured
+    names = ["its simulator", "ideal actuator", "random spikes", "silent", "shuffled", "yoked", "turned round"]
+    assert list(found) == names
+    for name in names[2:]:
+        assert found[name].mean_return == rows[name].measured.mean()
+        assert found[name].lost.value == pytest.approx(measured.mean() - rows[name].measured.mean())
+        assert found[name].lost.low <= found[name].lost.value <= found[name].lost.high
+    assert found["its simulator"].lost == gap.rows[0].gap
+    # Predicted as in simulation alone.
+    simulated = evaluate(policies, fit_timeline(series), episodes=100, seed=1, interventions=True).whose_work
+    assert simulated is not None
+    for row in simulated.rows:
+        if row.name in ("ideal actuator", "turned round", "random spikes", "yoked"):
+            predicted = found[row.name].mean_return if row.name == "ideal actuator" else rows[row.name].predicted.mean()
+            spread = row.returns.std() / np.sqrt(row.returns.size) + 1e-6
+            assert abs(predicted - row.returns.mean()) < 8 * spread + 1
+    assert "whose work is it: return with the culture replaced" in gap.to_text()
+    assert [each["name"] for each in json.loads(json.dumps(gap.to_dict()))["whose_work"]] == names
+
+
+@pytest.mark.oracle
+@pytest.mark.usefixtures("few_bootstraps")
+def test_the_best_coupling_runs_beside_the_policies(
+    tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
+    gap, _ = run(tmp_path, series, with_controls=False, with_coupling=True)
+    coupling = {row.name: row for row in gap.rows}["coupling"]
+    rewards = [tick.reward or 0.0 for tick in read_session(tmp_path).ticks if tick.agent == "coupling"]
+    assert len(coupling.measured) == 4 and coupling.measured.sum() == pytest.approx(sum(rewards))
+    assert len(coupling.predicted) and coupling.beside is not None
+
+
 @pytest.mark.oracle
 def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: list[Responses]) -> None:
     first, last = series[0].start_min, series[1].start_min
@@ -693,6 +752,7 @@ class TestCommand:
         assert "random" in printed.out
         assert "is its recording" in printed.out
 
+    @pytest.mark.oracle
     def test_other_electrodes_than_in_the_recordings_are_told(
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -715,6 +775,7 @@ class TestCommand:
         assert "budget.pulses: 50 of 50 pulses are spent, and 2 more were wanted" in printed.err
         assert "50 of 50 pulses" in printed.out
 
+    @pytest.mark.oracle
     def test_without_recordings_the_culture_is_recorded_first(
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:

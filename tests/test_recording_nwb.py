@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -196,6 +197,7 @@ def test_a_truncated_file_is_one_clear_line(synthetic: Recording, tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.oracle
 def test_damage_anywhere_in_the_file_is_an_error_of_ours_or_harmless(synthetic: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
     write_nwb(synthetic, path)
@@ -263,6 +265,7 @@ except InvalidFile as error:
 """
 
 
+@pytest.mark.oracle
 def test_a_full_disk_leaves_the_old_file_whole(synthetic: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
     write_nwb(synthetic, path)
@@ -276,3 +279,31 @@ def test_a_full_disk_leaves_the_old_file_whole(synthetic: Recording, tmp_path: P
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["a.nwb"]
     assert read_nwb(path).equals(synthetic)
+
+
+WRITE_BESIDE_A_HALF_WRITTEN_CACHE = """
+import sys
+from pathlib import Path
+import hdmf
+from importlib.metadata import version
+from platformdirs import PlatformDirs
+from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.synthetic import synthetic_recording
+own = PlatformDirs(appname="pynwb-hdmf", version=f"{version('pynwb')}-{hdmf.__version__}", ensure_exists=True)
+(own.user_cache_path / "pynwb_core_typemap.pkl").write_bytes(b"")
+write_nwb(synthetic_recording(4), sys.argv[1])
+"""
+
+
+def test_a_cache_that_another_process_is_writing_is_not_read(tmp_path: Path) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "PYNWB_NO_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")
+    done = subprocess.run(
+        [sys.executable, "-c", WRITE_BESIDE_A_HALF_WRITTEN_CACHE, str(tmp_path / "a.nwb")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(read_nwb(tmp_path / "a.nwb").channels) > 0

@@ -100,6 +100,7 @@ def test_the_same_seed_is_the_same_recording_and_the_culture_tires() -> None:
     assert mean_hz[1] / mean_hz[0] == pytest.approx(np.exp(-0.05 * 10), rel=0.1)
 
 
+@pytest.mark.oracle
 def test_a_series_is_written_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     few = {"patterns": 5, "channels": 16}
     files = write_synthetic_series(1, tmp_path / "series", sessions=3, **few)

@@ -28,6 +28,7 @@ from animat.robots import (
     Cartpole,
     Navigation,
     Robot,
+    Shuttle,
     SwingUp,
     TwoLinkArm,
     Wheels,
@@ -64,7 +65,7 @@ def forgetting() -> Iterator[None]:
 
 def forget(known: dict[str, type[Robot[Any]]] | None = None) -> None:
     """As in a process that has imported nothing of the user's."""
-    ours = {kind.name: kind for kind in (TwoLinkArm, Cartpole, Navigation, SwingUp, Wheels)}
+    ours = {kind.name: kind for kind in (TwoLinkArm, Cartpole, Navigation, Shuttle, SwingUp, Wheels)}
     registry.REGISTRY._registered.clear()
     registry.REGISTRY._registered.update(known or ours)
     for name in ("my_package", "my_package.robots"):
@@ -221,7 +222,8 @@ def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: p
 
     monkeypatch.setattr("importlib.metadata.entry_points", found)
     with pytest.raises(
-        InvalidArgument, match="expected one of arm, cartpole, navigation, swing-up, wheels, rover, tank, got 'plane'"
+        InvalidArgument,
+        match="expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, rover, tank, got 'plane'",
     ):
         robot_named("plane")
     assert robot_named("rover", gain_m=0.2) == robot_named(ROVER, gain_m=0.2)
@@ -242,7 +244,7 @@ def test_robots_are_listed_with_what_each_can_do(
     assert main(["robots", "--json"]) == 1
     said, _, line = capsys.readouterr().out.strip().rpartition("\n")
     told = json.loads(line)
-    assert list(told["robots"]) == ["arm", "cartpole", "navigation", "swing-up", "wheels", "rover"]
+    assert list(told["robots"]) == ["arm", "cartpole", "navigation", "shuttle", "swing-up", "wheels", "rover"]
     assert told["robots"]["cartpole"]["can"] == ["heuristic", "value_grid", "draw", "draw_paths"]
     assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
     assert "  no heuristic policy among the controls: rover has no method `heuristic`" in said
@@ -323,7 +325,7 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
 
 
 def test_ours_lack_nothing_but_the_optimum_of_two_commands_and_are_pickled_as_ever() -> None:
-    for robot in (Cartpole(), Navigation(), SwingUp(), TwoLinkArm(), Wheels()):
+    for robot in (Cartpole(), Navigation(), Shuttle(), SwingUp(), TwoLinkArm(), Wheels()):
         # There is no optimal return of two commands.
         assert set(lacking(robot)) == ({"value_grid"} if robot.n_commands > 1 else set())
         assert "import" not in robot_to_dict(robot)

@@ -13,7 +13,9 @@ from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Group, Pair, draw_comparisons
 from animat.report.controls import Controls, draw_controls
-from animat.report.learning_curves import LearningCurve, draw_learning_curves
+from animat.report.headline import ArmReturns, draw_headline
+from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
+from animat.report.minus import with_minus
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.robots import Cartpole
 from animat.studies.differences import came_out_otherwise, decisions, explain
@@ -289,6 +291,51 @@ def test_the_optimum_steps_with_the_simulator_in_use() -> None:
     assert line.get_drawstyle() == "steps-pre"
     assert np.asarray(line.get_xdata()).tolist() == [0, 1, 2, 3]
     assert np.asarray(line.get_ydata()).tolist() == [1, 1, 1, 7]
+
+
+def test_learning_curves_are_of_whole_rounds_of_episodes() -> None:
+    """Four environments in step: all fail after 1 iteration, go on for 3, and fail again; the truth is -0.5 throughout.
+
+    Each part is two iterations of all four, a round eight of each; in half of the parts only the short ones end.
+    """
+    iterations = 8.0 * np.arange(1, 9)
+    episodes = np.array([[4, 0, 0, 4, 4, 0, 0, 4], [0, 0, 0, 0, 0, 0, 0, 0]], float)
+    returns = np.array([[1, np.nan, np.nan, -2, 1, np.nan, np.nan, -2], [np.nan] * 8])
+    found = over_rounds(iterations, episodes, returns, 32)
+    np.testing.assert_array_equal(found[0], [np.nan] * 3 + [-0.5] * 5)
+    assert np.isnan(found[1]).all()
+    # Weighted by how many ended.
+    uneven = over_rounds(iterations[:2], np.array([[1.0, 3.0]]), np.array([[8.0, 0.0]]), 16)
+    np.testing.assert_array_equal(uneven, [[np.nan, 2.0]])
+    # Shorter than a round: all there is.
+    np.testing.assert_array_equal(over_rounds(iterations[:2], *(np.ones((1, 2)),) * 2, 99), [[np.nan, 1.0]])
+
+
+def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
+    rows = [
+        ArmReturns("cartpole", "a", 5.0, -500.0, 510.0, 0.0, 10.0, (4.0, 6.0)),
+        ArmReturns("cartpole", "b", 5.0, 4.0, 6.0, 0.0, 10.0, (3.0, 7.0)),
+    ]
+    figure = draw_headline(rows)
+    axes = figure.axes[0]
+    left, right = axes.get_xlim()
+    assert -1 < left < 0 and 10 < right < 11
+    assert [(line.get_marker(), line.get_ydata()[0]) for line in axes.lines if line.get_marker() in "<>"] == [
+        ("<", 0), (">", 0),
+    ]  # fmt: skip
+    for line in axes.lines:
+        assert left <= min(line.get_xdata()) <= max(line.get_xdata()) <= right
+    said = {"random actions", "optimal return", "95 % interval", "each policy", "their interquartile mean"}
+    assert legend(figure) == said
+
+
+def test_there_is_one_kind_of_minus() -> None:
+    assert with_minus("constant -1 from -0.5 to -.5, 1.5e-05") == "constant −1 from −0.5 to −.5, 1.5e−05"
+    same = "2-10 ms, p0-1, --at-min 5, tables/-1.csv, Mann-Whitney, recording_0-1, 2022-11-23"
+    assert with_minus(same) == same
+    low = Group("a", np.array([1.0, 2.0]), 0.0, 9.0, -0.07), Group("b", np.array([1.0, 2.0]), 0.0, 9.0, -0.001)
+    labels = [text.get_text() for text in draw_comparisons([Pair("", *low, 0.1, 0.0)], "").axes[0].get_xticklabels()]
+    assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
 
 
 def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> None:

@@ -119,6 +119,7 @@ def test_no_observation_of_an_episode_passes_the_bounds(robot: Robot, policy: st
     assert np.all(np.isfinite(in_episodes)) and np.all(np.isfinite(rewards[~ended_before]))
 
 
+@pytest.mark.oracle
 def test_the_episode_limit_is_never_a_termination(robot: Robot) -> None:
     """The same robot with a limit of one iteration steps as before: the limit is the business of whoever counts."""
     short = dataclasses.replace(robot, episode_limit=1)
@@ -150,7 +151,7 @@ def test_parameters_may_be_static_under_jit(robot: Robot) -> None:
 @pytest.mark.parametrize(
     ("name", "parameters", "message"),
     [
-        ("unicycle", {}, "robot: expected one of arm, cartpole, navigation, swing-up, wheels, got 'unicycle'"),
+        ("unicycle", {}, "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'unicycle'"),
         (3, {}, "robot: expected one of"),
         ("cartpole", {"mass": 1.0}, "cartpole: expected parameters among gravity_m_per_s2, .*, got 'mass'"),
         ("cartpole", {"pole_mass_kg": 0.0}, "cartpole: pole_mass_kg: expected at least 1e-09, got 0"),

@@ -115,6 +115,7 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
     assert ("other percentiles" in before_the_first_pulse) == bool(words)
 
 
+@pytest.mark.oracle
 def test_recordings_of_no_virtual_culture_are_told(
     tmp_path: Path, small_ones: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,7 +129,7 @@ def test_recordings_of_no_virtual_culture_are_told(
     [
         pytest.param((5.0, 80.0), True, marks=pytest.mark.oracle),
         pytest.param((80.0, 5.0), True, marks=pytest.mark.oracle),
-        ((80.0, 40.0, 20.0, 10.0, 5.0), True),
+        pytest.param((80.0, 40.0, 20.0, 10.0, 5.0), True, marks=pytest.mark.oracle),
         ((80.0, 5.0), False),
     ],
 )
@@ -259,6 +260,7 @@ def test_policies_of_before_are_run_as_their_recordings_tell(series: Path, tmp_p
     assert set(patterns) == {1, 6, 4}
 
 
+@pytest.mark.oracle
 def test_a_culture_is_recorded_first_on_the_electrodes_of_the_policies(
     series: Path, tmp_path: Path, small_ones: None
 ) -> None:

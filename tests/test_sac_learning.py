@@ -84,6 +84,7 @@ def trained_for(
 # --- the replay -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("rounds", [1, 4, 5, 7, 13])
 def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> None:
     limit = 3  # no divisor of the five rounds that the replay holds, so a row tells which round it is of
@@ -119,6 +120,7 @@ def test_returns_are_counted_in_the_tasks_own_units() -> None:
     np.testing.assert_array_equal(learner.returns, [15.0, 15.0])
 
 
+@pytest.mark.oracle
 def test_only_what_was_written_is_learned_from() -> None:
     settings = SAC(environments=2, gradient_steps=4, batch=64, replay=2000, hidden=8)
     environment = WithoutNeurons(Cartpole(), DISCRETE)

@@ -212,6 +212,7 @@ def test_a_cl1_opened_anew_goes_no_faster(monkeypatch: pytest.MonkeyPatch, clock
     assert all(last - first >= 25_000 for first, last in zip(frames, frames[5:], strict=False))
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("clock", ["goes on", "begins anew"])
 def test_a_maxone_opened_anew_goes_no_faster_and_its_clock_goes_on(
     monkeypatch: pytest.MonkeyPatch, clock: Clock

@@ -35,6 +35,7 @@ def series(recordings: list[Recording]) -> list[Responses]:
     return [extract_responses(recording) for recording in recordings]
 
 
+@pytest.mark.oracle
 def test_a_series_has_its_figures(recordings: list[Recording], series: list[Responses], tmp_path: Path) -> None:
     files = draw_series(recordings[0], series[::-1], tmp_path / "figures", "svg")
     names = ["series-array.svg", "series-responses.svg", "series-over-time.svg", "series-drift.svg"]
@@ -98,13 +99,14 @@ def test_the_drift_is_the_percentiles(series: list[Responses]) -> None:
 
 
 def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
-    axes = draw_responses_over_time(series, 0).axes[0]
-    marks = [line.get_xdata()[0] for line in axes.lines if to_hex(line.get_color()) == MEDIAN.lower()]
-    np.testing.assert_allclose(marks, [np.median(r.rates_of(0)) for r in series])
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["0", "30", "60"]
+    panels = draw_responses_over_time(series).axes
+    assert [axes.get_title(loc="left") for axes in panels] == [c.label for c in series[0].conditions]
+    for i, axes in enumerate(panels):
+        marks = [line.get_xdata()[0] for line in axes.lines if to_hex(line.get_color()) == MEDIAN.lower()]
+        np.testing.assert_allclose(marks, [np.median(r.rates_of(i)) for r in series])
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["0", "30", "60"]
     many = [replace(series[0], start_min=float(m)) for m in range(50)]
-    drawn = draw_responses_over_time(many, 0).axes[0]
-    assert "(20 of 50 recordings)" in drawn.get_title(loc="left")
+    assert draw_responses_over_time(many).get_suptitle() == "20 of 50 recordings"
 
 
 def test_first_and_last_hold_every_response(series: list[Responses]) -> None:

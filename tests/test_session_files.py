@@ -290,6 +290,7 @@ def places(node: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [at, *(place for name, value in inner for place in places(value, (*at, name)))]
 
 
+@pytest.mark.oracle
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_header_changed_anywhere_is_read_or_refused_by_name(

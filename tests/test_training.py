@@ -378,3 +378,8 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
     assert (told["kind"], told["bins"], told["range_hz"], told["window_ms"]) == ("histogram", 20, None, [2.0, 10.0])
     assert told["recorded_at_min"] == [0.0, 10.0, 20.0] and len(told["burst_thresholds"]) == 3
     assert policy.provenance["versions"]["jax"] == jax.__version__
+
+
+def test_a_shadowing_that_there_is_not_is_told() -> None:
+    with pytest.raises(InvalidArgument, match="shadowing: expected one of True, False, drawn, got 'bogus'"):
+        Training(Cartpole(), None, shadowing="bogus")  # type: ignore[arg-type]

@@ -83,6 +83,7 @@ def test_policies_of_blocks_are_reported_by_training_and_evaluation(
     ]
 
 
+@pytest.mark.oracle
 def test_an_unknown_presentation_is_not_told_as_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = series(tmp_path / "r", replace(a_recording(0), presentation=None))
     train = ["train", "cartpole", "--recordings", recordings, *QUICK, "--out", str(tmp_path / "p")]

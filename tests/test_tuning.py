@@ -30,10 +30,10 @@ from animat.training.settings import SAC
 from animat.training.specification import Training
 from animat.tuning import tasks
 from animat.tuning.journal import JOURNAL, Told, read_journal
-from animat.tuning.results import BEST, HISTORY, RESULTS, Tuned
+from animat.tuning.results import BEST, HISTORY, RESULTS, Tuned, train_command
 from animat.tuning.run import tune
 from animat.tuning.side_by_side import SideBySide
-from animat.tuning.space import Range, with_settings
+from animat.tuning.space import Range, first_settings, with_settings
 from animat.tuning.specification import Tuning, read_tuning, tuning_of
 from animat.tuning.tasks import Trial, same_shapes
 
@@ -79,6 +79,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.oracle
 def test_stopped_after_every_few_tasks_it_ends_in_the_same_bytes(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,6 +99,7 @@ def test_stopped_after_every_few_tasks_it_ends_in_the_same_bytes(
     assert not (tmp_path / "out" / ".unfinished").exists()
 
 
+@pytest.mark.oracle
 def test_a_trial_that_was_stopped_between_two_chunks_goes_on_from_there(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +149,9 @@ def test_the_best_is_a_study_and_a_training_of_the_settings_that_won(finished: P
     assert isinstance(command, Train)
     assert read_sac(command.sac) == SAC(**study.algorithm)  # type: ignore[arg-type]
     assert (command.simulator, command.mapping) == (study.simulators.kind, study.arms[0].mapping)
+    assert (command.policies, command.iterations, command.seed) == (study.policies, study.robots[0].trained_for, 1)
+    words = train_command(replace(study, seed=7)).removeprefix("animat ").split()
+    assert isinstance(command := _parse(words), Train) and command.seed == 7
 
 
 def test_a_finished_folder_is_told_again_and_nothing_is_trained(finished: Path) -> None:
@@ -172,6 +177,7 @@ def test_a_folder_of_another_search_is_refused_and_so_is_a_journal_of_one(finish
         run(out)
 
 
+@pytest.mark.oracle
 def test_a_trial_that_diverges_is_told_as_such_and_leaves_those_beside_it_finite(tmp_path: Path) -> None:
     """Side by side in one program; its learning rate is beyond what float32 can add up."""
     plain = read_tuning(TINY)
@@ -185,6 +191,7 @@ def test_a_trial_that_diverges_is_told_as_such_and_leaves_those_beside_it_finite
     assert told[0].state == "complete"
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("mapping", ["9-thresholds", None])
 def test_settings_as_arrays_train_as_those_that_are_compiled_in(mapping: str | None) -> None:
     """Against the program of ordinary training, one for each of the settings; alike but for rounding."""
@@ -231,14 +238,51 @@ def test_trials_of_one_program_are_together_five_policies_at_most(policies: int)
             assert len({(t.settings["mapping"], t.settings["batch"]) for t in group}) == 1
 
 
+@pytest.mark.oracle
+def test_after_a_study_s_own_settings_the_defaults_are_tried_and_both_go_to_the_end(tmp_path: Path) -> None:
+    file = tmp_path / "tune.toml"
+    own = TINY.read_text().replace("hidden = 8 }", "hidden = 8, learning_rate = 1e-4, discount = 0.95 }")
+    file.write_text(own.replace("trials = 7", "trials = 4").replace("3000", "240").replace("rungs = 2", "rungs = 3"))
+    tuned = tune(read_tuning(file), tmp_path / "out")
+    kind = {"simulator": "histogram"}
+    assert tuned.told[0].settings == {"learning_rate": 1e-4, "discount": 0.95, **kind}
+    assert tuned.told[1].settings == {"learning_rate": SAC().learning_rate, "discount": SAC().discount, **kind}
+    assert [len(each.chunks) for each in tuned.told[:2]] == [3, 3]
+    assert [each.trial for each in tuned.finals[:2]] == [0, 1]
+    file.write_text(own.replace("high = 0.999", "high = 0.98"))
+    tuning = read_tuning(file)
+    assert len(first_settings(tuning.study, tuning.space)) == 1, "defaults outside the search are not tried"
+
+
+def test_a_discount_is_drawn_evenly_in_the_logarithm_of_its_distance_from_1(tmp_path: Path) -> None:
+    from scipy.stats import kstest, uniform
+
+    from animat.tuning.search import Search
+
+    text = TINY.read_text()
+    assert "high = 0.999 }" in text
+    file = tmp_path / "tune.toml"
+    file.write_text(text.replace("high = 0.999 }", "high = 0.999, log = true }"))
+    drawn = [settings["discount"] for settings in Search(read_tuning(file)).ask(300)]
+    assert drawn[0] == 0.99, "the study's own is tried first, and as it is written"
+    exponents = np.log10(1 - np.array(drawn[1:], dtype=float))
+    assert kstest(exponents, uniform(-3, 2).cdf).pvalue > 0.01
+
+
 def test_importance_finds_the_setting_that_decides() -> None:
     from animat.tuning.search import importance_of
 
     rng = np.random.default_rng(1)
-    space = {"tau": Range(0.0, 1.0), "discount": Range(0.0, 1.0), "mapping": ("linear", "1-threshold")}
+    space = {"tau": Range(0.0, 1.0), "discount": Range(0.01, 0.99, True), "mapping": ("linear", "1-threshold")}
     told = []
+    # However well it began.
+    told.append(Told(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
     for i in range(60):
-        settings: Any = {"tau": rng.random(), "discount": rng.random(), "mapping": ("linear", "1-threshold")[i % 2]}
+        settings: Any = {
+            "tau": rng.random(),
+            "discount": 0.01 + 0.98 * rng.random(),
+            "mapping": ("linear", "1-threshold")[i % 2],
+        }
         returns = -((settings["tau"] - 0.3) ** 2) + 1e-3 * rng.random()
         told.append(Told(i, settings, "complete", (60,), ((float(returns),),)))
     shares = importance_of(space, told)

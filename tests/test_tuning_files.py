@@ -34,7 +34,9 @@ def test_a_file_s_search_is_read() -> None:
 
 
 @pytest.mark.parametrize("arm", ["", 'mapping = "9-thresholds"', 'mapping = "none"'])
-@pytest.mark.parametrize("algorithm", ["", "learning_rate = 1e-5\ndiscount = 0.5", "tau = 0"])
+@pytest.mark.parametrize(
+    "algorithm", ["", "learning_rate = 1e-5\ndiscount = 0.5", "tau = 0", "discount = 0", "discount = 1"]
+)
 def test_the_usual_search_holds_the_study_s_own_settings(tmp_path: Path, arm: str, algorithm: str) -> None:
     tuning = read_tuning(written(tmp_path, f"{PLAIN}{arm}\n[algorithm]\n{algorithm}\n"))
     own = own_settings(tuning.study)
@@ -81,6 +83,10 @@ BAD = {
     "more rungs than parts": (f"{PLAIN}[tune]\nrungs = 5\n", ["rungs", "60", "3^4"]),
     "nothing to search": (SEARCH, ["tune.search", "at least one"]),
     "a misspelt setting": (f"{SEARCH}discuont = {{ low = 0.9, high = 0.99 }}\n", ["'discuont'", "mean discount?"]),
+    "a logarithm of no distance from 1": (
+        f"{SEARCH}discount = {{ low = 0.9, high = 1, log = true }}\n",
+        ["search.discount", "below 1"],
+    ),
     "an empty range": (f"{SEARCH}discount = {{ low = 0.99, high = 0.99 }}\n", ["search.discount", "more than low"]),
     "a range of no end": (f"{SEARCH}discount = {{ low = 0.9 }}\n", ["search.discount.high", "got nothing"]),
     "a logarithm of nothing": (f"{SEARCH}tau = {{ low = 0, high = 1, log = true }}\n", ["search.tau", "more than 0"]),
@@ -89,7 +95,7 @@ BAD = {
     "one choice": (f'{SEARCH}mapping = ["linear"]\n', ["search.mapping", "two or more"]),
     "the same choice twice": (f'{SEARCH}mapping = ["linear", "linear"]\n', ["search.mapping", "different"]),
     "a number for a range": (f"{SEARCH}tau = 0.1\n", ["search.tau", "got 0.1"]),
-    "an unknown mapping": (f'{SEARCH}mapping = ["1-threshold", "steep"]\n', ["search.mapping", "steep"]),
+    "an unknown mapping": (f'{SEARCH}mapping = ["1-threshold", "cubic"]\n', ["search.mapping", "cubic"]),
     "no mapping": (f'{SEARCH}mapping = ["1-threshold", "none"]\n', ["search.mapping", "'none'"]),
     "an unknown simulator": (f'{SEARCH}simulator = ["histogram", "exact"]\n', ["search.simulator", "'exact'"]),
     "without its own": (f'{SEARCH}mapping = ["linear", "9-thresholds"]\n', ["search.mapping", "'1-threshold'"]),

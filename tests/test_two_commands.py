@@ -167,6 +167,7 @@ def test_policies_run_and_are_predicted(
     assert {"silent", "shuffled", "heuristic", "constant 5 Hz"} <= {row.name for row in gap.rows}
 
 
+@pytest.mark.oracle
 def test_a_policy_carries_its_readouts_through_its_file(
     policies: dict[str, Policy], timeline: SimulatorTimeline
 ) -> None:
@@ -219,6 +220,7 @@ def test_without_neurons_both_commands_are_continuous(baseline: dict[str, Policy
     np.testing.assert_allclose(z.std(axis=0), np.exp(log_deviations), rtol=0.06)
 
 
+@pytest.mark.oracle
 def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[str, Policy]) -> None:
     table = evaluate(baseline, None, episodes=40, optimum_resolution=0.5)
     assert [row.name for row in table.rows] == ["policies", "random", "heuristic", "coupling"]

@@ -234,6 +234,7 @@ def test_surroundings_are_data() -> None:
     assert again == robot and hash(again) == hash(robot)
 
 
+@pytest.mark.oracle
 def test_the_heuristic_finds_the_goal_between_the_obstacles() -> None:
     environment = WithoutNeurons(Wheels(), None)
     by_rule = roll_out(environment, None, Heuristic(), 1, episodes=200, seed=1).returns

@@ -14,10 +14,9 @@ import pytest
 from jaxtyping import Array
 from scipy import stats
 
-from animat.closed_loop.loop import Loop
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, Environment, State, WithoutNeurons
-from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Actor, Constant, Networks, Seen, Uniform, Uniforms, roll_out
 from animat.evaluation.table import evaluate
@@ -153,6 +152,7 @@ def mean_return(environment: Environment[Any], actor: Actor) -> float:
     return float(roll_out(environment, contrary(), actor, 1, episodes=4000, seed=1).returns.mean())
 
 
+@pytest.mark.oracle
 def test_who_sees_the_past_does_what_is_possible_with_neurons_that_remember() -> None:
     assert best_return(STAIRS, contrary(), grid=STEPS, episodes=0).value == pytest.approx(UP_AT_BEST, abs=1e-3)
     error = np.sqrt(UP_AT_BEST * (1 - UP_AT_BEST) / 4000)
@@ -188,6 +188,7 @@ def seeing(tmp_path_factory: pytest.TempPathFactory) -> Policy:
     return trained(SEEING, timeline_of(), tmp_path_factory.mktemp("seeing"))["p0"]
 
 
+@pytest.mark.oracle
 def test_a_policy_knows_what_it_sees_and_is_evaluated_so(seeing: Policy, tmp_path: Path) -> None:
     assert seeing.neural_observation
     assert seeing.weights[0].shape[0] == len(seeing.scales) == 6
@@ -203,9 +204,7 @@ def test_a_policy_knows_what_it_sees_and_is_evaluated_so(seeing: Policy, tmp_pat
         evaluate({"p": seeing, "q": blind}, timeline_of(), episodes=20)
 
 
-def test_no_closed_loop_runs_a_policy_that_sees_what_it_does_not_show(seeing: Policy, tmp_path: Path) -> None:
-    with pytest.raises(UnusableData, match=r"policy: expected one that sees the robot alone, .* neural observation"):
-        Loop.of_policy(seeing, np.zeros(11))
+def test_no_live_run_shows_what_neurons_remember(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match="neural_observation: expected False"):
         check_plan(SEEING, Protocol(), tmp_path / "live", Timetable(), 1, {})
 

@@ -84,6 +84,8 @@ if TYPE_CHECKING:
     from animat.studies.run import run_study as run_study
     from animat.studies.specification import Study as Study
     from animat.studies.toml import read_study as read_study
+    from animat.training.callbacks import CurveRow as CurveRow
+    from animat.training.callbacks import TrainingCallback as TrainingCallback
     from animat.training.policy import Policy as Policy
     from animat.training.policy import load_policies as load_policies
     from animat.training.settings import SAC as SAC
@@ -133,6 +135,7 @@ _WHERE = {
     "wrappers": ("EpisodeLimit", "ShuffledDelivery", "NeuralObservation"),
     "training.settings": ("SAC",),
     "training.specification": ("Training",),
+    "training.callbacks": ("CurveRow", "TrainingCallback"),
     "execution.training": ("train",),
     "training.policy": ("Policy", "load_policies"),
     "evaluation.table": ("Evaluation", "evaluate"),

@@ -53,27 +53,29 @@ def keep_compilations() -> None:
 
 
 @contextmanager
-def user_cache() -> Iterator[None]:
-    """Have a folder for the user's cache: the usual one, or where that cannot be written to, one for as long as this.
+def pynwb_importable() -> Iterator[None]:
+    """As long as this lasts, pynwb can be imported: it cannot without a folder for the user's cache.
 
-    For libraries that cannot be imported without (pynwb).
+    Its own cache there is left out: of two processes that import it for the first time, one reads what the other has
+    half written, and a process that is killed then leaves a file with which no import works again.
     """
     usual = _usual_cache()
     with suppress(OSError):
         usual.mkdir(parents=True, exist_ok=True)
-    if os.access(usual, os.W_OK | os.X_OK):
-        yield
-        return
-    before = os.environ.get("XDG_CACHE_HOME")
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["XDG_CACHE_HOME"] = folder
+        changed = {"PYNWB_NO_CACHE_DIR": "1"}
+        if not os.access(usual, os.W_OK | os.X_OK):
+            changed["XDG_CACHE_HOME"] = folder
+        before = {name: os.environ.get(name) for name in changed}
+        os.environ.update(changed)
         try:
             yield
         finally:
-            if before is None:
-                del os.environ["XDG_CACHE_HOME"]
-            else:
-                os.environ["XDG_CACHE_HOME"] = before
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def kept_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections import deque
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as RichProgress
+    from rich.console import RenderableType
+    from rich.live import Live
 
 LINE_EVERY_S = 10.0
+"""Between lines, where there is no terminal."""
+_LOOK_EVERY_S = 1.0
+_BAR_WIDTH = 24
+_FORGOTTEN = 1 / 3
+"""Of the time that passed: how fast the beginning went is of less use for the rest."""
+_ROUNDING = 1e-9
+"""Of all work: what sums of parts may be off by is no progress."""
+_FEWEST_MOVED = 0.01
+"""Of all work: with less done nothing sensible can be said about the rest."""
 
 
 class Progress(Protocol):
@@ -41,79 +53,198 @@ class Part:
         self._whole.update(self._before + self._units * done / total, self._total, note or self._note)
 
 
-class Lines:
-    """A progress in lines on standard error, for where there is no terminal: one every ten seconds, and no sooner.
+def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: str = "") -> Progress:
+    """The progress of another phase of the work, whose length says nothing about that of the others.
 
-        training: 34 %, 80 s left, return 101.2
+    A `Bar` shows each phase by itself, one below the other; any other progress is told the phases one after the other.
 
-    The time left is as long as the rest would take at the speed so far; of work whose share falls, as it begins another
-    part, from there on.
+    Args:
+        progress: of the whole work; None: silent.
+        title: a word or two.
+        amount: how much is done in the phase, where there is a number that tells more than a share; 0: none.
+        unit: of the amount, in the plural.
+    """
+    if isinstance(progress, Bar):
+        progress.begin(title, amount, unit)
+    return Silent() if progress is None else progress
+
+
+class Speed:
+    """How fast work goes on, of its whole a second: over the later two thirds of the time since it first moved.
+
+    What was before, compiling and the part of a checkpoint that is gone on from, says nothing about the rest.
     """
 
-    def __init__(self, title: str) -> None:
-        self._title = title
-        self._started_s = self._told_s = time.monotonic()
-        self._first = self._last = 0.0
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, float]] = deque()
+        self._began_s = 0.0
+        self._has_moved = False
+
+    def see(self, now_s: float, share: float) -> None:
+        """Take in how far it is; where that is less than before, other work has begun."""
+        if self._seen and share < self._seen[-1][1]:
+            self._seen.clear()
+            self._has_moved = False
+        if self._seen and not self._has_moved and share > self._seen[0][1] + _ROUNDING:
+            self._seen.clear()
+            self._has_moved = True
+        if not self._seen:
+            self._began_s = now_s
+        passed_s = now_s - self._began_s
+        if not self._seen or now_s - self._seen[-1][0] >= max(0.5, passed_s / 200):
+            self._seen.append((now_s, share))
+        while len(self._seen) > 1 and self._seen[1][0] <= self._began_s + _FORGOTTEN * passed_s:
+            self._seen.popleft()
+
+    def per_s(self, now_s: float, share: float) -> float | None:
+        """None as long as too little is done to tell."""
+        if not self._seen:
+            return None
+        since_s, before = self._seen[0]
+        if now_s <= since_s or share - before < _FEWEST_MOVED:
+            return None
+        return (share - before) / (now_s - since_s)
+
+
+class Phase:
+    """One phase of work, and what can be said about it."""
+
+    def __init__(self, title: str, amount: float = 0.0, unit: str = "") -> None:
+        self.title, self.share, self.note = title, 0.0, ""
+        self.was_told = False
+        """Whether anything was reported of it."""
+        self._amount, self._unit = amount, unit
+        self._began_s, self._ended_s = time.monotonic(), float("inf")
+        self._speed = Speed()
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Tell it, if the last line is old enough."""
-        now_s, share = time.monotonic(), done / total
-        if share < self._last:
-            self._started_s, self._first = now_s, share
-        self._last = share
-        if now_s - self._told_s < LINE_EVERY_S:
-            return
-        self._told_s = now_s
-        told = [f"{100 * share:.0f} %"]
-        if share > self._first:
-            left_s = (now_s - self._started_s) * (1 - share) / (share - self._first)
-            told.append(f"{left_s:.0f} s left" if left_s < 120 else f"{left_s / 60:.0f} min left")
-        print(f"{self._title}: {', '.join([*told, *([note] if note else [])])}", file=sys.stderr, flush=True)
+        """Take in a report."""
+        # Sums of parts may be a rounding beyond either end.
+        self.share, self.note, self.was_told = min(1.0, max(0.0, done / total)), note, True
+        self._speed.see(time.monotonic(), self.share)
+
+    def end(self) -> None:
+        """It is done."""
+        self.share, self.note, self._ended_s = 1.0, "", time.monotonic()
+
+    @property
+    def passed_s(self) -> float:
+        """Seconds that it has taken."""
+        return min(time.monotonic(), self._ended_s) - self._began_s
+
+    def counted(self) -> list[str]:
+        """How much is done, and how fast, where that is known."""
+        if not self._amount:
+            return []
+        told = [f"{self.share * self._amount:,.0f} of {self._amount:,.0f} {self._unit}"]
+        per_s = self._speed.per_s(time.monotonic(), self.share)
+        return told if per_s is None else [*told, rate_in_words(per_s * self._amount)]
+
+    def left(self) -> str:
+        """How long the rest would take at the speed so far; empty where that cannot be told."""
+        per_s = self._speed.per_s(time.monotonic(), self.share)
+        return "" if per_s is None or self.share == 1 else f"{duration_in_words((1 - self.share) / per_s)} left"
+
+
+def rate_in_words(per_s: float) -> str:
+    """A rate, such as `5,300 a second` or `2.1 a minute`."""
+    for unit, seconds in (("second", 1), ("minute", 60)):
+        if (rate := per_s * seconds) >= 1:
+            return f"{rate:,.0f} a {unit}" if rate >= 10 else f"{rate:.1f} a {unit}"
+    return f"{per_s * 3600:.1f} an hour"
+
+
+def duration_in_words(seconds: float) -> str:
+    """A duration, such as `80 s`, `12 min` or `3.4 h`."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 class Bar:
     """A progress bar on standard error, with the time left; where that is not a terminal, a line every ten seconds.
 
-    Use it as a context manager: `with Bar("training") as progress: ...`.
+        training: 34 %, 81,600 of 240,000 iterations, 1,940 a second, 82 s left, return 101.2
+
+    Use it as a context manager: `with Bar("training") as progress: ...`. Each phase of the work (`in_phase`) has a bar
+    of its own.
     """
 
     def __init__(self, title: str) -> None:
-        self._title = title
-        self._bar: RichProgress | None = None
-        self._lines = Lines(title)
+        self._phases = [Phase(title)]
+        self._live: Live | None = None
+        self._is_over = threading.Event()
+        self._told_s = time.monotonic()
+        self._telling = threading.Lock()
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-            from rich.progress import Progress as RichProgress
+            from rich.live import Live
 
-            self._bar = RichProgress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TextColumn("{task.percentage:>3.0f} %"),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[note]}"),
+            self._live = Live(
+                get_renderable=self._drawn,
                 console=Console(stderr=True),
                 # What is printed appears above the bar; a file or a pipe that it goes to gets it as ever.
                 redirect_stdout=sys.stdout.isatty(),
             )
-            self._bar.start()
-            self._task = self._bar.add_task(self._title, total=1.0, note="")
+            self._live.start()
+        else:
+            # Work that reports nothing for long is told of too.
+            threading.Thread(target=self._look, name="progress", daemon=True).start()
         return self
+
+    def begin(self, title: str, amount: float = 0.0, unit: str = "") -> None:
+        """Begin another phase; the one before is done. See `in_phase`."""
+        self._phases[-1].end()
+        # One of which nothing was said is not shown.
+        self._phases = [*(phase for phase in self._phases if phase.was_told), Phase(title, amount, unit)]
 
     def update(self, done: float, total: float, note: str = "") -> None:
         """Move the bar to `done` of `total`."""
-        if self._bar is None:
-            self._lines.update(done, total, note)
-        else:
-            self._bar.update(self._task, completed=done, total=total, note=note)
+        self._phases[-1].update(done, total, note)
+        if self._live is None:
+            self._tell()
+
+    def _look(self) -> None:
+        while not self._is_over.wait(_LOOK_EVERY_S):
+            self._tell()
+
+    def _tell(self) -> None:
+        """A line, if the last one is old enough."""
+        with self._telling:
+            now_s, phase = time.monotonic(), self._phases[-1]
+            if now_s - self._told_s < LINE_EVERY_S:
+                return
+            self._told_s = now_s
+            told = [f"{100 * phase.share:.0f} %", *phase.counted(), phase.left(), phase.note]
+            print(f"{phase.title}: {', '.join(filter(None, told))}", file=sys.stderr, flush=True)
+
+    def _drawn(self) -> RenderableType:
+        """The phases one below the other, and below the last what is known besides, cut to the terminal's width."""
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        phases = self._phases
+        table = Table.grid(padding=(0, 1))
+        for phase in phases:
+            minutes, seconds = divmod(int(phase.passed_s), 60)
+            table.add_row(
+                Text(phase.title, no_wrap=True, overflow="ellipsis"),
+                ProgressBar(1.0, phase.share, _BAR_WIDTH),
+                Text(f"{100 * phase.share:3.0f} %"),
+                Text(f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"),
+                Text(phase.left(), no_wrap=True),
+            )
+        told = ", ".join(filter(None, [*phases[-1].counted(), phases[-1].note]))
+        return Group(table, Text(told, no_wrap=True, overflow="ellipsis")) if told else table
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        self._is_over.set()
+        if self._live is not None:
+            self._live.stop()
+            self._live = None

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, final
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -12,6 +15,8 @@ from animat.environment import Animat, Environment, Responded, RobotState, State
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Quantity, Robot
+from animat.robots.capabilities import capability
+from animat.robots.host import HostRobot
 
 Delivery = Literal["chosen", "shuffled"]
 """What the neurons get: the condition that was chosen, or one drawn at random (`ShuffledDelivery`)."""
@@ -118,6 +123,136 @@ class NeuralObservation(Wrapper[RobotState]):
 
     def observe(self, state: State) -> Float[Array, " observations"]:
         return jnp.concatenate([self.inside.observe(state), state.neurons])
+
+
+@final
+@dataclass(frozen=True)
+class YokedDelivery(Wrapper[RobotState]):
+    """Delivers what was chosen for another episode, which goes on beside this one: as many stimuli, to no end here.
+
+    Whoever acts observes the other episode and acts in it, through neurons of its own; one that ends starts again. The
+    same stimuli are delivered here, whatever happens here.
+
+    Raises:
+        InvalidArgument: around an environment without neurons, or with a robot that is stepped outside of JAX.
+
+    Source: the non-contingent control of Bakkum et al. 2008, doi:10.1088/1741-2560/5/3/004.
+    """
+
+    def __post_init__(self) -> None:
+        _expect_neurons(self)
+        _expect_jax(self.robot)
+
+    @property
+    def noise_size(self) -> int:
+        return 2 * self.inside.noise_size
+
+    def observe(self, state: State) -> Float[Array, " observations"]:
+        return self.inside.observe(state.info[_OTHER])  # type: ignore[arg-type]
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        state, other = self.inside.reset(key), self.inside.reset(jax.random.fold_in(key, 1)).carried
+        return _remembering(state, {_OTHER: other, _START: other})
+
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        n, other, start = self.inside.noise_size, state.info[_OTHER], state.info[_START]
+        there = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
+        next_ = _where(jnp.logical_or(*there.ended), start, there.carried)
+        here = self.inside.advance(uniforms[:n], state, action, simulator)
+        return _remembering(here, {_OTHER: next_, _START: start})
+
+
+@final
+@dataclass(frozen=True)
+class GoalSwitch(Wrapper[RobotState]):
+    """Gives the robot another goal in mid-episode, that of the first other start whose goal looks different.
+
+    Attributes:
+        at: after how many iterations.
+
+    Raises:
+        InvalidArgument: for a robot whose goal cannot be switched (`Robot.with_goal_of`).
+    """
+
+    at: int
+
+    def __post_init__(self) -> None:
+        capability(self.robot, "with_goal_of")
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        state = self.inside.reset(key)
+        return _remembering(state, {_GOAL: other_goal(self.robot, state.robot, jax.random.fold_in(key, 1))})
+
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        after, other = self.inside.advance(uniforms, state, action, simulator), state.info[_GOAL]
+        switched = capability(self.robot, "with_goal_of")(after.robot, other)
+        robot = _where(after.iteration == self.at, switched, after.robot)
+        return _remembering(after._replace(robot=robot), {_GOAL: other})
+
+
+@final
+@dataclass(frozen=True)
+class TurnedRound(Animat[RobotState]):
+    """The mapping turned round: every response moves the robot by the opposite command."""
+
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+        responded = super().respond(uniforms, state, action, simulator)
+        return responded._replace(command=-responded.command)
+
+
+@final
+@dataclass(frozen=True)
+class IdealActuator(Animat[RobotState]):
+    """Moves the robot by a command of each condition in place of the response.
+
+    Attributes:
+        commands: of each condition; of several commands, one of each.
+    """
+
+    commands: tuple[float | tuple[float, ...], ...]
+
+    def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
+        responded = super().respond(uniforms, state, action, simulator)
+        return responded._replace(command=jnp.asarray(self.commands, jnp.float32)[action])
+
+
+def with_inmost(
+    environment: Environment[RobotState], change: Callable[[Environment[RobotState]], Environment[RobotState]]
+) -> Environment[RobotState]:
+    """The same wrappers around what is made of what is inside of all of them."""
+    if isinstance(environment, Wrapper):
+        return replace(environment, inside=with_inmost(environment.inside, change))
+    return change(environment)
+
+
+STARTS = 16
+"""Among which another goal is looked for: of two that are equally likely one in 65,000 is not found."""
+
+
+def other_goal(robot: Robot[RobotState], own: RobotState, key: PRNGKeyArray) -> RobotState:
+    """A start of a robot with another goal than its own, which an observation tells apart."""
+    starts = jax.vmap(robot.reset)(jax.random.split(key, STARTS))
+    switched = jax.vmap(capability(robot, "with_goal_of"), (None, 0))(own, starts)
+    is_other = jnp.any(jax.vmap(robot.observe)(switched) != robot.observe(own), axis=-1)
+    first: RobotState = jax.tree.map(lambda x: x[jnp.argmax(is_other)], starts)
+    return first
+
+
+_OTHER, _START, _GOAL = "other_episode", "other_start", "other_goal"
+"""In `State.info`: the other episode and where it starts; and the state whose goal is switched to."""
+
+
+def _remembering(state: State, remembered: dict[str, Any]) -> State:
+    return state._replace(info={**state.info, **remembered})
+
+
+def _where(condition: Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, condition), yes, no)
+
+
+def _expect_jax(robot: Robot[Any]) -> None:
+    if isinstance(robot, HostRobot):
+        raise InvalidArgument(f"robot: expected one that is stepped in JAX, got {robot.name}, which is not")
 
 
 def _expect_neurons(wrapper: Wrapper[Any]) -> None:

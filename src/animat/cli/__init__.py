@@ -24,12 +24,14 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from animat.cli.cluster import ClusterCommand
 from animat.cli.convert import Convert
 from animat.cli.evaluate import Evaluate
 from animat.cli.inspect import Inspect
 from animat.cli.live import Live
 from animat.cli.record import Record
 from animat.cli.recover import Recover
+from animat.cli.replay import Replay
 from animat.cli.reproduce import Reproduce
 from animat.cli.robots import Robots
 from animat.cli.run import Run
@@ -37,6 +39,7 @@ from animat.cli.study import StudyFile
 from animat.cli.train import Train
 from animat.cli.tune import TuneFile
 from animat.cli.validate import Validate
+from animat.cli.watch import Watch
 from animat.ctrl_c import heard_everywhere
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 
@@ -50,9 +53,12 @@ Command = (
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[StudyFile, subcommand("study")]
     | Annotated[TuneFile, subcommand("tune")]
+    | Annotated[ClusterCommand, subcommand("cluster")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Live, subcommand("live")]
     | Annotated[Recover, subcommand("recover")]
+    | Annotated[Replay, subcommand("replay")]
+    | Annotated[Watch, subcommand("watch")]
     | Annotated[Robots, subcommand("robots")]
 )
 
@@ -107,14 +113,18 @@ def _run(given: list[str]) -> int:
         # As for `python -m animat`: robots of one's own may lie in the working folder.
         sys.path.append("")
     try:
-        with heard_everywhere():
+        with heard_everywhere(), _watched(command):
             results = command.run()
     except AnimatError as error:
         print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
         _say_notes(error)
         return 1
     except KeyboardInterrupt as error:
-        kept = "" if isinstance(command, Inspect | Validate | Convert | Evaluate) else "; what was finished is kept"
+        kept = (
+            ""
+            if isinstance(command, Inspect | Validate | Convert | Evaluate | Replay | ClusterCommand | Watch)
+            else "; what was finished is kept"
+        )
         again = (
             "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile) else ""
         )
@@ -136,6 +146,15 @@ def _run(given: list[str]) -> int:
         print(json.dumps(as_json(results)))
     # Of several files, some of which could not be read or used, as was said on the way.
     return 1 if results.get("unreadable") or results.get("unusable") else 0
+
+
+def _watched(command: Command) -> contextlib.AbstractContextManager[None]:
+    """The page of a command that is asked for one (`--watch`), for as long as it runs and is looked at."""
+    if not isinstance(command, Record | Train | Run | Live | StudyFile | TuneFile) or not command.watch:
+        return contextlib.nullcontext()
+    from animat.watch.serving import watching
+
+    return watching(command.out)
 
 
 def _parse(arguments: list[str]) -> Command:

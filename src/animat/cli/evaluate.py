@@ -32,6 +32,10 @@ class Evaluate(Fitting):
     optimum: bool = False
     """Also compute the best return that any controller could get there, and that of a mere reflex, and scores; a
     minute, with memory some"""
+    interventions: bool = False
+    """Also say whose work it is: what the policies lose without the culture, with the stimuli of another episode,
+    with the mapping turned round; and, of a robot with several goals, what a switch of the goal does, and goal
+    information in bits"""
     seed: int = 1
     """Decides every random draw"""
     json: bool = False
@@ -62,6 +66,7 @@ class Evaluate(Fitting):
                 seed=self.seed,
                 greedy=not self.drawn,
                 optimum_resolution=1.0 if self.optimum else None,
+                interventions=self.interventions,
                 progress=progress,
             )
         say_findings(evaluation.findings)

@@ -64,6 +64,8 @@ class Live(Stimulating):
     """Decides every random draw, but what the culture does and when simulators are swapped"""
     out: Path = Path("live")
     """Folder for recordings, policies, the session, and live.log"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -115,7 +117,7 @@ class Live(Stimulating):
             ExitStack() as told,
             exclusive_lock(self.out),
             polite_kill_as_ctrl_c(),
-            Bar("live") as progress,
+            Bar("culture") as progress,
             culture_of(
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress
             ) as culture,

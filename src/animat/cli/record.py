@@ -52,6 +52,8 @@ class Record:
     """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too"""
     out: Path = Path("recordings")
     """Folder for the files"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 

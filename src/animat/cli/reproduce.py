@@ -1,26 +1,34 @@
-"""The command that runs the paper's study."""
+"""The command that runs the studies that come with animat: the paper's, and that of context."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from animat.cli.study import run_and_report
+from animat.errors import InvalidArgument
 
 
 @dataclass(frozen=True)
 class Reproduce:
     """The paper's study on a virtual culture: record, train, evaluate, compare, report. Goes on where it stopped."""
 
+    study: Literal["paper", "context"] = "paper"
+    """paper: the paper's comparisons; context: which tasks need more than a reflex, what the policies do beyond one,
+    and whose work it is"""
     quick: bool = False
     """Every step with fewer policies, iterations and recordings: a first look, no results"""
-    culture_seed: int = 1
-    """Which virtual culture"""
+    culture_seed: str = "1"
+    """Which virtual culture; several: 1-5, or 1,3,8"""
     seed: int = 1
     """Decides every draw of training and evaluation"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
+    cluster: str | None = None
+    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
+    shared_folder: bool = True
+    """Whether its workers see --out at the same place; if not, files go through this process"""
     out: Path = Path("study")
     """Folder for everything; the report is report.html in it"""
     json: bool = False
@@ -29,7 +37,42 @@ class Reproduce:
     def run(self) -> dict[str, Any]:
         """Run it."""
         from animat.studies.paper import paper_study
+        from animat.studies.source import read_seeds
 
+        try:
+            seeds = read_seeds(self.culture_seed)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"--culture-seed: {str(error).removeprefix('seeds: ')}") from error
+        if self.study == "context":
+            return self._context(seeds)
+        study = paper_study(1, self.seed, quick=self.quick)
+        if len(seeds) == 1:
+            culture = replace(study.culture, seed=seeds[0])
+        else:
+            culture = replace(study.culture, seeds=self.culture_seed)
         return run_and_report(
-            paper_study(self.culture_seed, self.seed, quick=self.quick), Path(), self.out, self.workers
+            replace(study, culture=culture), Path(), self.out, self.workers, self.cluster, self.shared_folder
         )
+
+    def _context(self, cultures: list[int]) -> dict[str, Any]:
+        """Run the context study."""
+        from animat.execution.cluster import on_cluster
+        from animat.progress import Bar
+        from animat.studies.context import run_context_study
+        from animat.studies.context_page import in_short, write_context_page
+        from animat.studies.context_tasks import ContextStudy, quick_context_study
+
+        study = (quick_context_study if self.quick else ContextStudy)(cultures=tuple(cultures), seed=self.seed)
+        with on_cluster(self.cluster, self.shared_folder) as executor, Bar("study") as progress:
+            found = run_context_study(study, self.out, workers=self.workers, executor=executor, progress=progress)
+        report = write_context_page(study, found)
+        for robot in study.robots:
+            print(f"{robot}: {in_short([row for row in found.rows if row.robot == robot])}")
+        print(f"report: {report}")
+        return {
+            "folder": str(found.folder),
+            "report": str(report),
+            "done_now_cpu_s": found.done_now,
+            "rows": [asdict(row) for row in found.rows],
+            "lost": [asdict(row) for row in found.lost],
+        }

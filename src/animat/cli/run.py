@@ -51,8 +51,12 @@ class Run(Stimulating):
     """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
     episodes: int = 5
     """Of each policy; of each control as many at most, and together no more than of policies, but 5 each"""
-    controls: Literal["all", "random"] = "all"
-    """all: random, constant, silent, shuffled and heuristic; random: only that one"""
+    controls: Literal["all", "random", "coupling"] = "all"
+    """all: random, constant, silent, shuffled and heuristic; random: only that one; coupling: all, and the best reflex,
+    which is searched for on the simulator first, a minute"""
+    interventions: bool = False
+    """Also say whose work it is: the policies with random spikes in place of responses, the stimuli of another episode,
+    the mapping turned round and, of a robot with several goals, the goal switched in mid-episode"""
     pulses: int | None = None
     """Pulses per trial; default: as the policies' recordings had"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
@@ -73,6 +77,8 @@ class Run(Stimulating):
     """Decides every random draw, but what a living culture does"""
     out: Path = Path("session")
     """Folder for the session's log and recording"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -90,6 +96,7 @@ class Run(Stimulating):
         from animat.progress import Bar
         from animat.reality_gap import check_conditions, check_policies, run_policies
         from animat.recordings.reading import read_recordings
+        from animat.robots.host import HostRobot
 
         # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
         check_episodes("--episodes", self.episodes)
@@ -97,6 +104,10 @@ class Run(Stimulating):
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
+        if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
+            raise InvalidArgument(
+                f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
+            )
         fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
@@ -115,7 +126,7 @@ class Run(Stimulating):
             # Last, as it makes the folder.
             _held_for_session(self.out, is_recording=not recordings),
             polite_kill_as_ctrl_c(),
-            Bar("closed loop") as progress,
+            Bar("culture") as progress,
             self._culture(recordings, progress) as culture,
         ):
             pulse, patterns, noticed = self._presenting(culture, recordings, calibration, loop)
@@ -128,7 +139,9 @@ class Run(Stimulating):
                 calibration,
                 self.out,
                 episodes=self.episodes,
-                with_controls=self.controls == "all",
+                with_controls=self.controls != "random",
+                with_coupling=self.controls == "coupling",
+                with_interventions=self.interventions,
                 greedy=not self.drawn,
                 adaptive=self.thresholds == "adaptive",
                 seed=self.seed,
@@ -189,6 +202,7 @@ class Run(Stimulating):
         from animat.coding.recording import protocol_of
         from animat.cultures.kinds import pulse_for
         from animat.live.recording import record_within
+        from animat.progress import in_phase
         from animat.recordings.formats.nwb import write_nwb
         from animat.stimulation.protocol import CLOSED_LOOP
 
@@ -196,7 +210,7 @@ class Run(Stimulating):
         encoder = Encoder(first.conditions, presentation.pulses)
         protocol = protocol_of(encoder, presentation.order, len(culture.patterns), pulse_for(self.culture))
         print("no recordings were given: the culture is recorded first", file=sys.stderr)
-        recording = record_within(account, culture, protocol, self.seed, progress)
+        recording = record_within(account, culture, protocol, self.seed, in_phase(progress, "recording"))
         write_nwb(recording, self.out / CALIBRATION_FILE)
         return recording
 

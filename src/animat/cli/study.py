@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from animat.studies.specification import Study
 
 
@@ -23,8 +25,14 @@ class StudyFile:
     """The TOML file; animat reproduce leaves one to start from in its folder"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
+    cluster: str | None = None
+    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
+    shared_folder: bool = True
+    """Whether its workers see --out at the same place; if not, files go through this process"""
     out: Path = Path("study")
     """Folder for everything; the report is report.html in it"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -32,17 +40,18 @@ class StudyFile:
         """Run it."""
         from animat.studies.toml import read_study
 
-        return run_and_report(read_study(self.specification), self.specification.parent, self.out, self.workers)
+        study = read_study(self.specification)
+        return run_and_report(
+            study, self.specification.parent, self.out, self.workers, self.cluster, self.shared_folder
+        )
 
 
-def run_and_report(study: Study, base: Path, out: Path, workers: int | None) -> dict[str, Any]:
+def run_and_report(
+    study: Study, base: Path, out: Path, workers: int | None, cluster: str | None, shared_folder: bool
+) -> dict[str, Any]:
     """Run a study, whose files are named as seen from `base`, and print its comparisons."""
-    from animat.lined_up import lined_up
-    from animat.progress import Bar
-    from animat.studies.heuristic import not_outperforming
-    from animat.studies.places import results_file
-    from animat.studies.results import Results, read_typed
-    from animat.studies.run import run_study
+    from animat.execution.cluster import on_cluster
+    from animat.studies.cultures import studies_of
 
     for spec in study.robots:
         for caveat in spec.robot().caveats():
@@ -50,9 +59,22 @@ def run_and_report(study: Study, base: Path, out: Path, workers: int | None) -> 
     cores = len(os.sched_getaffinity(0))
     if workers is not None and workers > cores:
         print(f"warning: --workers: {workers} were asked for; there is one a core, {cores}", file=sys.stderr)
+    run = _run_many if studies_of(study) else _run_one
+    with on_cluster(cluster, shared_folder) as executor:
+        return run(study, base, out, workers, executor)
+
+
+def _run_one(study: Study, base: Path, out: Path, workers: int | None, executor: Executor | None) -> dict[str, Any]:
+    from animat.lined_up import lined_up
+    from animat.progress import Bar
+    from animat.studies.heuristic import not_outperforming
+    from animat.studies.places import results_file
+    from animat.studies.results import Results, read_typed
+    from animat.studies.run import run_study
+
     began = time.monotonic()
     with Bar("study") as progress:
-        ran = run_study(study, out, base=base, workers=workers, progress=progress)
+        ran = run_study(study, out, base=base, workers=workers, executor=executor, progress=progress)
     results = read_typed(results_file(ran.folder), Results)
     cells = []
     for row in results.comparisons:
@@ -77,4 +99,40 @@ def run_and_report(study: Study, base: Path, out: Path, workers: int | None) -> 
         "done_now_cpu_s": ran.done_now,
         "comparisons": [asdict(row) for row in results.comparisons],
         "not_outperforming_the_heuristic": beside,
+    }
+
+
+def _run_many(study: Study, base: Path, out: Path, workers: int | None, executor: Executor | None) -> dict[str, Any]:
+    from animat.errors import AnimatError
+    from animat.lined_up import lined_up
+    from animat.progress import Bar
+    from animat.studies.cultures import run_over_cultures
+    from animat.studies.cultures_page import write_cultures_page
+    from animat.studies.parquet import MISSING
+
+    began = time.monotonic()
+    with Bar("study") as progress:
+        found = run_over_cultures(study, out, base=base, workers=workers, executor=executor, progress=progress)
+    report = write_cultures_page(study, found)
+    cells = []
+    for row in found.summary:
+        interval = "" if row.low_95 is None else f"{row.low_95:+.1f} to {row.high_95:+.1f}"
+        means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}", f"{row.difference:+.1f}"
+        cells.append([f"{row.robot}, {row.comparison}", *means, interval, f"{row.holds_in} of {row.cultures}"])
+    if cells:
+        print("\n".join(lined_up(["", "first", "second", "difference", "95 % interval", "second better in"], cells)))
+    jobs = sum(len(each.done_now) for each in found.ran.values())
+    print(f"{len(found.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
+    if found.parquet is None:
+        print(f"scores.csv only, no Parquet table: {MISSING}")
+    for name, why in found.failed.items():
+        print(f"failed: {name}: {why}", file=sys.stderr)
+    if found.failed:
+        total = len(found.ran) + len(found.failed)
+        raise AnimatError(f"{len(found.failed)} of {total} cultures failed; the same command tries them again")
+    return {
+        "folder": str(found.folder),
+        "report": str(report),
+        "cultures": list(found.ran),
+        "over_cultures": [asdict(row) for row in found.summary],
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,7 +27,7 @@ class Train(Fitting):
     """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, swing-up, arm, wheels, one of your own, such as
+    """The robot to drive: cartpole, navigation, swing-up, shuttle, arm, wheels, one of your own, such as
     my_package.robots:Rover, or any of Gymnasium's, gymnasium:Reacher-v5"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""
@@ -41,7 +42,8 @@ class Train(Fitting):
     policies: int | None = None
     """How many policies, each from its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
-    """Training iterations of each; default: 400000 for cartpole, 250000 for others, with --paper twice as many"""
+    """Training iterations of each; default: 400000 for cartpole, 500000 for swing-up, 1000000 for arm, 250000 for
+    others, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
     shadowing: Literal["on", "off", "drawn"] = "on"
@@ -60,6 +62,8 @@ class Train(Fitting):
     """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
     sac: tuple[str, ...] = ()
     """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
+    neural_observation: bool = False
+    """Policies see what the neurons remember too, trace and load of the last stimuli and responses"""
     lessons: Path | None = None
     """Lessons in turn, a TOML file: ranges of parameters, starts and recordings, and when to go on"""
     assess: int | None = None
@@ -67,8 +71,16 @@ class Train(Fitting):
     default: none, but 20 where lessons say when to go on"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
+    cluster: str | None = None
+    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
+    shared_folder: bool = True
+    """Whether its workers see --out at the same place; if not, files go through this process"""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard: the learning curves as they come, a run a policy; needs animat[tensorboard]"""
     out: Path = Path("policies")
     """Folder for the policies"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -110,12 +122,16 @@ class Train(Fitting):
             delivery=self.delivery,
             commands=robot.baseline_commands if mapping == "none" else None,
             algorithm=read_sac(self.sac),
+            neural_observation=self.neural_observation,
             lessons=() if self.lessons is None else read_lessons(self.lessons),
             assess=self.assess,
         )
+        from animat.execution.cluster import on_cluster
         from animat.execution.training import train
+        from animat.report.tensorboard import TensorBoard
         from animat.training.folder import expect_folder_for, expect_trainable, is_finished
 
+        board = nullcontext() if self.tensorboard is None else TensorBoard(self.tensorboard)
         expect_trainable(training, is_saved=True)
         expect_folder_for(training, self.out)
         for caveat in robot.caveats():
@@ -132,14 +148,16 @@ class Train(Fitting):
         was_finished = is_finished(training, self.out)
         if timeline is not None:
             print(_control(timeline))
-        with Bar("training") as progress:
+        with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
             trained = train(
                 training,
                 timeline,
                 self.out,
                 workers=self.workers,
+                executor=executor,
                 progress=progress,
                 sources=[str(path) for path in self.recordings],
+                callbacks=() if on_row is None else (on_row,),
             )
         if was_finished:
             print(f"this training was finished before: its policies are in {self.out}, as they were")

@@ -20,13 +20,20 @@ class TuneFile:
     """The study's TOML file; its table [tune] says what is searched"""
     workers: int | None = None
     """Processes, each on its own core; default: one a core"""
+    cluster: str | None = None
+    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
+    shared_folder: bool = True
+    """Whether its workers see --out at the same place; if not, files go through this process"""
     out: Path = Path("tuning")
     """Folder for everything; the settings found are best.toml in it"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         """Search."""
+        from animat.execution.cluster import on_cluster
         from animat.lined_up import lined_up
         from animat.progress import Bar
         from animat.tuning.search import expect_optuna
@@ -36,6 +43,7 @@ class TuneFile:
         expect_optuna()
         from animat.tuning.results import BEST, HISTORY, IMPORTANCE, settings_in_words
         from animat.tuning.run import tune
+        from animat.tuning.space import first_settings
 
         for caveat in tuning.study.robots[0].robot().caveats():
             print(f"warning: {caveat}", file=sys.stderr)
@@ -43,13 +51,15 @@ class TuneFile:
         if self.workers is not None and self.workers > cores:
             print(f"warning: --workers: {self.workers} were asked for; there is one a core, {cores}", file=sys.stderr)
         began = time.monotonic()
-        with Bar("tuning") as progress:
-            tuned = tune(tuning, self.out, base=self.specification.parent, workers=self.workers, progress=progress)
+        base = self.specification.parent
+        with on_cluster(self.cluster, self.shared_folder) as executor, Bar("tuning") as progress:
+            tuned = tune(tuning, self.out, base=base, workers=self.workers, executor=executor, progress=progress)
         cells = []
+        names = ("own settings", "defaults")[: len(first_settings(tuning.study, tuning.space))]
         for final in sorted(tuned.finals, key=lambda each: -each.mean):
-            error = "" if final.standard_error is None else f"{final.standard_error:.1f}"
-            name = "own settings" if final.trial == 0 else f"trial {final.trial}"
-            mean = "diverged" if final.returns is None else f"{final.mean:.1f}"
+            error = "" if final.standard_error is None else f"{final.standard_error:.2g}"
+            name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"
+            mean = "diverged" if final.returns is None else f"{final.mean:.4g}"
             cells.append([name, mean, error, settings_in_words(final.settings)])
         policies, episodes = tuning.study.policies, tuning.study.episodes
         print(f"trained anew, {policies} policies of each in {episodes} fresh episodes each:")
@@ -58,7 +68,7 @@ class TuneFile:
             shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
             print(f"importance: {shares}")
         else:
-            print("importance: too few trials to tell")
+            print("importance: too few trials with different returns to tell")
         pictures = [HISTORY, *([IMPORTANCE] if tuned.importance else [])]
         counted = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
         print(f"{len(tuned.told)} trials ({counted}) in {time.monotonic() - began:.0f} s")

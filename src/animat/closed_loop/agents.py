@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 
-LoopDelivery = Literal["chosen", "shuffled", "silent"]
-"""What the culture is given; a training (`animat.wrappers.Delivery`) has no silence."""
+LoopDelivery = Literal["chosen", "shuffled", "silent", "yoked"]
+"""What the culture is given; a training (`animat.wrappers.Delivery`) has the first two alone."""
 
 
 class Controller(Protocol):
@@ -74,9 +74,34 @@ class HeuristicController:
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
         """The nearest."""
-        wanted = np.asarray(capability(self.robot, "heuristic")(observation), np.float32)
-        apart = np.array(self.means, np.float32) - wanted
-        return int(np.argmin(np.abs(apart) if apart.ndim == 1 else np.linalg.norm(apart, axis=1)))
+        return _nearest(self.means, np.asarray(capability(self.robot, "heuristic")(observation), np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class CouplingController:
+    """The best coupling (`animat.evaluation.coupling`), which was found on a simulator.
+
+    Attributes:
+        coupling: as it acts there; one actor.
+        scales: what the numbers of an observation are divided by.
+    """
+
+    coupling: Any
+    scales: Float[np.ndarray, " observations"]
+
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
+        """The condition whose mean command is the nearest to the one that the coupling wants."""
+        weights = np.asarray(self.coupling.weights)[0]
+        seen = (np.asarray(observation, np.float32) / np.asarray(self.scales, np.float32))[list(self.coupling.seen)]
+        drive = weights[:, :-1] @ seen + weights[:, -1]
+        wanted = np.tanh(drive) if self.coupling.kind == "graded" else np.sign(drive)
+        return _nearest(np.asarray(self.coupling.means)[0], wanted if len(wanted) > 1 else wanted[0])
+
+
+def _nearest(means: Any, wanted: Any) -> int:
+    """The condition whose mean command is the nearest; of several commands by the straight line."""
+    apart = np.asarray(means, np.float32) - wanted
+    return int(np.argmin(np.abs(apart) if apart.ndim == 1 else np.linalg.norm(apart, axis=1)))
 
 
 @dataclass(frozen=True)
@@ -108,9 +133,13 @@ class Agent:
         meaning: what it is, in a few words.
         controller: who chooses.
         delivery: `"chosen"`: the culture gets what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
-            `"silent"`: no pulse, and what the culture fires by itself is read where the response would be.
+            `"silent"`: no pulse, and what the culture fires by itself is read where the response would be; `"yoked"`:
+            what was given in the last whole episode of those who take turns here, over and over.
         calibrates: whether its responses count for adaptive thresholds; one condition presented over
             and over is answered otherwise than between others. The warm-up of its episodes always counts.
+        drawn_from: responses that one is drawn from in place of the culture's; None: the culture's own is read.
+        is_turned_round: whether every command is turned into its opposite.
+        switch_at: after how many iterations the robot is given another goal; None: never.
     """
 
     name: str
@@ -118,6 +147,15 @@ class Agent:
     controller: Controller
     delivery: LoopDelivery = "chosen"
     calibrates: bool = True
+    drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
+    is_turned_round: bool = False
+    switch_at: int | None = None
+
+    def sees_neurons(self, turn: int) -> bool:
+        """Whether whoever chooses in its episode number `turn` sees the history state too."""
+        controller = self.acting(turn)
+        policy = controller.policy if isinstance(controller, Greedy) else controller
+        return bool(getattr(policy, "neural_observation", False))
 
     def acting(self, turn: int) -> Controller:
         """Who chooses in the agent's episode number `turn`, counted from 0."""
@@ -160,6 +198,34 @@ def controls(
                 HeuristicController(robot, tuple(means)),
             )
         )
+    return found
+
+
+def interventions(
+    robot: Robot[Any],
+    policies: Mapping[str, Controller],
+    responses_hz: Float64[np.ndarray, "responses *readouts"],
+    switch_at: int,
+) -> list[Agent]:
+    """The same policies, in turn, in what is changed in one way each (`animat.evaluation.controls.interventions_of`).
+
+    Only a culture's own part is changed here: who is replaced by an ideal actuator needs none, and silent and shuffled
+    ones are among the controls.
+
+    Args:
+        robot: that is driven.
+        policies: by name.
+        responses_hz: non-burst responses of all conditions, for random spikes.
+        switch_at: after how many iterations the goal is switched, where the robot can be given another one.
+    """
+    who = InTurn(dict(policies))
+    found = [
+        Agent("random spikes", "no pulse; any recorded response", who, "silent", drawn_from=responses_hz),
+        Agent("yoked", "the stimuli of another episode", who, "yoked", calibrates=False),
+        Agent("turned round", "the opposite of every command", who, is_turned_round=True),
+    ]
+    if hasattr(robot, "with_goal_of"):
+        found.append(Agent("goal switched", f"another goal after {switch_at} actions", who, switch_at=switch_at))
     return found
 
 

@@ -5,37 +5,33 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import Agent, Controller
+from animat.closed_loop.agents import Agent, Controller, InTurn
 from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.reading import read_response
 from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
-from animat.closed_loop.stretch import Asked, Stretch, rows_of
+from animat.closed_loop.standing import Standing
+from animat.closed_loop.stopping import Stop, ending_of
+from animat.closed_loop.stretch import Asked, Stretch, seen_in
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
-from animat.errors import AnimatError, BudgetSpent, UnsafeStimulus
-from animat.responses.windows import read_windows
+from animat.errors import AnimatError, BudgetSpent
+from animat.neurons.remembering import Remembered
 from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
-
-
-class Stop(Exception):
-    """The session is over before its plan is done."""
-
-    def __init__(self, ending: Ending) -> None:
-        super().__init__(ending.message)
-        self.ending = ending
 
 
 class Driver:
@@ -49,6 +45,7 @@ class Driver:
         account: of the stimulation budget.
         clock: the machine's.
         seed: decides every random draw.
+        stop_file: looked for before anything is asked of the culture; once it is there, nothing is any more.
     """
 
     def __init__(
@@ -60,19 +57,24 @@ class Driver:
         account: Account,
         clock: Clock,
         seed: int,
+        stop_file: Path,
     ) -> None:
         self.records: deque[Record] = deque()
-        self.episodes_done, self.last_return = 0, ""
+        self.standing = Standing(loop.robot.episode_limit)
         self.is_stopped = False
         self.expected = float("inf"), "nobody"
         """By when, on `time.monotonic()`, who should have answered at the latest; a supervisor watches it."""
         self.under_way: Asked | None = None
         """What was asked of the culture and is not answered yet; a supervisor writes it down."""
+        self._stop_file = stop_file
         self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
         self._rng = np.random.default_rng([seed, 21])
         runs = HostRunner if isinstance(loop.robot, HostRobot) else RobotRunner
         self._runner: Runner = runs(loop.robot, np.random.default_rng([seed, 22]))
+        if any(agent.switch_at is not None for agent in agents):
+            # Compiled now, as its step is.
+            self._runner.switch_goal(0)
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
@@ -83,18 +85,24 @@ class Driver:
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
+        self._remembered = Remembered()
+        self._given: dict[str, list[int]] = {}
+        """What was delivered in the last whole episode of each agent."""
         self._unmoved: tuple[Stretch, Sequence[Stimulus], dict[str, Any]] | None = None
 
     @property
     def _at_rest(self) -> float | tuple[float, ...]:
-        n = self._loop.robot.n_commands
-        return 0.0 if n == 1 else (0.0,) * n
+        return 0.0 if (n := self._loop.robot.n_commands) == 1 else (0.0,) * n
 
     @property
     def unfinished(self) -> Record | None:
         """What the culture answered while the robot has not moved by it: to be written down if it never does."""
-        unmoved = self._unmoved
-        return None if unmoved is None else _seen(*unmoved)
+        return None if self._unmoved is None else seen_in(*self._unmoved)
+
+    def stopped_by_file(self) -> Ending | None:
+        """The ending that a person asks for by a file, if they do."""
+        is_there = self._stop_file.exists()
+        return Ending("person", f"stopped by a person (the file {self._stop_file.name})") if is_there else None
 
     def run(self) -> Ending:
         """Run all episodes; whatever goes wrong is an ending, never an exception."""
@@ -103,7 +111,7 @@ class Driver:
             self._data_at_s = self._wall_zero_s = self._clock.now_s()
             for episode, turn in enumerate(self._turns):
                 self._run_episode(episode, self._agents[turn])
-                self.episodes_done = episode + 1
+                self.standing.end()
         except Stop as stop:
             return stop.ending
         except Exception as error:
@@ -126,23 +134,41 @@ class Driver:
             self._percentiles = self._adaptive.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
-        return_ = 0.0
+        self.standing.begin(agent.name)
+        given, remembering = list[int](), loop.remembering if agent.sees_neurons(turn) else None
+        source = self._source_of(agent)
         for iteration in range(loop.robot.episode_limit):
-            chosen = self._choose(agent, controller, observation)
+            seen = observation if remembering is None else remembering.beside(observation, self._remembered)
+            chosen = self._choose(agent, controller, seen)
             repeats = 0
             while True:
                 delivered = chosen
                 if agent.delivery == "shuffled":
                     delivered = int(self._rng.integers(len(loop.conditions)))
+                elif agent.delivery == "yoked":
+                    delivered = source[iteration % len(source)]
                 tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if not again:
                     break
                 repeats += 1
-            return_ += tick.reward or 0.0
+            given.append(delivered)
+            self.standing.add(tick.reward or 0.0)
             if tick.terminated or tick.truncated:
                 break
             observation = np.array(tick.observation)
-        self.last_return = f"{agent.name}: return {return_:.1f}"
+        # The newest is the last of all.
+        self._given.pop(agent.name, None)
+        self._given[agent.name] = given
+
+    def _source_of(self, agent: Agent) -> list[int]:
+        """What a yoked agent's culture is given: that of one who takes turns there, the newest episode of any."""
+        if agent.delivery != "yoked":
+            return []
+        assert isinstance(agent.controller, InTurn)
+        of_them = [given for name, given in self._given.items() if name in agent.controller.by_name]
+        if not of_them:
+            raise Stop(Ending("controller", f"{agent.name}: expected an episode of a policy before, got none"))
+        return of_them[-1]
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Put the robot where it starts: in a round of all agents each meets the same start."""
@@ -158,9 +184,7 @@ class Driver:
 
     def _warm_up(self, agent: Agent, episode: int) -> None:
         """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
-        if agent.delivery == "silent":
-            return
-        for _ in range(self._loop.warm_up or 0):
+        for _ in range(0 if agent.delivery == "silent" else self._loop.warm_up or 0):
             for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
                 self._present(agent, episode, -1, condition, condition, 0)
 
@@ -196,22 +220,15 @@ class Driver:
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
         decided_s = self._clock.now_s() - self._data_at_s
         stretch = self._see(stimuli, duration_s, since_s)
-        pulse_time_s = stretch.stimulus_time_s
-        if not stimuli:
-            pulse_time_s = self._on_samples(stretch.asked_at_s + times_s)
+        pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(stretch.asked_at_s + times_s)
         after_s = pulse_time_s[-1:]
         # From when they really came; a grid step is the grid's, and a sample's rounding, and not lateness.
         due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
         late_s = float(np.max(pulse_time_s - due_at_s))
         late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
-        rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
-        x_hz, readout_hz = rate_hz[0], ()
-        if not loop.readouts.are_all:
-            x_hz = loop.readouts.read(stretch, self._members, after_s, loop.window_ms)[0]
-            readout_hz = tuple(np.atleast_1d(x_hz).tolist())
+        read = read_response(loop, agent, stretch, self._members, after_s, self._rng)
         self._last_pulse_s = self._zero_s + float(after_s[0])
-        is_burst = bool(active_ratio[0] > loop.burst_threshold)
-        again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
+        again = read.is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {
             "number": self._presented,
             "agent": agent.name,
@@ -223,10 +240,6 @@ class Driver:
             "patterns": tuple(stimulus.pattern for stimulus in stimuli),
             "pulse_time_s": tuple(pulse_time_s.tolist()) if stimuli else (),
             "read_after_s": float(after_s[0]),
-            "spikes": round(float(rate_hz[0]) * (loop.window_ms[1] - loop.window_ms[0]) * 1e-3 * len(self._channels)),
-            "rate_hz": float(rate_hz[0]),
-            "active_ratio": float(active_ratio[0]),
-            "is_burst": is_burst,
             "handled": "warm-up" if is_warm_up else "repeated" if again else "unfinished",
             "command": None,
             "reward": None,
@@ -235,35 +248,47 @@ class Driver:
             "truncated": False,
             "late_s": late_s,
             "decided_s": decided_s,
-            "readout_hz": readout_hz,
+            **read.told,
         }
         self._presented += 1
-        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
-            self._adaptive.add(delivered, x_hz)
+        if loop.remembering is not None:
+            if stimuli:
+                first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
+                self._remembered = loop.remembering.after(
+                    self._remembered, delivered, x, first_s, at_s, is_burst=read.is_burst
+                )
+            tick["neurons"] = loop.remembering.observed(self._remembered)
+        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
+            self._adaptive.add(delivered, read.x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
             if not (again or is_warm_up):
-                tick |= self._move(x_hz, is_burst, iteration)
+                tick |= self._move(agent, read.x_hz, read.is_burst, iteration)
         finally:
             # Whatever happens to the robot, what the culture did is written down.
             finished = Tick(**tick)
-            self.records.append(_seen(stretch, stimuli, vars(finished)))
+            self.records.append(seen_in(stretch, stimuli, vars(finished)))
             self._unmoved = None
         return finished, again
 
-    def _move(self, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int) -> dict[str, Any]:
+    def _move(
+        self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int
+    ) -> dict[str, Any]:
         loop = self._loop
         handled: Handled = "skipped" if is_burst and loop.on_burst == "skip" else "used"
         if handled == "used":
             # In float32, as when it was trained: a response that lies on a percentile is then on it here as well.
             command = self._decoder.command(np.asarray(x_hz, np.float32)[()], self._percentiles)
+            command = -command if agent.is_turned_round else command
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
         self._expect("the robot")
         try:
             moved = self._runner.step(self._last_command)
+            if iteration + 1 == agent.switch_at and not moved.terminated:
+                moved = moved._replace(observation=self._runner.switch_goal(self._presented))
         except Exception as error:
             raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
@@ -294,6 +319,8 @@ class Driver:
         """Deliver, watch, and check what came back; times count from `since_s`; a pause is written down here."""
         if self.is_stopped:
             raise Stop(Ending("person", "stopped by a person"))
+        if stopped := self.stopped_by_file():
+            raise Stop(stopped)
         culture, account = self._culture, self._account
         try:
             account.check(stimuli)
@@ -313,7 +340,7 @@ class Driver:
             if not is_admitted:
                 account.take_back(stimuli)
             # Whoever stopped the culture ended the session, not the culture's refusal that follows.
-            ending = _ending_of(error, culture, self.is_stopped)
+            ending = ending_of(error, culture, self.is_stopped)
             self._note_fault(ending, asked, is_admitted=is_admitted)
             raise Stop(ending) from error
         wrong = wrong_with(
@@ -342,7 +369,7 @@ class Driver:
         )
         self._seen_until_s = offset_s + observed.duration_s
         if pause:
-            self.records.append(_seen(stretch, (), None))
+            self.records.append(seen_in(stretch, (), None))
         if self._loop.real_time:
             until_s = self._wall_zero_s + (self._now_s() - self._zero_s)
             self._expect("the clock", max(0.0, until_s - self._clock.now_s()))
@@ -365,33 +392,8 @@ class Driver:
         try:
             return self._culture.now_s
         except Exception as error:
-            raise Stop(_ending_of(error, self._culture, self.is_stopped)) from error
+            raise Stop(ending_of(error, self._culture, self.is_stopped)) from error
 
     def _on_samples(self, times_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
         # The same numbers that a recording of the session holds: only then are windows the same to the last bit.
         return np.asarray(np.rint(times_s * self._rate_hz) / self._rate_hz)
-
-
-def _seen(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
-    """What was seen, to be written down."""
-    span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-    words = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
-    return Record(words, stretch.spike_times_s, stretch.spike_channels)
-
-
-def _ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
-    if is_stopped:
-        return Ending("person", "stopped by a person")
-    if isinstance(error, UnsafeStimulus) and error.limit in ("stimuli_per_session", "net_charge_per_session"):
-        return Ending("budget", str(error))
-    if isinstance(error, UnsafeStimulus) and culture.is_stopped:
-        return Ending("culture", f"the culture was stopped: {error}")
-    lost = "the connection to the culture is lost: " if _is_lost(error) else "the culture raised "
-    return Ending("culture", lost + in_words(error))
-
-
-def _is_lost(error: BaseException | None) -> bool:
-    """Whether an error is of a connection, or caused by one; a device that was too slow is still there."""
-    if error is None:
-        return False
-    return (isinstance(error, OSError) and not isinstance(error, TimeoutError)) or _is_lost(error.__cause__)

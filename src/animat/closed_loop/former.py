@@ -24,4 +24,6 @@ def in_todays_words(words: dict[str, Any]) -> dict[str, Any]:
 
 
 def _renamed(words: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    if names.keys().isdisjoint(words):
+        return words
     return {names.get(name, name): value for name, value in words.items()}

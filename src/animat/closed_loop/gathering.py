@@ -23,6 +23,8 @@ from animat.writing import atomic_write
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
 TICKS_FILE = "ticks.csv"
+STOP_FILE = "STOP"
+"""In a session's folder: whoever makes it, empty or not, ends the session as Ctrl-C does."""
 
 
 class Gathered:

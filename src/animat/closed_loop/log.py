@@ -31,8 +31,10 @@ from animat.plain_file import expect_plain_file
 from animat.writing import keep_name
 
 MAGIC = b"ANIMATL1"
-_RECORD = b"REC1"
-_HEAD = struct.Struct("<4sIII")
+RECORD = b"REC1"
+"""What a record begins with."""
+HEAD = struct.Struct("<4sIII")
+"""Before each record: that, the length of the words, the number of spikes, the checksum of both."""
 _BUFFER_BYTES = 2**18
 _BLOCK_BYTES = 2**23
 """Of the log, that spikes are read from in one go."""
@@ -88,7 +90,7 @@ class LogWriter:
         words = json.dumps(record.words).encode()
         spikes = record.spike_times_s.astype("<f8").tobytes() + record.spike_channels.astype("<i4").tobytes()
         body = words + spikes
-        self._write(_HEAD.pack(_RECORD, len(words), len(record.spike_times_s), zlib.crc32(body)) + body)
+        self._write(HEAD.pack(RECORD, len(words), len(record.spike_times_s), zlib.crc32(body)) + body)
         self._places.append(self._whole)
 
     def written(self) -> Log:
@@ -139,14 +141,14 @@ class Records(Sequence[Record]):
         number = range(len(self))[index]
         with opened_log(self._path) as file:
             file.seek(self._places[number])
-            return _record(self._path, file.read(self._places[number + 1] - self._places[number]))
+            return record_of(self._path, file.read(self._places[number + 1] - self._places[number]))
 
     def __iter__(self) -> Iterator[Record]:
-        return (_record(self._path, data) for data in self._data())
+        return (record_of(self._path, data) for data in self._data())
 
     def words(self) -> Iterator[dict[str, Any]]:
         """The words of each record, without the spikes."""
-        return (_words(self._path, data) for data in self._data())
+        return (words_of(self._path, data) for data in self._data())
 
     def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int[np.ndarray, " spikes"]]]:
         """All spikes, their times in s and their channels, some million at a time, in the order they were written."""
@@ -159,9 +161,9 @@ class Records(Sequence[Record]):
                 data = memoryview(file.read(places[last] - places[first]))
                 times, channels = [], []
                 for at in (places[first:last] - places[first]).tolist():
-                    _, n_words, n_spikes, _ = _HEAD.unpack_from(data, at)
+                    _, n_words, n_spikes, _ = HEAD.unpack_from(data, at)
                     if n_spikes:
-                        at += _HEAD.size + n_words
+                        at += HEAD.size + n_words
                         times.append(data[at : at + 8 * n_spikes])
                         channels.append(data[at + 8 * n_spikes : at + 12 * n_spikes])
                 first = last
@@ -209,7 +211,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
                 f"{path}: expected the log of a closed-loop session, got one that ends in its first record"
             )
         file.seek(places[0])
-        header = _words(path, file.read(places[1] - places[0]))
+        header = words_of(path, file.read(places[1] - places[0]))
     return Log(header, Records(path, places[1:]), n_bytes - places[-1])
 
 
@@ -229,30 +231,36 @@ def opened_log(path: Path) -> Iterator[BinaryIO]:
 
 def _end_of_whole(file: BinaryIO, at: int, n_bytes: int) -> int | None:
     """Where the record ends that begins at a place, which the file stands at; None where there is no whole one."""
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
+    head = file.read(HEAD.size)
+    if len(head) < HEAD.size:
         return None
-    mark, n_words, n_spikes, checksum = _HEAD.unpack(head)
+    mark, n_words, n_spikes, checksum = HEAD.unpack(head)
     length = n_words + 12 * n_spikes
-    end = at + _HEAD.size + length
+    end = at + HEAD.size + length
     # Looked at first: a damaged length must not have gigabytes read.
-    if mark != _RECORD or end > n_bytes or zlib.crc32(file.read(length)) != checksum:
+    if mark != RECORD or end > n_bytes or zlib.crc32(file.read(length)) != checksum:
         return None
     return int(end)
 
 
-def _record(path: Path, data: bytes) -> Record:
-    _, n_words, n_spikes, _ = _HEAD.unpack_from(data)
-    times_at = _HEAD.size + n_words
+def record_of(path: Path, data: bytes) -> Record:
+    """A record of all its bytes, which are whole.
+
+    Raises:
+        InvalidFile: if its words are not JSON.
+    """
+    _, n_words, n_spikes, _ = HEAD.unpack_from(data)
+    times_at = HEAD.size + n_words
     times_s = np.frombuffer(data, "<f8", n_spikes, times_at).astype(np.float64)
     channels = np.frombuffer(data, "<i4", n_spikes, times_at + 8 * n_spikes).astype(np.int64)
-    return Record(_words(path, data), times_s, channels)
+    return Record(words_of(path, data), times_s, channels)
 
 
-def _words(path: Path, data: bytes) -> dict[str, Any]:
-    _, n_words, _, _ = _HEAD.unpack_from(data)
+def words_of(path: Path, data: bytes) -> dict[str, Any]:
+    """The words of a record of all its bytes, without its spikes; errors as those of `record_of`."""
+    _, n_words, _, _ = HEAD.unpack_from(data)
     try:
-        words = json.loads(data[_HEAD.size : _HEAD.size + n_words])
+        words = json.loads(data[HEAD.size : HEAD.size + n_words])
     except (ValueError, RecursionError) as error:
         raise InvalidFile(f"{path}: expected JSON in every record, got {error}") from error
     if not isinstance(words, dict):

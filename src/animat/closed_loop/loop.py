@@ -16,6 +16,7 @@ from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.goals.robot import body_and_goal
+from animat.neurons.remembering import Remembering
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.readouts import ALL, Readouts
@@ -58,10 +59,6 @@ class Trained(Protocol):
     def presentation(self) -> Presentation | None:
         """How stimuli were presented when its neurons were recorded."""
 
-    @property
-    def neural_observation(self) -> bool:
-        """Whether it sees the neurons too, which a loop does not show."""
-
 
 @dataclass(frozen=True, eq=False)
 class Loop:
@@ -96,6 +93,7 @@ class Loop:
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
         readouts: groups of channels that are read, by their electrodes: one for each command of the robot.
+        remembering: how responses become the history state, for agents that see it; None: nobody does.
 
     Raises:
         InvalidArgument: for a setting that cannot be.
@@ -120,6 +118,7 @@ class Loop:
     patience_s: float = 10.0
     real_time: bool = False
     readouts: Readouts = ALL
+    remembering: Remembering | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
@@ -185,15 +184,10 @@ class Loop:
             settings: the other attributes.
 
         Raises:
-            UnusableData: for a policy without neurons, or with a neural observation.
+            UnusableData: for a policy without neurons.
         """
         if policy.mapping is None:
             raise UnusableData("policy: expected one that acts through neurons, got one that was trained without")
-        if policy.neural_observation:
-            raise UnusableData(
-                "policy: expected one that sees the robot alone, got one with a neural observation, which no closed "
-                "loop makes; evaluate it on a simulator, or train with neural_observation=False"
-            )
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses
@@ -214,6 +208,8 @@ class Loop:
         """As plain data, for the log of a session."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain["adaptive"] = plain.pop("adaptive_from") is not None
+        remembering = plain.pop("remembering")
+        plain |= {} if remembering is None else {"memory": remembering.to_dict()}
         return plain | {
             **body_and_goal(self.robot),
             "mapping": mapping_to_data(self.mapping),

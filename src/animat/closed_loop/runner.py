@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 from numpy.typing import ArrayLike
 
+from animat.errors import InvalidArgument
 from animat.robots.base import Robot
+from animat.robots.capabilities import capability
 from animat.robots.host import Bodies, HostRobot
+from animat.wrappers import other_goal
 
 
 class Moved(NamedTuple):
@@ -37,6 +40,9 @@ class Runner(Protocol):
     def step(self, u: ArrayLike) -> Moved:
         """Move by a command in [-1, 1], or by several."""
 
+    def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
+        """Give the robot another goal, the same number the same one; returns what is observed."""
+
 
 class RobotRunner:
     """A robot with its state; its step is compiled once, before the first one, and takes some 30 us.
@@ -57,9 +63,16 @@ class RobotRunner:
             state = robot.reset(jax.random.fold_in(key, number))
             return state, robot.observe(state)
 
+        def switched(key: Any, number: int, state: Any) -> tuple[Any, Any]:
+            other = other_goal(robot, state, jax.random.fold_in(key, number))
+            after = capability(robot, "with_goal_of")(state, other)
+            return after, robot.observe(after)
+
         self.robot, self._rng = robot, rng
-        self._step, self._start = jax.jit(stepped), jax.jit(started)
+        self._step, self._start, self._switch = jax.jit(stepped), jax.jit(started), jax.jit(switched)
         self._key = jax.random.key(int(rng.integers(2**31)))
+        # Goals are those of starts that no episode has.
+        self._goals = jax.random.split(self._key)[1]
         # Compiled now: in the middle of an episode it would cost some hundred milliseconds.
         self.reset(0)
         self.step(np.zeros(() if robot.n_commands == 1 else robot.n_commands))
@@ -79,14 +92,19 @@ class RobotRunner:
         self._state, reward, terminated, observation = self._step(uniforms, self._state, np.asarray(u, np.float32))
         return Moved(float(reward), bool(terminated), np.asarray(observation, np.float64))
 
+    def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
+        """Give the robot the goal of another start, the same number the same one; returns what is observed."""
+        self._state, observation = self._switch(self._goals, number, self._state)
+        return np.asarray(observation, np.float64)
+
 
 class HostRunner:
-    """A robot that is stepped on the host, with its state; arguments as of `RobotRunner`."""
+    """A robot that is stepped on the host, with its state; arguments as of `RobotRunner`, and of `Bodies`."""
 
-    def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
+    def __init__(self, robot: Robot[Any], rng: np.random.Generator, *, with_pictures: bool = False) -> None:
         assert isinstance(robot, HostRobot)
         self._entropy = int(rng.integers(2**31))
-        self._bodies = Bodies(robot, [(self._entropy, 0)])
+        self._bodies = Bodies(robot, [(self._entropy, 0)], with_pictures=with_pictures)
         # What it loads when it first moves would come late in the middle of an episode.
         self.reset(0)
         self.step(np.zeros(robot.n_commands))
@@ -101,3 +119,11 @@ class HostRunner:
         stepped = self._bodies.step(np.asarray(u, np.float32).reshape(1, -1))
         (reward,), (terminated,), (truncated,) = stepped.reward, stepped.terminated, stepped.truncated
         return Moved(float(reward), bool(terminated), stepped.observation[0].astype(np.float64), bool(truncated))
+
+    def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
+        """Its goal is its own affair (InvalidArgument)."""
+        raise InvalidArgument(f"robot: expected one whose goal can be switched, got {self._bodies.robot.name}")
+
+    def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """The body as it is now; None where it gives none."""
+        return self._bodies.picture()

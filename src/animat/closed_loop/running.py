@@ -20,7 +20,7 @@ import numpy as np
 
 from animat.closed_loop.agents import Agent, InTurn, interleaved
 from animat.closed_loop.driver import Driver
-from animat.closed_loop.gathering import LOG_FILE, SessionFiles
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE, SessionFiles
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
 from animat.closed_loop.interrupts import told_instead
 from animat.closed_loop.log import LogWriter, Record
@@ -66,7 +66,8 @@ def run_session(
     of the culture and not answered yet; and once this returns, or `recover_session` did its work, `session.nwb` is a
     recording like any other. Unless the plan was done
     or the budget spent, the culture is then stopped: it delivers nothing until it is closed and opened again.
-    `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included. What `progress` raises is
+    `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included, nor for a file `STOP`
+    that somebody puts in the folder: it ends the session before the next pulse. What `progress` raises is
     raised, once the culture is stopped and the log is written.
 
     Args:
@@ -78,10 +79,12 @@ def run_session(
         seed: decides every random draw, but what the culture does.
         account: of a stimulation budget; None: without end.
         clock: the machine's; None: its monotonic one.
-        progress: told after each episode.
+        progress: told all the time how many episodes are done, and the returns so far.
 
     Raises:
-        InvalidArgument: for a culture that is closed or stopped, no agents, or a session in the folder already.
+        InvalidArgument: for a culture that is closed or stopped, no agents, one that sees the history state in a loop
+            that does not remember, or a session or a file `STOP` in the folder
+            already.
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read.
         InvalidFile: if the log cannot be begun.
@@ -89,12 +92,15 @@ def run_session(
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
     _check(culture, loop, agents, planned, seed)
     expect_no_session(folder)
+    stop_file = Path(folder) / STOP_FILE
+    if stop_file.exists():
+        raise InvalidArgument(f"{stop_file}: expected none yet, as it ends a session: remove it first")
     account, progress = account or Account(), progress or Silent()
-    turns = interleaved(planned, np.random.default_rng([seed, 20]))
-    driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed)
+    turns = _after_their_sources(interleaved(planned, np.random.default_rng([seed, 20])), agents)
+    driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed, stop_file)
     file = Path(folder) / LOG_FILE
     # As whoever reads the log has it.
-    header = json.loads(json.dumps(_header(culture, loop, agents, turns, seed)))
+    header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed)))
     with ExitStack() as stack:
         files = stack.enter_context(SessionFiles(file.parent, read_header(file, header)))
         log = LogWriter(file, header)
@@ -178,12 +184,15 @@ class _Supervisor:
                 self._write()
             except OSError as error:
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
+            if thread.is_alive() and (stopped := driver.stopped_by_file()):
+                # The loop sees it before its next trial; pulses of the one under way are not waited for.
+                return stopped
             by_s, who = driver.expected
             if time.monotonic() > by_s and thread.is_alive():
                 return Ending(
                     "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: left alone"
                 )
-            self._progress.update(driver.episodes_done, self._episodes, driver.last_return)
+            self._progress.update(driver.standing.episodes, self._episodes, driver.standing.note())
         return None
 
     def _write(self) -> None:
@@ -282,7 +291,9 @@ def _switching_every(interval_s: float) -> Iterator[None]:
         sys.setswitchinterval(before_s)
 
 
-def _header(culture: Culture, loop: Loop, agents: Sequence[Agent], turns: Sequence[int], seed: int) -> dict[str, Any]:
+def _header(
+    culture: Culture, loop: Loop, agents: Sequence[Agent], turns: Sequence[int], account: Account, seed: int
+) -> dict[str, Any]:
     channels = culture.channels
     return {
         "kind": "header",
@@ -294,6 +305,8 @@ def _header(culture: Culture, loop: Loop, agents: Sequence[Agent], turns: Sequen
         "culture": culture.name,
         "provenance": culture.provenance,
         "limits": asdict(culture.limits),
+        # What was spent of it before the session.
+        "account": account.to_dict(),
         "loop": loop.to_dict(),
         "observed": observed_columns(loop.robot),
         "agents": [_told(agent) for agent in agents],
@@ -302,12 +315,32 @@ def _header(culture: Culture, loop: Loop, agents: Sequence[Agent], turns: Sequen
     }
 
 
+def _after_their_sources(turns: list[int], agents: Sequence[Agent]) -> list[int]:
+    """The same turns with no yoked episode before the first one that it could repeat: the two change places."""
+    turns = list(turns)
+    for number, agent in enumerate(agents):
+        if agent.delivery != "yoked" or number not in turns:
+            continue
+        assert isinstance(agent.controller, InTurn)
+        sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller.by_name]
+        if not sources:
+            raise InvalidArgument(f"agents: expected episodes that {agent.name!r} could repeat, got none")
+        if (first := turns.index(number)) < sources[0]:
+            turns[first], turns[sources[0]] = turns[sources[0]], turns[first]
+    return turns
+
+
 def _told(agent: Agent) -> dict[str, Any]:
     told: dict[str, Any] = {"name": agent.name, "meaning": agent.meaning, "delivery": agent.delivery}
     if isinstance(agent.controller, InTurn):
         # Episode after episode of this agent, over and over.
         told["in_turn"] = list(agent.controller.by_name)
-    return told
+    changed = {
+        "is_drawn": agent.drawn_from is not None,
+        "is_turned_round": agent.is_turned_round,
+        "switch_at": agent.switch_at,
+    }
+    return told | {name: value for name, value in changed.items() if value}
 
 
 def check_episodes(name: str, episodes: int) -> None:
@@ -337,6 +370,12 @@ def _check(culture: Culture, loop: Loop, agents: Sequence[Agent], episodes: Sequ
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if loop.patterns is not None and loop.patterns > len(culture.patterns):
         raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")
+    seeing = [agent.name for agent, n in zip(agents, episodes, strict=True) if any(map(agent.sees_neurons, range(n)))]
+    if seeing and loop.remembering is None:
+        raise InvalidArgument(
+            f"loop: expected `remembering` of a recording for agents that see the history state ({', '.join(seeing)}), "
+            "got none"
+        )
     loop.readouts.members(culture.channels)
     if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(

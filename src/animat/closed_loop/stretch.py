@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.closed_loop.log import Record
 from animat.recordings.recording import Channels
 from animat.stimulation.stimulus import Stimulus
 
@@ -54,3 +55,10 @@ class Stretch:
 def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     """What was stimulated; when is in the tick."""
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
+
+
+def seen_in(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
+    """What was seen, to be written down."""
+    span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
+    words = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
+    return Record(words, stretch.spike_times_s, stretch.spike_channels)

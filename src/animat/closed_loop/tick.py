@@ -20,13 +20,13 @@ class Tick:
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
             and the warm-up has -1.
         chosen: the condition that was chosen, by the agent or, in a warm-up, by lot.
-        delivered: the one that the culture got; under the silent control the chosen one, without its pulses.
+        delivered: the one that the culture got; of a silent agent the chosen one, without its pulses.
         frequency_hz: that the delivered one was presented at.
-        patterns: of each pulse, -1 where its electrodes are none of the culture's; none under the silent control.
+        patterns: of each pulse, -1 where its electrodes are none of the culture's; none of a silent agent.
         pulse_time_s: when each pulse really began.
         read_after_s: the pulse that the response was read after, or when it would have come.
         spikes: in the response window.
-        rate_hz: x of all channels.
+        rate_hz: x of all channels; of an agent whose responses are drawn, what was drawn.
         readout_hz: x of each readout, where these are groups of channels; else empty.
         active_ratio: share of channels that spiked in the window.
         is_burst: whether that is above the threshold.
@@ -41,6 +41,7 @@ class Tick:
         decided_s: from the end of the response window before, as data were there, until this presentation was handed
             over.
         wall_s: the machine's clock at the end, from the start of the session.
+        neurons: the history state after it, trace and load; empty where nobody sees that.
     """
 
     number: int
@@ -67,13 +68,15 @@ class Tick:
     decided_s: float
     wall_s: float
     readout_hz: tuple[float, ...] = ()
+    neurons: tuple[float, ...] = ()
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """From what `vars` gave, through JSON."""
-        # Logs of before know of no readouts.
-        values = {each.name: data[each.name] for each in fields(cls) if each.name != "readout_hz"}
-        values["readout_hz"] = data.get("readout_hz", ())
+        # Logs of before know of no readouts, nor of neurons.
+        later = ("readout_hz", "neurons")
+        values = {each.name: data[each.name] for each in fields(cls) if each.name not in later}
+        values |= {name: data.get(name, ()) for name in later}
         for name, value in values.items():
             values[name] = tuple(value) if isinstance(value, list) else value
         return cls(**values)

@@ -7,12 +7,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
 
 from animat.environment import Animat, Environment
+from animat.evaluation.commands import mean_commands
 from animat.evaluation.heuristic import Heuristic, heuristic_policy
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
-from animat.neurons.simulator import NeuronSimulator, silenced
-from animat.wrappers import ShuffledDelivery, unwrapped
+from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
+from animat.robots.host import HostRobot
+from animat.wrappers import (
+    GoalSwitch,
+    IdealActuator,
+    ShuffledDelivery,
+    TurnedRound,
+    YokedDelivery,
+    unwrapped,
+    with_inmost,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +78,71 @@ def controls_of(
             meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
         controls.append(Control("heuristic", meaning, environment, simulator, rule))
     if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
-        silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
-        controls += [
-            Control("silent", "the culture always answers 0", environment, silent, policies, n_policies),
-            Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),
-        ]
+        controls += _without_effect(environment, simulator, policies, n_policies)
     return controls
+
+
+def interventions_of(
+    environment: Environment[Any],
+    simulator: NeuronSimulator,
+    policies: Networks,
+    n_policies: int,
+    *,
+    switch_at: int | None = None,
+) -> list[Control]:
+    """The same policies in what is changed in one way each, to see whose work it is.
+
+    *ideal actuator*, each condition's mean command, stretched to the full range, in place of the response; *random
+    spikes*, the culture's rates, whatever is delivered; *silent* and *shuffled* as among the controls; *yoked*, the
+    stimuli of another episode; *turned round*, the opposite command; *goal switched*, another goal in mid-episode.
+
+    Args:
+        environment, simulator: what the policies are evaluated in.
+        policies: several side by side.
+        n_policies: how many.
+        switch_at: the iteration at which the goal is switched; None leaves that out, as a robot with one goal does.
+    """
+    animat = unwrapped(environment)
+    assert isinstance(animat, Animat)
+    fields = animat.robot, animat.mapping, animat.n_conditions
+    ideal = IdealActuator(*fields, _stretched(mean_commands(environment, simulator)[1]))
+
+    def control(name: str, meaning: str, changed: Environment[Any], culture: NeuronSimulator = simulator) -> Control:
+        return Control(name, meaning, changed, culture, policies, n_policies)
+
+    found = [
+        control(
+            "ideal actuator",
+            "each condition's mean command, stretched to the full range, in place of the response",
+            with_inmost(environment, lambda _: ideal),
+        ),
+        control("random spikes", "at the culture's rates, whatever is delivered", environment, indifferent(simulator)),
+        *_without_effect(environment, simulator, policies, n_policies),
+    ]
+    if not isinstance(environment.robot, HostRobot):
+        found.append(control("yoked", "the stimuli of another episode", YokedDelivery(environment)))
+    turned = with_inmost(environment, lambda _: TurnedRound(*fields))
+    found.append(control("turned round", "the opposite of every command", turned))
+    if switch_at is not None and hasattr(environment.robot, "with_goal_of"):
+        switched = GoalSwitch(environment, switch_at)
+        found.append(control("goal switched", f"another goal after {switch_at} actions", switched))
+    return found
+
+
+def _without_effect(
+    environment: Environment[Any], simulator: NeuronSimulator, policies: Networks, n_policies: int
+) -> list[Control]:
+    """Policies whose choices decide nothing."""
+    silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
+    return [
+        Control("silent", "the culture always answers 0", environment, silent, policies, n_policies),
+        Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),
+    ]
+
+
+def _stretched(means: Float64[np.ndarray, "actions *commands"]) -> tuple[Any, ...]:
+    """From -1 to 1, of each command; 0 where all are equal."""
+    low, high = means.min(axis=0), means.max(axis=0)
+    even = np.where(high > low, high - low, np.inf)
+    stretched = np.where(high > low, 2 * (means - low) / even - 1, 0.0)
+    return tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())

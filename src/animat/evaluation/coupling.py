@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 from scipy.optimize import differential_evolution
+from scipy.stats import t as student_t
 
 from animat.environment import Environment
 from animat.errors import InvalidArgument
@@ -142,7 +143,7 @@ class ContextGap:
         coupling: mean return of the best coupling.
         standard_error: of that.
         gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and the optimum's
-            grid. None where the optimum is not above random stimuli.
+            grid. None where the optimum is not above random stimuli, or of one episode.
     """
 
     coupling: float
@@ -169,16 +170,19 @@ class ContextGap:
             return None
         mean, error = float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(len(returns)))
         span = optimum.value - self.coupling
-        # Of a ratio whose denominator is known much better than 0: both ends of both errors, in quadrature.
+        # Of a ratio whose denominator is known much better than 0: the half widths of all parts, in quadrature. Few
+        # policies have wide tails, so theirs is Student's.
         value = (mean - self.coupling) / span
-        spread = _Z * np.hypot(error, (1 - value) * self.standard_error) / span
-        return Interval(value, value - float(spread), value + float(spread), CONFIDENCE)
+        of_policies = student_t.ppf((1 + CONFIDENCE) / 2, len(returns) - 1) * error
+        parts = [of_policies, _Z * (1 - value) * self.standard_error, value * optimum.grid_error]
+        spread = float(np.linalg.norm(parts) / span)
+        return Interval(value, value - spread, value + spread, CONFIDENCE)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
             "coupling": self.coupling,
-            "coupling_standard_error": self.standard_error,
+            "coupling_standard_error": self.standard_error if np.isfinite(self.standard_error) else None,
             "context_gap": None if self.gap is None else self.gap.to_dict(),
             "needs_context": self.needs_context,
         }
@@ -186,6 +190,8 @@ class ContextGap:
     def to_text(self, score: Interval | None = None) -> str:
         """In a line, with the policies' context score where it is known."""
         told = f"best coupling {self.coupling:.1f} ± {self.standard_error:.1f}"
+        if not np.isfinite(self.standard_error):
+            return f"best coupling {self.coupling:.1f}; no context gap of one episode"
         if self.gap is None:
             return f"{told}; no context gap, as the optimal return is not above that of random stimuli"
         gap = f"context gap {self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
@@ -205,7 +211,7 @@ def context_gap(
     means, errors = ([float(f(x)) for x in (coupling, random)] for f in (np.mean, _standard_error))
     best, span = optimum.value, optimum.value - means[1]
     gap = None
-    if span > 0:
+    if span > 0 and np.isfinite(errors).all():
         value = (best - means[0]) / span
         # d gap: by the coupling -1, by random stimuli gap, by the optimum 1 - gap, each over the span.
         parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
@@ -215,4 +221,4 @@ def context_gap(
 
 
 def _standard_error(returns: Float64[np.ndarray, " episodes"]) -> float:
-    return float(returns.std(ddof=1) / np.sqrt(len(returns)))
+    return float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else float("nan")

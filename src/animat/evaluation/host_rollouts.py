@@ -50,7 +50,7 @@ def roll_out_on_host(
     keys: Key[Array, " actors"],
     seed: int,
 ) -> Counts:
-    """Run episodes of several actors, one actor after the other.
+    """Run episodes of several actors, as many side by side as there is room.
 
     Args:
         environment: with a robot that is stepped on the host.
@@ -73,17 +73,21 @@ def roll_out_on_host(
         np.zeros((len(keys), n_conditions, *readouts), np.int64),
     )
     side_by_side = min(AT_ONCE, episodes)
-    for number, key in enumerate(keys):
-        actor = jax.tree.map(lambda part, number=number: part[number], actors)
+    actors_at_once = max(1, AT_ONCE // side_by_side)
+    for begin in range(0, len(keys), actors_at_once):
+        numbers = range(begin, min(begin + actors_at_once, len(keys)))
+        some = slice(numbers.start, numbers.stop)
+        acting = jax.tree.map(lambda part, some=some: part[some], actors)
         for first in range(0, episodes, side_by_side):
             # The last ones of a wave may be more than were asked for: the program is compiled for one number.
-            seeds = [(seed, number, first + i) for i in range(side_by_side)]
+            seeds = [(seed, number, first + i) for number in numbers for i in range(side_by_side)]
             here = slice(first, min(first + side_by_side, episodes))
-            wave = _wave(environment, simulator, actor, jax.random.fold_in(key, first), seeds, here.stop - first)
+            folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
+            wave = _wave(environment, simulator, acting, folded, seeds, here.stop - first)
             for whole, part in zip(counts[:3], wave[:3], strict=True):
-                whole[number, here] = part[: here.stop - first]
-            counts.presented[number] += wave.presented
-            counts.passed[number] += wave.passed
+                whole[some, here] = part[:, : here.stop - first]
+            counts.presented[some] += wave.presented
+            counts.passed[some] += wave.passed
     return counts
 
 
@@ -103,56 +107,63 @@ def paths_on_host(
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)
     observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)
-    commands, lengths = np.zeros((n, robot.episode_limit), np.float32), np.zeros(n, np.int64)
+    of_each = () if robot.n_commands == 1 else (robot.n_commands,)
+    commands, lengths = np.zeros((n, robot.episode_limit, *of_each), np.float32), np.zeros(n, np.int64)
     for number, key in enumerate(keys):
-        actor = jax.tree.map(lambda part, number=number: part[number], actors)
+        actor, alone = jax.tree.map(lambda part, number=number: part[number : number + 1], actors), key[None]
         bodies = Bodies(robot, [(seed, number)])
-        state = _started(environment, jax.random.split(key, 1))._replace(robot=bodies.begin())
-        observations[number] = state.robot
+        state = _started(environment, alone, 1)._replace(robot=bodies.begin()[None])
+        observations[number] = state.robot[0]
         for iteration in range(robot.episode_limit):
-            command, state, _, _ = _iteration(environment, simulator, actor, key, np.int32(iteration), state)
+            command, state, _, _ = _iteration(environment, simulator, actor, alone, np.int32(iteration), state)
             stepped = bodies.step(np.asarray(command).reshape(1, -1))
-            commands[number, iteration] = np.asarray(command)[0]
+            commands[number, iteration] = np.asarray(command)[0].reshape(of_each)
             observations[number, iteration + 1 :] = stepped.observation
             lengths[number] += 1
             if stepped.ended[0]:
                 break
-            state = state._replace(robot=stepped.observation)
+            state = state._replace(robot=stepped.observation[None])
     return observations, commands, lengths
 
 
 def _wave(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
-    actor: Acting,
-    key: PRNGKeyArray,
+    actors: Acting,
+    keys: Key[Array, " actors"],
     seeds: Sequence[tuple[int, ...]],
     counted: int,
 ) -> Counts:
-    """One episode of each of several bodies; only the first `counted` ones count."""
-    robot, n = environment.robot, len(seeds)
+    """One episode of each of several bodies, as many for each actor; only the first `counted` ones of each count."""
+    robot, shape = environment.robot, (len(keys), len(seeds) // len(keys))
     assert isinstance(robot, HostRobot)
     bodies = _bodies(robot, seeds)
-    state = _started(environment, jax.random.split(key, n))._replace(robot=bodies.begin())
-    going = np.arange(n) < counted
-    returns, lengths, terminated = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, bool)
-    presented, passed = _nothing(environment, simulator)
+
+    def seen(observation: np.ndarray) -> np.ndarray:
+        return observation.reshape(*shape, -1)
+
+    state = _started(environment, keys, shape[1])._replace(robot=seen(bodies.begin()))
+    going = np.broadcast_to(np.arange(shape[1]) < counted, shape).copy()
+    returns, lengths, terminated = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool)
+    presented, passed = _nothing(environment, simulator, len(keys))
+    of_actor = np.indices(shape)[0]
     for iteration in range(robot.episode_limit):
-        command, state, delivered, passes = _iteration(environment, simulator, actor, key, np.int32(iteration), state)
-        stepped = bodies.step(np.asarray(command).reshape(n, -1))
-        returns += np.where(going, stepped.reward, 0.0)
+        command, state, delivered, passes = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
+        stepped = bodies.step(np.asarray(command).reshape(len(seeds), -1))
+        returns += np.where(going, stepped.reward.reshape(shape), 0.0)
         lengths += going
-        terminated |= going & stepped.terminated
-        if len(presented):
-            np.add.at(presented, np.asarray(delivered)[going], 1)
-            np.add.at(passed, np.asarray(delivered)[going], np.asarray(passes)[going])
-        going &= ~stepped.ended
+        terminated |= going & stepped.terminated.reshape(shape)
+        if presented.size:
+            at = of_actor[going], np.asarray(delivered)[going]
+            np.add.at(presented, at, 1)
+            np.add.at(passed, at, np.asarray(passes)[going])
+        going &= ~stepped.ended.reshape(shape)
         if not going.any():
             break
         if stepped.ended.any():
             # What has ended moves on and counts no further: a body may not be stepped after its end.
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
-        state = state._replace(robot=bodies.observation)
+        state = state._replace(robot=seen(bodies.observation))
     return Counts(returns, lengths, terminated, presented, passed)
 
 
@@ -165,36 +176,41 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
     return bodies
 
 
-def _nothing(environment: Environment[Any], simulator: NeuronSimulator | None) -> tuple[np.ndarray, np.ndarray]:
-    if simulator is None or environment.n_actions is None:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    n = environment.n_actions
-    return np.zeros(n, np.int64), np.zeros((n, *simulator.percentiles.shape[:-1]), np.int64)
+def _nothing(
+    environment: Environment[Any], simulator: NeuronSimulator | None, n_actors: int
+) -> tuple[np.ndarray, np.ndarray]:
+    n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
+    readouts = () if simulator is None else simulator.percentiles.shape[:-1]
+    return np.zeros((n_actors, n), np.int64), np.zeros((n_actors, n, *readouts), np.int64)
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=FAST_TO_COMPILE)
-def _started(environment: Environment[Any], keys: Key[Array, " episodes"]) -> State:
-    return jax.vmap(environment.reset)(keys).carried
+@partial(jax.jit, static_argnums=(0, 2), compiler_options=FAST_TO_COMPILE)
+def _started(environment: Environment[Any], keys: Key[Array, " actors"], episodes: int) -> State:
+    return jax.vmap(lambda key: jax.vmap(environment.reset)(jax.random.split(key, episodes)).carried)(keys)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=FAST_TO_COMPILE)
 def _iteration(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
-    actor: Acting,
-    key: PRNGKeyArray,
+    actors: Acting,
+    keys: Key[Array, " actors"],
     iteration: Array,
     state: State,
-) -> tuple[Float[Array, "episodes *commands"], State, Array, Array]:
+) -> tuple[Float[Array, "actors episodes *commands"], State, Array, Array]:
     """Commands, the state that the neurons leave, what was delivered, and whether the answer was P50 or more."""
-    n, n_drawn = len(state.iteration), environment.n_drawn
-    uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
-    observation = jax.vmap(environment.observe)(state) / environment.scales
-    action = actor.act(environment, observation, uniforms[:, :n_drawn])
-    delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(
-        uniforms[:, n_drawn:], state, action, simulator
-    )
-    passes = jnp.zeros(n, bool)
-    if simulator is not None:
-        passes = answer.rate_hz >= simulator.percentiles[..., N_PERCENTILES // 2]
-    return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered, passes
+
+    def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array, Array]:
+        n, n_drawn = len(state.iteration), environment.n_drawn
+        uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
+        observation = jax.vmap(environment.observe)(state) / environment.scales
+        action = actor.act(environment, observation, uniforms[:, :n_drawn])
+        delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(
+            uniforms[:, n_drawn:], state, action, simulator
+        )
+        passes = jnp.zeros(n, bool)
+        if simulator is not None:
+            passes = answer.rate_hz >= simulator.percentiles[..., N_PERCENTILES // 2]
+        return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered, passes
+
+    return jax.vmap(of_actor)(actors, keys, state)

@@ -20,12 +20,13 @@ from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
+from animat.evaluation.whose_work import WhoseWork, whose_work
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Progress
+from animat.progress import Progress, in_phase
 from animat.recordings.findings import Finding
 from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
@@ -94,6 +95,7 @@ class Evaluation:
         no_optimum: why it is not known, though it was asked for.
         fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
         objectives: of the robot's goal, as texts; none of a robot without one.
+        whose_work: what the policies lose with each intervention; None where that was not asked for.
     """
 
     __repr__ = briefly
@@ -109,6 +111,7 @@ class Evaluation:
     fixed_from_min: float | None = None
     context: ContextGap | None = None
     objectives: tuple[str, ...] = ()
+    whose_work: WhoseWork | None = None
 
     @property
     def context_score(self) -> Interval | None:
@@ -158,6 +161,7 @@ class Evaluation:
             "no_optimum": self.no_optimum,
             "context": None if self.context is None else self.context.to_dict(),
             "context_score": None if self.context_score is None else self.context_score.to_dict(),
+            "whose_work": None if self.whose_work is None else self.whose_work.to_dict(),
             "not_outperformed": None if self.verdict is None else self.verdict.not_outperformed,
             "verdict": None if self.verdict is None else str(self.verdict),
             "not_met_in_a_closed_loop": self.not_met,
@@ -198,7 +202,8 @@ class Evaluation:
                 known = "a closed loop on the culture would not meet these returns"
             lines.append(f"  {known}: see the warnings ({', '.join(self.not_met)})")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name == "no-heuristic"]
-        return "\n".join([*lines, *self._optimum_lines()])
+        lines += self._optimum_lines()
+        return "\n".join([*lines, *([] if self.whose_work is None else [self.whose_work.to_text()])])
 
     def _optimum_lines(self) -> list[str]:
         if self.no_optimum is not None:
@@ -231,6 +236,7 @@ def evaluate(
     robot: Robot[Any] | None = None,
     controls: Collection[str] | None = None,
     optimum_resolution: float | None = None,
+    interventions: bool = False,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Run policies and the controls beside them on the simulator of one minute.
@@ -248,10 +254,12 @@ def evaluate(
         controls: names of those that are run beside the policies (`animat.evaluation.controls`); None: all.
         optimum_resolution: of the grid for the optimal return in the same environment (`best_returns`; a study's is
             1), which takes seconds, as the best coupling does, which is then among the controls; None: neither is.
-        progress: told after the policies and each control, and before the optimum.
+        interventions: whether to run the policies with all interventions too (`animat.evaluation.whose_work`).
+        progress: told after the policies and each control, before the optimum and each intervention.
 
     Raises:
-        InvalidArgument: for no policies, fewer episodes than one, or an `at_min`, a seed or a resolution that is none.
+        InvalidArgument: for no policies, fewer episodes than one, interventions without neurons, or an `at_min`, a
+            seed or a resolution that is none.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery")
@@ -285,18 +293,24 @@ def evaluate(
     meaning = "as trained"
     if simulator is not None and first.delivery == "shuffled":
         trained_in, meaning = ShuffledDelivery(environment), "as trained: what is delivered is drawn anew"
-    acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
-    every = controls_of(environment, simulator, _action_labels(first), networks, n)
-    if optimum_resolution is not None and not isinstance(body, HostRobot):
-        reflex = best_coupling(environment, simulator, seed=seed)
-        every.append(Control("coupling", "the best reflex: no memory, no goal", environment, simulator, reflex))
-    acting += [control for control in every if controls is None or control.name in controls]
-    if controls is None and (without := lacking(body).get("heuristic")):
-        findings += (Finding("no-heuristic", "note", without),)
     if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):
         raise InvalidArgument(f"optimum_resolution: expected a positive number, got {optimum_resolution!r}")
+    if interventions and simulator is None:
+        raise InvalidArgument("interventions: expected policies that act through neurons, got ones without")
+    acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
+    every = controls_of(environment, simulator, _action_labels(first), networks, n)
+    acting += [control for control in every if controls is None or control.name in controls]
+    wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
+    searches = wants_coupling and not isinstance(body, HostRobot)
+    steps = len(acting) + searches + (optimum_resolution is not None)
+    if searches:
+        if progress is not None:
+            progress.update(0, steps, "best coupling")
+        reflex = best_coupling(environment, simulator, seed=seed)
+        acting.append(Control("coupling", "the best reflex: no memory, no goal", environment, simulator, reflex))
+    if controls is None and (without := lacking(body).get("heuristic")):
+        findings += (Finding("no-heuristic", "note", without),)
     rows = []
-    steps = len(acting) + (optimum_resolution is not None)
     for each in acting:
         ran = roll_out(each.environment, each.simulator, each.actor, each.n_actors, episodes=episodes, seed=seed)
         changed = each.environment is not environment or each.simulator is not simulator
@@ -329,6 +343,17 @@ def evaluate(
         fixed_from_min,
         context,
         objectives_of(body),
+        whose_work(
+            trained_in,
+            simulator,
+            networks,
+            n,
+            episodes=episodes,
+            seed=seed,
+            progress=in_phase(progress, "whose work it is"),
+        )
+        if interventions
+        else None,
     )
 
 

@@ -19,7 +19,7 @@ class Beside(NamedTuple):
     """Episodes of policies beside those of a control.
 
     Attributes:
-        p: that their returns are drawn alike (Mann-Whitney, two-sided, normal approximation).
+        p: of the two-sided Mann-Whitney test (normal approximation).
         wins: share of pairs of episodes in which the policies' return is larger, ties half.
         policies, control: episodes of each.
     """

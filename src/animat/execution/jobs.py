@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import os
-import shutil
+import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 from animat.errors import AnimatError, InvalidArgument
+from animat.execution.cluster import Cluster
 from animat.execution.pinned import PinnedProcesses
-from animat.execution.receipts import Receipt, receipt_path
-from animat.execution.task import UNFINISHED, Done, Task, carry_out, memory_of, reported
+from animat.execution.receipts import Receipt, digest_of, receipt_path
+from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
 from animat.progress import Progress
 
 _LOOK_EVERY_S = 0.2
@@ -29,12 +31,14 @@ class Job:
         task: what it does.
         needs: names of the jobs whose files it reads.
         cost_s: about how many seconds of one core it takes, for the order of jobs and the time left.
+        reads: places in the folder of other files that it reads, which are no job's.
     """
 
     name: str
     task: Task
     needs: tuple[str, ...] = ()
     cost_s: float = 1.0
+    reads: tuple[str, ...] = ()
 
 
 def in_order(jobs: Sequence[Job]) -> list[Job]:
@@ -72,11 +76,12 @@ class Jobs:
     def __init__(self, jobs: Sequence[Job], folder: Path, receipts: Path, fingerprint: str) -> None:
         self._folder, self._receipts, self._fingerprint = folder, receipts, fingerprint
         self._done: dict[str, Receipt] = {}
+        self._jobs = {job.name: job for job in jobs}
         self.waiting = [job for job in in_order(jobs) if not self._is_done(job)]
         """Those that are not done, the most urgent first."""
 
     def run(self, *, workers: int | None, executor: Executor | None, progress: Progress) -> dict[str, float]:
-        """Run the jobs that are not done; the first that fails ends all.
+        """Run the jobs that are not done; the first that fails ends all, but on a cluster the others go on first.
 
         Args:
             workers: processes, each on a core of its own; None: one a core. Not with an executor.
@@ -87,45 +92,87 @@ class Jobs:
             The processor seconds of each job that was run.
 
         Raises:
-            AnimatError: if a job failed; its message names the job.
+            AnimatError: if a job failed; its message names the job, or all that failed.
         """
         notices = self._folder / UNFINISHED / ".told"
-        # Of a run that was killed.
-        shutil.rmtree(notices, ignore_errors=True)
-        total_s = sum(job.cost_s for job in self.waiting)
+        notices.mkdir(parents=True, exist_ok=True)
+        # Of a run that was killed; its locks may still be held.
+        for stale in notices.glob("*.json"):
+            stale.unlink(missing_ok=True)
+        total_s, ended_s = sum(job.cost_s for job in self.waiting), 0.0
         running: dict[Future[Done], Job] = {}
+        failed: list[AnimatError] = []
         cpu_s: dict[str, float] = {}
+        told_s = -math.inf
 
         def report() -> None:
-            done_s, parts = total_s - sum(job.cost_s for job in self.waiting), []
+            nonlocal told_s
+            told_s = time.monotonic()
+            done_s, parts = ended_s, []
             for job in running.values():
                 share, words = reported(receipt_path(notices, job.name)) or (0.0, None)
-                done_s -= job.cost_s * (1 - share)
+                done_s += job.cost_s * share
                 if words is not None:
                     parts.append(f"{job.name} {100 * share:.0f} % {words}".strip())
-            n_jobs = len(self._done) + len(running) + len(self.waiting)
+            n_jobs = len(self._done) + len(running) + len(self.waiting) + len(failed)
+            if failed:
+                parts.append(f"{len(failed)} failed")
             note = f"{len(self._done)} of {n_jobs} jobs; {'; '.join(parts)}" if parts else ""
             progress.update(done_s, total_s, note)
 
         with _running_on(executor, workers, running) as at:
-            while self.waiting or running:
+            # Those that wait for one that failed wait in vain.
+            while running or any(self._has_needs(job) for job in self.waiting):
                 for job in [job for job in self.waiting if self._has_needs(job)]:
                     self.waiting.remove(job)
                     # What it needs may have been made again, with the same bytes as before.
-                    if not self._is_done(job):
-                        notice = receipt_path(notices, job.name)
-                        running[at.submit(carry_out, job.task, self._folder, notice)] = job
-                report()
+                    if self._is_done(job):
+                        ended_s += job.cost_s
+                    else:
+                        running[self._submit(job, at, receipt_path(notices, job.name))] = job
+                if time.monotonic() - told_s > _LOOK_EVERY_S:
+                    report()
                 # Those that succeeded first: their receipts are kept, whatever the others raise.
                 for future in sorted(wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done, key=_has_failed):
-                    done = _done(future, running[future])
+                    ended_s += running[future].cost_s
+                    try:
+                        done = _done(future, running[future])
+                    except AnimatError as error:
+                        if not isinstance(executor, Cluster) or future.cancelled():
+                            raise
+                        failed.append(error)
+                        del running[future]
+                        continue
                     job = running.pop(future)
                     receipt = Receipt(job.name, self._fingerprint, self._inputs(job), done.files)
                     receipt.save(self._receipts)
                     self._done[job.name] = receipt
                     cpu_s[job.name] = done.cpu_s
         report()
+        if failed:
+            # In whatever order they ended, the same message.
+            failed.sort(key=str)
+            in_vain = f"; {len(self.waiting)} jobs wait for what failed" if self.waiting else ""
+            failed[0].args = ("; ".join(map(str, failed)) + in_vain,)
+            raise failed[0]
         return cpu_s
+
+    def _submit(self, job: Job, at: Executor, notice: Path) -> Future[Done]:
+        if isinstance(at, Cluster):
+            reads = self._read_by(job)
+            return at.submit_task(job.task, self._folder, notice, name=job.name, cost_s=job.cost_s, reads=reads)
+        return at.submit(carry_out_alone, job.task, self._folder, notice)
+
+    def _read_by(self, job: Job) -> dict[str, str]:
+        """The digests of the files that a job reads, by their places: of all that comes before it."""
+        reads = {place: digest_of(self._folder / place) for place in job.reads}
+        before, seen = list(job.needs), set[str]()
+        while before:
+            if (name := before.pop()) not in seen:
+                seen.add(name)
+                reads |= self._done[name].outputs
+                before += self._jobs[name].needs
+        return reads
 
     def _is_done(self, job: Job) -> bool:
         """Whether a job has a receipt, on inputs as they are now, for files as they are now."""
@@ -168,6 +215,8 @@ def _done(future: Future[Done], job: Job) -> Done:
     except AnimatError as error:
         error.args = (f"{job.name}: {error}",)
         raise
+    except CancelledError as error:
+        raise AnimatError(f"{job.name}: its executor has ended; start that, and then this again to go on") from error
     except Exception as error:
         # The executor's: of a process that ended, or a machine that is lost.
         words = " ".join(str(error).split()) or type(error).__name__

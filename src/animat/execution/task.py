@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import abc
+import fcntl
 import json
+import os
+import platform
+import threading
 import time
 import traceback
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from animat.errors import AnimatError, first_line, out_of_memory
+from animat.errors import AnimatError, InvalidFile, first_line, out_of_memory
 from animat.execution.receipts import digest_of
 from animat.progress import Progress
 
+SILENT_S = 60.0
+"""After which a process is taken for frozen."""
 UNFINISHED = ".unfinished"
 """Of a folder: checkpoints, and what tasks report while they run; gone when everything is done."""
 
@@ -27,6 +33,11 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def grows_with(self) -> Mapping[str, object]:
         """The settings that its memory grows with, and what they are."""
+
+    @property
+    def reads_elsewhere(self) -> bool:
+        """Whether it reads files that are not in the folder."""
+        return False
 
     @abc.abstractmethod
     def run(self, folder: Path, progress: Progress) -> list[Path]:
@@ -45,6 +56,60 @@ class Done:
 
     files: dict[str, str]
     cpu_s: float
+
+
+def carry_out_alone(task: Task, folder: Path, notice: Path) -> Done:
+    """`carry_out`, when no other process does: one whose client or scheduler was killed may not have heard of it.
+
+    Raises:
+        InvalidFile: if the folder of the notice, which is in that of all files, is not seen here.
+        AnimatError: if it fails.
+    """
+    if not notice.parent.is_dir():
+        raise InvalidFile(
+            f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it"
+        )
+    with notice.with_suffix(".lock").open("a") as lock, _shown_to_live(lock):
+        return carry_out(task, folder, notice)
+
+
+@contextmanager
+def _shown_to_live(lock: IO[str]) -> Iterator[None]:
+    """Hold a lock, whose file shows all the while that this process lives: nobody waits for one that is frozen.
+
+    Where the file system has no locks, or such a one goes on, two may do the same: each file is whole, and of the same
+    bytes.
+    """
+    seen, seen_s = 0.0, time.monotonic()
+    while not _has_locked(lock):
+        if (changed := os.fstat(lock.fileno()).st_mtime) != seen:
+            seen, seen_s = changed, time.monotonic()
+        elif time.monotonic() - seen_s > SILENT_S:
+            break
+        time.sleep(0.2)
+    ended = threading.Event()
+
+    def show() -> None:
+        while not ended.wait(SILENT_S / 12):
+            os.utime(lock.fileno())
+
+    shows = threading.Thread(target=show, daemon=True)
+    shows.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        shows.join()
+
+
+def _has_locked(lock: IO[str]) -> bool:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def carry_out(task: Task, folder: Path, notice: Path) -> Done:

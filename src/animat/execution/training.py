@@ -7,15 +7,18 @@ import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import final
 
 from animat.coding.decoder import expect_fit
 from animat.errors import InvalidArgument, UnusableData
+from animat.execution.curves import CurveFile, Curves
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED, Task
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Part, Progress, Silent
+from animat.progress import Part, Progress, in_phase
+from animat.training.callbacks import TrainingCallback
 from animat.training.course import rows_of
 from animat.training.folder import (
     MANIFEST,
@@ -27,7 +30,7 @@ from animat.training.folder import (
     write_assessments,
     write_description,
 )
-from animat.training.group import BEST, CHECKPOINT_S, Group, save_policies, train_group
+from animat.training.group import BEST, CHECKPOINT_S, AddPart, Group, save_policies, train_group
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import clear_away, exclusive_lock
@@ -43,6 +46,7 @@ def train(
     progress: Progress | None = None,
     checkpoint_s: float = CHECKPOINT_S,
     sources: Sequence[str] = (),
+    callbacks: Sequence[TrainingCallback] = (),
 ) -> dict[str, Policy]:
     """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which says what they are.
 
@@ -62,6 +66,8 @@ def train(
         progress: told how far it is.
         checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
         sources: names of the recordings, for the manifest.
+        callbacks: each called with every row of the learning curves as it comes; no bit of what is learned depends on
+            them.
 
     Returns:
         The policies by name, `p0` first. Those that were assessed have what they were at their best beside them, and in
@@ -84,28 +90,32 @@ def train(
     expect_trainable(training, is_saved=folder is not None)
     if timeline is not None:
         expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
-    progress = progress or Silent()
     training = training.over(timeline)
     rows_of(training, timeline)
     manifest = describe(training, timeline, sources)
     groups = groups_of(training, timeline, manifest, fewest=2)
     if folder is None:
-        return _in_memory(groups, progress)
+        return _in_memory(groups, _phase_of(groups, progress), callbacks)
     folder = Path(folder).absolute()
     # Seen before it is touched: somebody else's folder stays as it is.
     is_ours(folder, manifest)
     with exclusive_lock(folder):
         if not is_ours(folder, manifest):
             write_description(folder, manifest)
+        missing = [group for group in groups if not _is_trained(group, folder)]
         left = [
-            Job(_names(group), TrainGroup(group, checkpoint_s), cost_s=CHUNKS * len(group.members))
-            for group in groups
-            if not _is_trained(group, folder)
+            Job(
+                _names(group),
+                TrainGroup(group, checkpoint_s, tells_rows=bool(callbacks)),
+                cost_s=CHUNKS * len(group.members),
+            )
+            for group in missing
         ]
+        curves = Curves(folder, [group.members for group in groups], callbacks, _phase_of(missing, progress))
         if left:
             jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
             try:
-                jobs.run(workers=workers, executor=executor, progress=progress)
+                jobs.run(workers=workers, executor=executor, progress=curves)
             except UnusableData:
                 # What the robot gave was no number: whoever corrects it begins anew.
                 shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
@@ -118,6 +128,7 @@ def train(
         policies = {f"p{i}": _load(folder, f"p{i}.safetensors") for i in range(training.policies)}
         if training.episodes_assessed and not (folder / TABLE).exists():
             write_assessments(folder, policies)
+        curves.finish(policies)
     return policies
 
 
@@ -134,10 +145,12 @@ class TrainGroup(Task):
     Attributes:
         group: what is trained.
         checkpoint_s: seconds between checkpoints.
+        tells_rows: whether it writes the rows of the learning curves, for callbacks, as they come.
     """
 
     group: Group
     checkpoint_s: float
+    tells_rows: bool = False
 
     @property
     def grows_with(self) -> dict[str, object]:
@@ -146,11 +159,18 @@ class TrainGroup(Task):
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         self.group.training.register()
         checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
-        return train_into(folder, self.group, checkpoint, progress, checkpoint_s=self.checkpoint_s)
+        add_part = CurveFile(folder, self.group.members[0]).add if self.tells_rows else None
+        return train_into(folder, self.group, checkpoint, progress, checkpoint_s=self.checkpoint_s, add_part=add_part)
 
 
 def train_into(
-    folder: Path, group: Group, checkpoint: Path, progress: Progress, *, checkpoint_s: float = CHECKPOINT_S
+    folder: Path,
+    group: Group,
+    checkpoint: Path,
+    progress: Progress,
+    *,
+    checkpoint_s: float = CHECKPOINT_S,
+    add_part: AddPart | None = None,
 ) -> list[Path]:
     """Train a group of policies, going on from its checkpoint; returns their files.
 
@@ -160,11 +180,19 @@ def train_into(
         checkpoint: file to write now and then; gone at the end.
         progress: told how far it is.
         checkpoint_s: seconds between checkpoints.
+        add_part: as of `train_group`.
     """
-    policies = train_group(group, checkpoint, progress, checkpoint_s=checkpoint_s)
+    progress.update(0, CHUNKS, "compiling")
+    policies = train_group(group, checkpoint, progress, checkpoint_s=checkpoint_s, add_part=add_part)
     files = save_policies(group, policies, folder)
     checkpoint.unlink(missing_ok=True)
     return files
+
+
+def _phase_of(groups: Sequence[Group], progress: Progress | None) -> Progress:
+    """The progress of training some groups, which counts the iterations of all their policies."""
+    iterations = sum(group.training.iterations * len(group.members) for group in groups)
+    return in_phase(progress, "training", iterations, "iterations")
 
 
 def _names(group: Group) -> str:
@@ -180,11 +208,12 @@ def _is_trained(group: Group, folder: Path) -> bool:
     return True
 
 
-def _in_memory(groups: Sequence[Group], progress: Progress) -> dict[str, Policy]:
+def _in_memory(groups: Sequence[Group], progress: Progress, callbacks: Sequence[TrainingCallback]) -> dict[str, Policy]:
     """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
+    curves = Curves(None, [group.members for group in groups], callbacks, progress)
     for number, group in enumerate(groups):
         part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
-        policies = train_group(group, None, part)
+        policies = train_group(group, None, part, add_part=partial(curves.add, group.members) if callbacks else None)
         trained |= {f"p{member}": policy for member, policy in zip(group.members, policies, strict=True)}
     return trained

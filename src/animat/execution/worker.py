@@ -53,12 +53,16 @@ def pin_worker(core: int) -> BinaryIO:
     os.sched_setaffinity(0, {core})
     # Networks of 64 units keep a core busy and no GPU, and workers, one a core, would all take the same one.
     os.environ["JAX_PLATFORMS"] = "cpu"
-    # However the parent ends, the kernel then kills this process.
-    PR_SET_PDEATHSIG = 1
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    end_with_parent()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return answers
+
+
+def end_with_parent() -> None:
+    """However the process that started this one ends, the kernel then kills this one."""
+    PR_SET_PDEATHSIG = 1
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from animat.errors import InvalidArgument
 from animat.goals.region import Region, number
-from animat.records import Positive, Whole, record
+from animat.records import Number, Whole, record
 from animat.robots.base import LONGEST_EPISODE
 
 Kind = Literal["avoid", "reach", "drive", "minimize", "maximize"]
@@ -34,7 +34,7 @@ class Objective:
 
     kind: Kind
     region: Region
-    weight: Positive = 1.0
+    weight: Annotated[Number, Field(ge=1e-6, le=1e6)] = 1.0
     within: Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE)] | None = None
 
     def __post_init__(self) -> None:

@@ -194,6 +194,13 @@ def region_in_units(region: tuple[Range | Ball, ...], spec: Mapping[str, Quantit
             left[name] = low, high = max(low, before[0]), min(high, before[1])
             if not low < high:
                 raise InvalidArgument(f"{name}: expected parts that have something in common, got an empty region")
+    for part in parts:
+        if isinstance(part, Range) and part.outside:
+            low, high = left.get(part.quantity, (-math.inf, math.inf))
+            if part.low is not None and part.high is not None and part.low <= low and high <= part.high:
+                raise InvalidArgument(
+                    f"{part.quantity}: expected parts that have something in common, got an empty region"
+                )
     return parts
 
 

@@ -101,7 +101,12 @@ class RobotWithGoal(Robot[GoalState]):
         # Of what a robot may lack it has what the robot in it has.
         if name in WITHOUT and hasattr(self.robot, name):
             return self._value_grid if name == "value_grid" else getattr(self.robot, name)
+        if name == "with_goal_of" and hasattr(self.robot, name):
+            return self._with_goal_of
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def _with_goal_of(self, state: Any, other: Any) -> Any:
+        return state._replace(robot=self.robot.with_goal_of(state.robot, other.robot))  # type: ignore[attr-defined]
 
     @cached_property
     def _spec(self) -> dict[str, Quantity]:

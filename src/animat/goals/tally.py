@@ -24,6 +24,7 @@ class Tally(NamedTuple):
     Attributes:
         iterations: how many are done.
         inside: of each objective, in how many the robot was in its region.
+        is_inside: of each, whether it is in the last state.
         margins: of each: to avoid, the least distance from the region; to reach, the nearest to it or farthest within;
             of others, that of the last state.
         failed, reached: whether it has ended so; what comes after that is not counted.
@@ -31,6 +32,7 @@ class Tally(NamedTuple):
 
     iterations: Int[Array, ""]
     inside: tuple[Int[Array, ""], ...]
+    is_inside: tuple[Bool[Array, ""], ...]
     margins: tuple[Float[Array, ""], ...]
     failed: Bool[Array, ""]
     reached: Bool[Array, ""]
@@ -87,7 +89,7 @@ def nothing_yet(objectives: Sequence[Objective]) -> Tally:
 
     margins = tuple(jnp.float32(1.0 if each.kind == "avoid" else -1.0) for each in objectives)
     none, no = jnp.int32(0), jnp.bool_(False)
-    return Tally(none, tuple(none for _ in objectives), margins, no, no)
+    return Tally(none, tuple(none for _ in objectives), tuple(no for _ in objectives), margins, no, no)
 
 
 def counted(
@@ -105,6 +107,7 @@ def counted(
     after = Tally(
         tally.iterations + 1,
         tuple(before + inside for before, (_, inside) in zip(tally.inside, seen, strict=True)),
+        tuple(inside for _, inside in seen),
         tuple(margin(of.kind, *m) for of, *m in zip(objectives, tally.margins, (m for m, _ in seen), strict=True)),
         failed,
         reached,
@@ -125,15 +128,18 @@ def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -
             return jnp.where(inside > 0, (tally.iterations - 1) / episode_limit, 1.0)
         return 1.0 + jnp.minimum(margin, 0.0) if kind == "reach" else inside / out_of
 
-    by_kind = [(of.kind, margin) for of, margin in zip(objectives, tally.margins, strict=True)]
-    reaches = [margin for kind, margin in by_kind if kind == "reach"]
-    others = [margin for kind, margin in by_kind if kind not in ("avoid", "reach")]
+    told = zip(objectives, tally.margins, tally.is_inside, strict=True)
+    of_all = [(of.kind, margin, inside) for of, margin, inside in told]
+    avoided = [margin for kind, margin, _ in of_all if kind == "avoid"]
+    reaches = [margin for kind, margin, _ in of_all if kind == "reach"]
+    others = [(margin, inside) for kind, margin, inside in of_all if kind not in ("avoid", "reach")]
     # What is reached ends the episode, and nothing else is then asked but that it has not failed.
-    deciding = [reduce(jnp.maximum, reaches)] if reaches else others
-    met = tally.reached if reaches else reduce(jnp.logical_and, [m >= 0 for m in others], jnp.bool_(True))
+    deciding = [reduce(jnp.maximum, reaches)] if reaches else [margin for margin, _ in others]
+    met = tally.reached if reaches else reduce(jnp.logical_and, [inside for _, inside in others], jnp.bool_(True))
     each = zip(objectives, tally.inside, tally.margins, strict=True)
     return Outcome(
         met & ~tally.failed,
-        100 * jnp.stack([jnp.float32(satisfaction(of.kind, *told)) for of, *told in each]),
-        reduce(jnp.minimum, [*(margin for kind, margin in by_kind if kind == "avoid"), *deciding]),
+        100 * jnp.stack([jnp.float32(satisfaction(of.kind, *known)) for of, *known in each]),
+        # What has failed may be another objective than those that decide where nothing failed.
+        jnp.where(tally.failed, reduce(jnp.minimum, tally.margins), reduce(jnp.minimum, [*avoided, *deciding])),
     )

@@ -84,7 +84,7 @@ def check_plan(
     if training.mapping is None:
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
     if training.neural_observation:
-        raise InvalidArgument("neural_observation: expected False, as no closed loop makes one, got True")
+        raise InvalidArgument("neural_observation: expected False, as a live run shows none, got True")
     if training.lessons or training.assess:
         raise InvalidArgument("lessons, assess: expected none, as a live run has no end that is known, got some")
     if (n := training.robot.n_commands) > 1:

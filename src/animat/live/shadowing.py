@@ -28,7 +28,7 @@ from animat.live.trainers import Trainers
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
-from animat.progress import Progress, Silent
+from animat.progress import Part, Progress, in_phase
 from animat.reality_gap import Calibration, RealityGap, run_policies
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.responses.responses import Responses
@@ -179,7 +179,7 @@ class _Run:
         self.iterations, self.culture_min, self.wall_s = 0, 0.0, 0.0
         self._training = replace(training, duration_min=timetable.duration_min, shadowing=True)
         self._culture, self._protocol, self._timetable, self._kind = culture, protocol, timetable, kind
-        self._progress = progress or Silent()
+        self._progress = in_phase(progress, "recording")
         self._zero_s, self._wall_zero_s = culture.now_s, time.monotonic()
         self._known_s, self._ended_early = self._zero_s, False
         try:
@@ -191,11 +191,13 @@ class _Run:
     def shadow(self) -> dict[str, Policy]:
         """Record and train to the end; returns the policies."""
         exchange = Exchange(self.folder / ".exchange")
-        timeline = self._record(0)
+        timeline = self._record(0, self._progress)
         if timeline is None:
             raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
         exchange.publish(0, float(timeline.start_min[-1]), _newest(timeline))
         groups = groups_of(self._training, timeline, describe(self._training, timeline))
+        minutes = self._timetable.duration_min
+        self._progress = in_phase(self._progress, "training", minutes, "min of the culture")
         with Trainers(groups, exchange, self.folder / POLICIES) as trainers:
             self.write("training", policies=self._training.policies, processes=len(groups))
             try:
@@ -206,6 +208,7 @@ class _Run:
                 with suppress(AnimatError):
                     trainers.finish()
                 raise
+            self._progress.update(minutes, minutes, "waiting for the last chunk of training")
             self._note(trainers.finish())
             self.iterations = trainers.iterations
         self.culture_min = (self._culture.now_s - self._zero_s) / 60
@@ -234,7 +237,9 @@ class _Run:
             if number == self._timetable.recordings or not in_budget:
                 continue
             try:
-                timeline = self._record(number)
+                here = min(number * self._timetable.interval_min, self._timetable.duration_min)
+                beside = Part(self._progress, here, 0, self._timetable.duration_min, f"recording {number + 1}")
+                timeline = self._record(number, beside)
             except BudgetSpent as spent:
                 self.write("budget", message=str(spent))
                 in_budget = False
@@ -252,15 +257,17 @@ class _Run:
             passed_min = (time.monotonic() - self._wall_zero_s) * self._timetable.speed / 60
             told = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
             note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{told}"
+            if time.monotonic() >= due_s:
+                note += "; waiting for all policies to train on the last recording"
             self._progress.update(min(passed_min, minute), self._timetable.duration_min, note)
         self._culture.rest(max(0.0, self._zero_s + 60 * minute - self._culture.now_s))
 
-    def _record(self, number: int) -> SimulatorTimeline | None:
+    def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:
         """Record and fit; None where the recording cannot be trained on, which is written down."""
         began_s = time.monotonic()
         # Other cultures and other recordings have other orders.
         seed = self._training.seed * 10_000 + number
-        recording = record_within(self.account, self._culture, self._protocol, seed)
+        recording = record_within(self.account, self._culture, self._protocol, seed, progress)
         file = self.folder / RECORDINGS / recording_name(round(recording.start_min, 3))
         write_nwb(recording, file)
         self.files.append(file)

@@ -69,6 +69,7 @@ class Ranked:
     """Responses by rank.
 
     Attributes:
+        sorted_hz: the non-burst responses, rising.
         rank: of each, the share of non-burst responses below it, ties half, shape (responses,).
         means: the mean rank of each condition's non-burst responses, shape (conditions,).
         rows: of each condition, the responses that can be drawn.
@@ -76,7 +77,7 @@ class Ranked:
 
     def __init__(self, responses: Responses) -> None:
         self._presented, self._place = responses.presentations
-        self._sorted_hz = np.sort(responses.non_burst_rate_hz)
+        self.sorted_hz = np.sort(responses.non_burst_rate_hz)
         self.rank = self._ranks(responses.rate_hz)
         conditions = range(len(responses.conditions))
         usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in conditions]
@@ -85,8 +86,8 @@ class Ranked:
         self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
 
     def _ranks(self, rate_hz: Float64[np.ndarray, " values"]) -> Float64[np.ndarray, " values"]:
-        below, no_larger = (np.searchsorted(self._sorted_hz, rate_hz, side=side) for side in ("left", "right"))
-        return np.asarray((below + no_larger) / (2 * len(self._sorted_hz)))
+        below, no_larger = (np.searchsorted(self.sorted_hz, rate_hz, side=side) for side in ("left", "right"))
+        return np.asarray((below + no_larger) / (2 * len(self.sorted_hz)))
 
     def traces(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
         """The trace before each response."""

@@ -232,6 +232,20 @@ def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
     )
 
 
+def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
+    """A culture that answers every condition as this one answers all of them together: random spikes, of its rates.
+
+    Responses at 512 evenly spaced quantiles stand for each condition, whatever was before.
+    """
+    uniforms = (jnp.arange(512, dtype=jnp.float32) + 0.5) / 512
+    n = simulator.n_conditions
+    each = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))(jnp.arange(n), uniforms)
+    pooled = each.reshape(-1, *each.shape[2:])
+    pooled = pooled[jnp.argsort(pooled if pooled.ndim == 1 else pooled.mean(axis=1))]
+    values = jnp.broadcast_to(pooled, (n, *pooled.shape))
+    return EmpiricalSimulator(values, jnp.full(n, len(pooled), jnp.int32), simulator.percentiles)
+
+
 def pooled_percentiles(responses: Responses) -> Float[Array, "*readouts percentiles"]:
     """P0, P10, ..., P100 of the non-burst responses of all conditions together, interpolated linearly, in Hz."""
     return jnp.asarray(np.percentile(_non_burst(responses), PERCENTILES, axis=0).T, jnp.float32)

@@ -75,7 +75,8 @@ class Scores:
         crps_hz: continuous ranked probability score of each, shape (held,).
         transforms: the probability integral transform of each, from F(x-) to F(x), shape (held, 2).
         distance: Kolmogorov's, of the transforms from uniform.
-        p_value: how often chance alone makes it so large.
+        p_value: how often chance alone makes it so large; None of a kind that does not predict from all responses to a
+            condition alike, to which it is not comparable.
         autocorrelation: of the free runs, at lags 1 to `LAGS`.
         run_length: the mean length of the free runs' runs at or above P50 of the first half.
         lasting: the share of these that last 1 to `LAGS` trials or more.
@@ -89,7 +90,7 @@ class Scores:
     crps_hz: Float64[np.ndarray, " held"]
     transforms: Float64[np.ndarray, "held 2"]
     distance: float
-    p_value: float
+    p_value: float | None
     autocorrelation: Band
     run_length: Band
     lasting: Band
@@ -212,6 +213,8 @@ class Validation:
             return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"
         if distance > SMALL_DISTANCE:
             return f"With care: {off} (at most {SMALL_DISTANCE:g} to be trusted)"
+        if lag != lag:
+            return "With care: successive responses cannot be compared, as no two neighbours are both no bursts"
         if abs(lag) > LARGE_DIFFERENCE:
             return (
                 f"With care: successive responses correlate by {self.autocorrelation[0]:.2f}, the simulator's by "
@@ -269,7 +272,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
                 crps(prediction, halves),
                 transforms,
                 distance,
-                float(np.mean(distances >= distance)),
+                None if each in (MARGINAL, "memory") else (1 + int(np.sum(distances >= distance))) / (1 + _CHANCES),
                 _band(autocorrelation(series)),
                 _band(np.array([_mean(runs) for runs in lengths])),
                 _band(np.array([shares_lasting(runs) for runs in lengths])),

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
+from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
 from animat.recordings.findings import Finding
@@ -42,6 +43,7 @@ class Calibration:
         findings: what was noticed.
         fitted: how the simulators were made, as `Policy.fitted`.
         readouts: that they answer for.
+        remembering: how a loop's responses become the history state of its simulator.
     """
 
     simulator: NeuronSimulator
@@ -57,6 +59,7 @@ class Calibration:
     findings: tuple[Finding, ...]
     fitted: dict[str, Any]
     readouts: Readouts = ALL
+    remembering: Remembering | None = None
 
     @property
     def percentiles(self) -> Float64[np.ndarray, "*readouts percentiles"]:
@@ -114,6 +117,7 @@ class Calibration:
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
+            remembering=Remembering.of(responses, simulator),
         )
         if policy is None or policy.percentiles != "first":
             return calibration

@@ -13,14 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.agents import Agent, AnyCondition, Greedy, HeuristicController, OneCondition
-from animat.environment import Animat
+from animat.closed_loop.agents import (
+    Agent,
+    AnyCondition,
+    CouplingController,
+    Greedy,
+    HeuristicController,
+    InTurn,
+    OneCondition,
+)
+from animat.environment import Animat, Environment
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
-from animat.neurons.simulator import silenced
+from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.passes import Passes
 from animat.robots.host import HostRobot
+from animat.wrappers import GoalSwitch, TurnedRound, YokedDelivery, with_inmost
 
 EPISODES = 200
 """Of each policy and control in one roll-out."""
@@ -28,8 +37,8 @@ ROLL_OUTS = 5
 """On the recording's simulator; one on each simulator of bootstrapped responses."""
 
 
-EPISODES_ON_HOST, BOOTSTRAPS_ON_HOST = 20, 40
-"""Fewer of both for a robot that is stepped on the host, where an episode takes a thousand times as long."""
+BOOTSTRAPS_ON_HOST = 40
+"""Fewer for a robot that is stepped on the host, where an episode takes a thousand times as long."""
 
 
 class Predicted(NamedTuple):
@@ -70,7 +79,7 @@ def _stacked(passes: Sequence[Passes]) -> Passes:
 
 def predict(
     groups: Sequence[Sequence[Agent]],
-    environment: Animat[Any],
+    environment: Environment[Any],
     calibration: Calibration,
     rule: Actor | None,
     *,
@@ -82,7 +91,7 @@ def predict(
 
     Args:
         groups: agents as they will act on the culture; those of a group are policies that are run together.
-        environment: robot and mapping.
+        environment: robot and mapping, and what policies see besides.
         calibration: the simulators.
         rule: the heuristic policy, where it is among the agents.
         greedy: whether policies take the most probable action.
@@ -95,15 +104,14 @@ def predict(
     progress = progress or Silent()
     simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
     if isinstance(environment.robot, HostRobot):
-        simulators, episodes_each = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST], EPISODES_ON_HOST
+        simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
+        episodes_each = episodes_on_host(environment.robot)
     acting = [_actor(group, rule, greedy=greedy) for group in groups]
 
     def rolled(group: int, on: int) -> Episodes:
         actor, many = acting[group]
-        simulator = silenced(simulators[on]) if groups[group][0].delivery == "silent" else simulators[on]
-        return roll_out(
-            environment, simulator, actor, many, episodes=episodes_each, seed=roll_out_seed(seed, group, on)
-        )
+        changed, simulator = _changed(groups[group][0], environment, simulators[on])
+        return roll_out(changed, simulator, actor, many, episodes=episodes_each, seed=roll_out_seed(seed, group, on))
 
     found: dict[str, Predicted] = {}
     # A body on the host hangs in the first thread or is not noticed (`animat.robots.host.within`).
@@ -111,10 +119,11 @@ def predict(
     with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         side_by_side = map if pool is None else pool.map
         # First one of each kind: two of a kind that start together would both be compiled.
-        kinds = {(type(acting[i][0]), group[0].delivery == "silent"): i for i, group in enumerate(groups)}
+        progress.update(0, len(groups), "compiling")
+        kinds = {(type(acting[i][0]), *_how(group[0])): i for i, group in enumerate(groups)}
         list(side_by_side(rolled, kinds.values(), repeat(0)))
         for number, group in enumerate(groups):
-            progress.update(number, len(groups), f"predicting {group[0].name}")
+            progress.update(number, len(groups), group[0].name)
             episodes = list(side_by_side(rolled, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
             passes = _stacked([Passes(each.presented, each.passed) for each in episodes])
@@ -130,22 +139,55 @@ def predict(
     return found
 
 
+def episodes_on_host(robot: HostRobot) -> int:
+    """Of each policy on each simulator: twenty, or fewer of more than 200 iterations, but four at least."""
+    return max(4, min(20, 4_000 // robot.episode_limit))
+
+
 def roll_out_seed(seed: int, group: int, on: int) -> int:
     """One of its own for each roll-out, and others for every `seed`: no interval is surer than its episodes are."""
     return int(np.random.SeedSequence((seed, group, on)).generate_state(1)[0])
+
+
+def _how(agent: Agent) -> tuple[bool, ...]:
+    """What decides which program its episodes run in."""
+    yoked, drawn = agent.delivery == "yoked", agent.drawn_from is not None
+    return agent.delivery == "silent", drawn, yoked, agent.is_turned_round, agent.switch_at is not None
+
+
+def _changed(
+    agent: Agent, environment: Environment[Any], simulator: NeuronSimulator
+) -> tuple[Environment[Any], NeuronSimulator]:
+    """What an agent acts in: the culture or the environment is another one for some."""
+    changed: Environment[Any] = environment
+    if agent.delivery == "silent":
+        simulator = silenced(simulator) if agent.drawn_from is None else indifferent(simulator)
+    if agent.delivery == "yoked":
+        changed = YokedDelivery(environment)
+    if agent.is_turned_round:
+        changed = with_inmost(environment, _turned_round)
+    if agent.switch_at is not None:
+        changed = GoalSwitch(changed, agent.switch_at)
+    return changed, simulator
+
+
+def _turned_round(inmost: Environment[Any]) -> Environment[Any]:
+    assert isinstance(inmost, Animat)
+    return TurnedRound(inmost.robot, inmost.mapping, inmost.n_conditions)
 
 
 def _actor(group: Sequence[Agent], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:
     """Who acts on the simulator as a group does on the culture, and how many they are."""
     first = group[0].controller
     # Without stimuli it makes no difference what is chosen, nor where each condition is delivered as often whatever is.
-    if isinstance(first, AnyCondition) or group[0].delivery != "chosen":
+    if isinstance(first, AnyCondition) or group[0].delivery in ("silent", "shuffled"):
         return Uniform(), 1
     if isinstance(first, OneCondition):
         return Constant(jnp.array([first.condition])), 1
     if isinstance(first, HeuristicController) and rule is not None:
         return rule, 1
-    policies: list[Any] = [
-        each.policy if isinstance(each, Greedy) else each for each in (agent.controller for agent in group)
-    ]
+    if isinstance(first, CouplingController):
+        return first.coupling, 1
+    acting = first.by_name.values() if isinstance(first, InTurn) else (agent.controller for agent in group)
+    policies: list[Any] = [each.policy if isinstance(each, Greedy) else each for each in acting]
     return networks_of(policies, greedy=greedy), len(policies)

@@ -8,48 +8,55 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.agents import Agent, Greedy, controls, random_control
+from animat.closed_loop.agents import Agent, CouplingController, Greedy, controls, interventions, random_control
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import Session
+from animat.closed_loop.session import Session, expect_no_session
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
-from animat.environment import Animat
-from animat.errors import Mismatch
+from animat.environment import Animat, Environment
+from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.coupling import best_coupling
 from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
+from animat.evaluation.rollouts import networks_of
 from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
 from animat.evaluation.verdict import beside
 from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
-from animat.progress import Progress
+from animat.progress import Progress, in_phase
 from animat.reality_gap.answered import answered
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.goals import outcomes
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import (
     BOOTSTRAPS_ON_HOST,
-    EPISODES_ON_HOST,
     ROLL_OUTS,
     Predicted,
+    episodes_on_host,
     predict,
     together,
 )
 from animat.reality_gap.reasons import Evidence, reasons
-from animat.reality_gap.table import RealityGap, Row
+from animat.reality_gap.row import Row, between
+from animat.reality_gap.table import RealityGap
+from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
 from animat.responses.condition import other_stimulus
 from animat.robots.capabilities import lacking
 from animat.robots.grid import grid_for, no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
+from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
@@ -65,6 +72,8 @@ def run_policies(
     *,
     episodes: int = 5,
     with_controls: bool = True,
+    with_coupling: bool = False,
+    with_interventions: bool = False,
     greedy: bool = True,
     adaptive: bool = True,
     seed: int = 1,
@@ -89,13 +98,16 @@ def run_policies(
         folder: for the session.
         episodes: of each policy, and at most of each control.
         with_controls: all of them; if not, only the random one.
+        with_coupling: the best coupling on the calibration's simulator too, which is searched for first.
+        with_interventions: the policies with random spikes in place of responses, yoked stimuli, the mapping turned
+            round and, of a robot with several goals, the goal switched; and whose work it is.
         greedy: whether policies take the most probable action, or draw as in training.
         adaptive: whether the mapping's thresholds adapt to the culture (`animat.closed_loop.adaptive`) from where the
             calibration left them, or are fixed.
         seed: decides every random draw, but what the culture does.
         pulses: of a trial; None: as in the policies' recordings.
         account: of a stimulation budget.
-        progress: told after each episode.
+        progress: told of each phase how far it is, and of the closed loop the returns so far.
         report: is given lines before the session: the warnings, and how long it will and can be.
         noticed: findings to be reported beside those made here.
         settings: other attributes of `Loop`.
@@ -112,6 +124,8 @@ def run_policies(
         settings["adaptive_from"] = calibration.responses_hz
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
+    if first.neural_observation:
+        settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":
@@ -138,14 +152,16 @@ def run_policies(
         *no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory),
     )
     if isinstance(loop.robot, HostRobot):
+        episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (
-            f"{loop.robot.name} is stepped on the host: predicted returns are of {ROLL_OUTS * EPISODES_ON_HOST} "
-            f"episodes, and their intervals of {BOOTSTRAPS_ON_HOST} bootstraps"
+            f"{loop.robot.name} is stepped on the host: predicted returns are of {episodes_predicted} episodes, and "
+            f"their intervals of {BOOTSTRAPS_ON_HOST} bootstraps"
         )
         findings += (Finding("few-predicted", "note", message),)
     account = account or Account()
 
-    environment = Animat(loop.robot, loop.mapping, len(loop.conditions))
+    animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
+    environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     agents = [Agent(name, "as trained", controller) for name, controller in acting.items()]
@@ -163,6 +179,21 @@ def run_policies(
         )
     else:
         agents.append(random_control(len(loop.conditions)))
+    if with_coupling:
+        in_phase(progress, "best coupling").update(0, 1, "searching for it on the simulator")
+        reflex = best_coupling(environment, simulator, seed=seed)
+        acts = CouplingController(reflex, animat.scales)
+        agents.append(Agent("coupling", "the best reflex: no memory, no goal", acts))
+
+    networks = networks_of(list(policies.values()), greedy=greedy)
+    fields = environment, simulator, networks, len(policies), seed
+    ideal = None
+    if with_interventions:
+        if isinstance(loop.robot, HostRobot):
+            raise InvalidArgument(f"--interventions: expected a robot in JAX, got {loop.robot.name}")
+        ideal = with_ideal_actuator(*fields)
+        pooled = np.concatenate(calibration.responses_hz)
+        agents += interventions(loop.robot, acting, pooled, half_an_episode(*fields))
 
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
@@ -177,10 +208,10 @@ def run_policies(
         rule,
         greedy=greedy,
         seed=seed,
-        progress=progress,
+        progress=in_phase(progress, "predicting"),
     )
     # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
-    optimum = _meanwhile(lambda: _best_return(environment, simulator)) if why_not is None else None
+    optimum = _meanwhile(lambda: _best_return(animat, simulator)) if why_not is None else None
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and optimum is not None:
         _wait_for(optimum, progress)
@@ -195,9 +226,12 @@ def run_policies(
         for message in warnings_once(findings):
             report(f"warning: {message}")
         report(str(ahead))
-    session = run_session(
-        culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=progress
-    )
+    forecast = {name: between(of.returns.mean(), of.anew) for name, of in predicted.items()}
+    # Another session's forecast stays as it is.
+    expect_no_session(folder)
+    write_predicted(Path(folder), {name: (of.value, of.low, of.high) for name, of in forecast.items()})
+    watched = in_phase(progress, "closed loop", sum(of_each), "episodes")
+    session = run_session(culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=watched)
     best = None
     # Whoever stopped the session does not wait for it.
     if optimum is not None and (optimum.done() or session.ending.by == "plan"):
@@ -225,6 +259,7 @@ def run_policies(
         sum(map(len, calibration.responses_hz)),
         ahead,
         found,
+        () if ideal is None else replaced(rows, *ideal),
     )
 
 
@@ -262,8 +297,8 @@ def _meanwhile(compute: Callable[[], float]) -> Future[float]:
 
 
 def _wait_for(optimum: Future[float], progress: Progress | None) -> float:
-    if progress is not None:
-        progress.update(0, 1, "optimal return")
+    if not optimum.done():
+        in_phase(progress, "optimal return").update(0, 1, "working it out on the simulator")
     return optimum.result()
 
 
@@ -336,7 +371,8 @@ def _rows(
                 rows.append(row(agent.name, agent.meaning, [agent.name]))
             continue
         control = row(agent.name, agent.meaning, [agent.name])
-        if len(control.measured) and len(policies.measured):
+        # With another goal in mid-episode policies are to do as well as ever: nothing to outperform.
+        if len(control.measured) and len(policies.measured) and agent.switch_at is None:
             control = replace(control, beside=beside(policies.measured, control.measured))
         rows.append(control)
     return tuple(rows)

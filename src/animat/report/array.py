@@ -101,7 +101,7 @@ def _finish(axes: Axes, title: str) -> None:
     axes.set_aspect("equal")
     # Rows are counted from the top, as on the chip.
     axes.invert_yaxis()
-    style_axes(axes, "", "x (um)", "y (um)")
+    style_axes(axes, "", "x (µm)", "y (µm)")
     # Of the whole figure, as axes that are narrow would cut it off.
     axes.figure.suptitle(title, fontsize=10, x=0.02, ha="left")
     if axes.get_legend_handles_labels()[0]:

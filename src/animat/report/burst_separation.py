@@ -60,8 +60,8 @@ def _scatter(
     axes.scatter(
         responses.active_ratio[which],
         responses.rate_hz[which],
-        s=7,
-        alpha=0.4 if len(responses) > 300 else 0.8,
+        s=9,
+        alpha=0.6 if len(responses) > 300 else 0.9,
         color=colour,
         linewidths=0,
         label=label,

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
+from animat.report.html import cell
+from animat.report.minus import with_minus
 from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, new_figure, style_axes
 
 if TYPE_CHECKING:
@@ -77,7 +79,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         low, high = whole.get_ylim()
         room = high - low
         whole.plot([0, 0, 1, 1], high + room * np.array([0.03, 0.06, 0.06, 0.03]), color=BLACK, linewidth=0.9)
-        words = f"{stars(pair.p)}  p corrected = {pair.p:.3g}, U = {pair.u:g}"
+        words = f"{stars(pair.p)}  p corrected = {cell(pair.p)}, U = {pair.u:g}"
         whole.text(0.5, high + 0.08 * room, words, ha="center", va="bottom", fontsize=8)
         whole.set_ylim(low, high + 0.2 * room)
         for axes, words in ((whole, pair.title), (close, "close up")):
@@ -91,7 +93,9 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
 def _name(group: Group) -> str:
     """The arm in two lines, and its score in a third."""
     name = group.name if " " in group.name else f"{group.name} "
-    return name.replace(" ", "\n", 1) + ("" if group.score is None else f"\nscore {group.score:.2f}")
+    # Adding 0 takes the sign off a zero.
+    score = "" if group.score is None else f"\nscore {round(group.score, 2) + 0.0:.2f}"
+    return with_minus(name.replace(" ", "\n", 1) + score)
 
 
 def _draw_boxes(axes: Axes, group: Group, place: int, colour: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from animat.report.minus import with_minus
 from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
             colour, name = (BLUE, "trained") if place < controls.n_trained else (ORANGE, "control")
             bar = [error or 0.0]
             axes.errorbar([mean], [-place], xerr=bar, fmt="o", markersize=4, color=colour, capsize=2, label=name)
-        axes.set_yticks([-i for i in range(len(controls.returns))], [name for name, _, _ in controls.returns])
+        names = [with_minus(name) for name, _, _ in controls.returns]
+        axes.set_yticks([-i for i in range(len(names))], names)
         axes.set_ylim(-len(controls.returns) + 0.4, 0.6)
         if controls.optimum is not None:
             axes.axvline(controls.optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")

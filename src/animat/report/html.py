@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
+from animat.report.minus import MINUS, with_minus
 from animat.report.style import PNG_DPI
 from animat.writing import atomic_write
 
@@ -78,7 +79,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: paragraphs, then points of a list, then tables, then figures."""
+    """A section of the page: paragraphs, then points of a list, then figures, then tables."""
 
     title: str
     paragraphs: tuple[str, ...] = ()
@@ -117,6 +118,7 @@ def write_page(
         lstrip_blocks=True,
     )
     environment.filters["cell"] = cell
+    environment.filters["prose"] = with_minus
     text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
     path = Path(path)
     with atomic_write(path) as beside:
@@ -129,12 +131,12 @@ def cell(value: Any) -> str:
     if value is None or value != value:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return str(value)
+        return with_minus(str(value))
     if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
+        return "∞" if value > 0 else f"{MINUS}∞"
     whole = value == int(value) and abs(value) < 1e6
     # With the zeros at the end: 23.0 beside 22.4.
-    return (f"{int(value)}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", "−")
+    return (f"{int(value)}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
 
 
 def with_error(value: float, error: float | None) -> str:
@@ -144,4 +146,4 @@ def with_error(value: float, error: float | None) -> str:
     decimals = min(3, max(0, 1 - math.floor(math.log10(error)))) if error > 0 else 1
     rounded = f"{error:.{decimals}f}"
     told = rounded if error == 0 or float(rounded) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
-    return f"{value:.{decimals}f}\u00a0±\u00a0{told}".replace("-", "−")
+    return f"{value:.{decimals}f}\u00a0±\u00a0{told}".replace("-", MINUS)

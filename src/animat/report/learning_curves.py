@@ -1,4 +1,4 @@
-"""Learning curves: the return of the episodes that ended in each part of training, over the policies."""
+"""Learning curves: the return of the episodes that ended within one whole round of them, over the policies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class LearningCurve:
     Attributes:
         name: the arm.
         iterations: done at the end of each part of training, shape (parts,).
-        returns: mean return of the episodes that ended in it, NaN where none did, shape (policies, parts).
+        returns: mean return of the episodes that ended by then (`over_rounds`), NaN where not known, shape
+            (policies, parts).
         random, optimum: of random actions and optimal with the simulator in use in each part, NaN where not
             known, shape (parts,); None where known of none.
     """
@@ -43,7 +44,8 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         curves: of one robot.
         title: of the whole figure.
     """
-    figure, panels = grid_of_panels(len(curves), 3, 3.1, 2.4, title, share_x=True, share_y=True)
+    columns = 2 if len(curves) == 4 else min(3, len(curves))
+    figure, panels = grid_of_panels(len(curves), columns, 3.1, 2.4, title, share_x=True, share_y=True)
     for axes, curve in zip(panels, curves, strict=True):
         x = curve.iterations / 1000
         for of_policy in curve.returns:
@@ -54,7 +56,8 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         some = np.isfinite(mean)
         label = "95 % interval of the mean"
         axes.fill_between(x[some], low[some], high[some], color=BLUE, alpha=0.3, linewidth=0, label=label)
-        axes.plot(x[some], mean[some], color=BLUE, linewidth=1.5, label="mean of the policies")
+        single = "o" if np.count_nonzero(some) == 1 else ""
+        axes.plot(x[some], mean[some], color=BLUE, linewidth=1.5, marker=single, label="mean of the policies")
         for name, levels, colour, line in (
             ("optimal return", curve.optimum, OPTIMUM, "--"),
             ("random actions", curve.random, GREY, ":"),
@@ -67,8 +70,39 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
                 )
         style_axes(axes, curve.name, "iterations (thousands)", "return")
         axes.set_xlim(0, None)
-    add_common_legend(figure, panels, columns=4)
+    add_common_legend(figure, panels, columns=4 if columns == 3 else 2)
     return figure
+
+
+def over_rounds(
+    iterations: Float64[np.ndarray, " parts"],
+    episodes: Float64[np.ndarray, "policies parts"],
+    returns: Float64[np.ndarray, "policies parts"],
+    longest: int,
+) -> Float64[np.ndarray, "policies parts"]:
+    """The mean return of the episodes that ended in the parts before and with each that make up a round.
+
+    In a round every environment ends at least one episode. The episodes that end in less are no fair sample: first the
+    short ones, which have reached what they were to reach or have failed, and in turn the long ones, as environments
+    that begin together go on in step.
+
+    Args:
+        iterations: done at the end of each part, of all environments together.
+        episodes: that ended in each.
+        returns: their mean; NaN where none did.
+        longest: iterations in which every environment ends an episode: those of the longest one, times environments.
+
+    Returns:
+        NaN before the first whole round; where training is no longer than that, all of it is one.
+    """
+    longest_known = min(float(longest), float(iterations[-1]))
+    # Parts that ended at least a round before the end of each.
+    before = np.searchsorted(iterations, iterations - longest_known, side="right")
+    sums = [np.cumsum(of, axis=1) for of in (np.where(episodes > 0, episodes * returns, 0.0), episodes)]
+    total, count = (np.concatenate([np.zeros((len(of), 1)), of], axis=1) for of in sums)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = (total[:, 1:] - total[:, before]) / (count[:, 1:] - count[:, before])
+    return np.where(iterations >= longest_known, means, np.nan)
 
 
 def mean_with_interval(

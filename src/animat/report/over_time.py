@@ -101,16 +101,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
         if of.random is not None:
             axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
         if trained_until_min is not None:
-            axes.axvline(trained_until_min, color=GREY, linewidth=0.8)
-            axes.annotate(
-                "end of training",
-                (trained_until_min, 0.35),
-                xycoords=("data", "axes fraction"),
-                xytext=(3, 3),
-                textcoords="offset points",
-                fontsize=8,
-                color=GREY,
-            )
+            axes.axvline(trained_until_min, color=GREY, linewidth=1.0, label="end of training")
         more = f" ({of.left_out} more arms in the tables)" if of.left_out else ""
         style_axes(axes, f"{of.title}{more}", "recording that answers (min)", "return")
     add_common_legend(figure, panels, columns=3)

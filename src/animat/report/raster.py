@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Recording
 from animat.report.style import BLACK, RED, WINDOW, add_legend, condition_colours, new_figure, style_axes
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
 _MOST_STIMULI = 300
 _MOST_LABELS = 12
+_MOST_DOTS = 3000
+"""Spikes around stimuli that can be told apart as dots."""
+_MOST_BINS = 100
 
 
 def draw_raster(
@@ -42,10 +46,10 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
     """All channels over the time of the recording's middle six stimuli; without any, over the whole recording."""
     times_s = recording.stimuli.time_s
     from_s, to_s = recording.start_s, max(recording.stop_s, recording.start_s + 1e-3)
-    if len(times_s):
-        middle = times_s[max(0, len(times_s) // 2 - 3) : len(times_s) // 2 + 3]
-        margin_s = max(0.05, 0.1 * (middle[-1] - middle[0]))
-        from_s, to_s = middle[0] - margin_s, middle[-1] + margin_s
+    shown = times_s[max(0, len(times_s) // 2 - 3) : len(times_s) // 2 + 3]
+    if len(shown):
+        margin_s = 0.4 * float(np.min(np.diff(shown))) if len(shown) > 1 else 0.05
+        from_s, to_s = shown[0] - margin_s, shown[-1] + max(margin_s, 0.02)
     _, spike = spikes_in(recording, np.array([from_s]), np.array([to_s]))
     axes.scatter(
         recording.spike_times_s[spike],
@@ -55,14 +59,16 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
         linewidths=0,
         rasterized=True,
     )
-    shown = times_s[(times_s >= from_s) & (times_s <= to_s)]
-    for i, time_s in enumerate(shown):
+    # Whatever else falls into it.
+    inside = times_s[(times_s >= from_s) & (times_s <= to_s)]
+    for i, time_s in enumerate(inside):
         axes.axvline(time_s, color=RED, linewidth=1, label="stimulus" if i == 0 else None)
     axes.set_xlim(from_s, to_s)
     axes.set_ylim(-1, len(recording.channels))
-    style_axes(axes, f"{len(shown)} stimuli in the middle of the recording", "time (s)", "channel (row)")
-    if len(shown):
-        add_legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0)
+    title = f"{len(inside)} stimuli in the middle of the recording, each spike a dot" if len(inside) else "every spike"
+    style_axes(axes, title, "time (s)", "channel (row)")
+    if len(inside):
+        add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_ms: float, to_ms: float) -> None:
@@ -72,30 +78,63 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     chosen = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _MOST_STIMULI)).round().astype(np.int64))
     chosen = chosen[np.argsort(responses.condition[chosen], kind="stable")]
     row, spike = spikes_in(recording, times_s[chosen] + from_ms * 1e-3, times_s[chosen] + to_ms * 1e-3)
+    lag_ms = 1e3 * (recording.spike_times_s[spike] - times_s[chosen[row]])
     condition = responses.condition[chosen]
-    axes.axvspan(start_ms, end_ms, color=WINDOW, alpha=0.25, linewidth=0, label=f"window {start_ms:g}-{end_ms:g} ms")
+    are_dots = len(spike) <= _MOST_DOTS
+    band = 0.25 if are_dots else 0.12
+    axes.axvspan(start_ms, end_ms, color=WINDOW, alpha=band, linewidth=0, label=f"window {start_ms:g}-{end_ms:g} ms")
     for edge_ms in (start_ms, end_ms):
-        # On top of the dots, which can hide the band.
+        # On top of the spikes, which can hide the band.
         axes.axvline(edge_ms, color=WINDOW, linewidth=1.2, zorder=3)
-    axes.axvline(0, color=RED, linewidth=1, label="stimulus")
+    axes.axvline(0, color=RED, linewidth=1, label="stimulus", zorder=3)
     drawn = np.unique(condition).tolist()
-    for i, colour in zip(drawn, condition_colours([responses.conditions[i].unit for i in drawn]), strict=True):
-        of = condition[row] == i
-        lag_ms = 1e3 * (recording.spike_times_s[spike[of]] - times_s[chosen[row[of]]])
-        axes.scatter(
-            lag_ms,
-            row[of],
-            s=2.5,
-            color=colour,
-            linewidths=0,
-            rasterized=True,
-            label=responses.conditions[i].label if i in drawn[:_MOST_LABELS] else None,
-        )
-    if len(drawn) > _MOST_LABELS:
-        axes.plot([], [], " ", label=f"and {len(drawn) - _MOST_LABELS} more")
+    colours = condition_colours([responses.conditions[i].unit for i in drawn])
+    if are_dots:
+        axes.scatter(lag_ms, row, s=2.5, c=[colours[drawn.index(i)] for i in condition[row]], linewidths=0)
+        each = "each spike a dot"
+    else:
+        _draw_rates(axes, row, lag_ms, len(chosen), len(recording.channels), from_ms, to_ms)
+        each = f"all {len(recording.channels):,} channels together"
+    # The rows of each condition are named beside them.
+    first = np.searchsorted(condition, drawn)
+    middle = [(a + b - 1) / 2 for a, b in zip(first, [*first[1:], len(chosen)], strict=True)]
+    every = max(1, -(-len(drawn) // _MOST_LABELS))
+    axes.set_yticks(middle[::every], [responses.conditions[i].label for i in drawn[::every]])
+    for edge in first[1:].tolist():
+        axes.axhline(edge - 0.5, color=BLACK, linewidth=0.6)
     axes.set_xlim(from_ms, to_ms)
-    axes.set_ylim(-1, max(len(chosen), 1))
+    axes.set_ylim(-0.5, max(len(chosen), 1) - 0.5)
     thinned = "" if len(chosen) == len(times_s) else f"{len(chosen)} of "
-    title = f"{thinned}{len(times_s):,} stimuli, sorted by condition, all {len(recording.channels):,} channels"
-    style_axes(axes, title, "time from stimulus (ms)", "stimulus (row)")
-    add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=4)
+    style_axes(
+        axes, f"{thinned}{len(times_s):,} stimuli, a row each; {each}", "time from stimulus (ms)", "stimulus (row)"
+    )
+    add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _draw_rates(
+    axes: Axes,
+    row: Int64[np.ndarray, " spikes"],
+    lag_ms: Float64[np.ndarray, " spikes"],
+    rows: int,
+    channels: int,
+    from_ms: float,
+    to_ms: float,
+) -> None:
+    """The rate in each row and bin as a shade: dots of so many spikes would run into one."""
+    edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
+    count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(rows + 1) - 0.5, edges_ms])
+    rate_hz = 1e3 * count / channels / (edges_ms[1] - edges_ms[0])
+    # A burst in a row or two must not leave all others pale.
+    drawn = axes.imshow(
+        rate_hz,
+        cmap="Greys",
+        vmin=0,
+        vmax=max(float(np.quantile(rate_hz, 0.95)), 1e-9),
+        extent=(from_ms, to_ms, -0.5, rows - 0.5),
+        aspect="auto",
+        origin="lower",
+        interpolation="nearest",
+    )
+    bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02, shrink=0.6, anchor=(0.0, 0.0))
+    bar.set_label("firing rate (Hz per channel)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)

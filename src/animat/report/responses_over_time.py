@@ -1,4 +1,4 @@
-"""The responses of one condition from recording to recording: fatigue, seen as a shift of the whole distribution."""
+"""The responses from recording to recording: fatigue, seen as a shift of each condition's whole distribution."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import MEDIAN, new_figure, style_axes
+from animat.report.style import MEDIAN, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 
 if TYPE_CHECKING:
@@ -16,36 +16,50 @@ if TYPE_CHECKING:
 
 _BINS = 24
 _MOST_ROWS = 20
+_MOST_CONDITIONS = 8
 
 
-def draw_responses_over_time(series: Sequence[Responses], condition: int) -> Figure:
-    """Histograms of a condition's non-burst responses, one a recording, the first at the top; a mark at each median.
+def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
+    """A column a condition, a row a recording, the first at the top: its non-burst responses, and their median.
 
-    At most 20 recordings are drawn, evenly over the series; the title says so.
+    At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so.
 
     Args:
         series: responses of the recordings in the order of time, with the same conditions.
-        condition: index of the condition.
     """
-    from matplotlib import colormaps
-
     rows = np.unique(np.linspace(0, len(series) - 1, min(len(series), _MOST_ROWS)).round().astype(int))
     shown = [series[row] for row in rows]
-    rates = [responses.rates_of(condition) for responses in shown]
-    edges_hz = rate_edges(shown[0], np.concatenate(rates), _BINS)
-    figure = new_figure(6.5, 1.4 + 0.34 * len(shown))
-    axes = figure.subplots()
-    shares = [np.histogram(x, edges_hz)[0] / max(len(x), 1) for x in rates]
-    height = 0.92 / max(max(share.max() for share in shares), 1e-9)
-    for row, (share, x) in enumerate(zip(shares, rates, strict=True)):
-        base, colour = -float(row), colormaps["cividis"](0.88 * row / max(len(shown) - 1, 1))
-        axes.stairs(base + height * share, edges_hz, baseline=base, fill=True, color=colour)
-        if len(x):
-            axes.plot([np.median(x)] * 2, [base, base + 0.92], color=MEDIAN, linewidth=1.6)
-    axes.set_yticks([-float(row) for row in range(len(shown))], [f"{r.start_min:g}" for r in shown])
-    axes.set_xlim(0, edges_hz[-1])
-    axes.set_ylim(-len(shown) + 0.9, 1.0)
-    thinned = "" if len(shown) == len(series) else f" ({len(shown)} of {len(series)} recordings)"
-    title = f"{shown[0].conditions[condition].label}: non-burst responses over time{thinned}, medians marked"
-    style_axes(axes, title, "response x (Hz per channel)", "start of the recording (min)")
+    conditions = shown[0].conditions[:_MOST_CONDITIONS]
+    rates = [[responses.rates_of(i) for responses in shown] for i in range(len(conditions))]
+    edges_hz = rate_edges(shown[0], np.concatenate([x for of in rates for x in of]), _BINS)
+    columns = len(conditions) if len(conditions) <= 5 else 4
+    down = -(-len(conditions) // columns)
+    figure = new_figure(1.0 + (2.2 if columns <= 4 else 1.9) * columns, 0.6 + down * (0.7 + 0.3 * len(shown)))
+    panels = figure.subplots(down, columns, sharex=True, squeeze=False).reshape(-1)
+    colours = condition_colours([condition.unit for condition in shown[0].conditions])
+    for i, (axes, condition, of) in enumerate(zip(panels, conditions, rates, strict=False)):
+        shares = [np.histogram(x, edges_hz)[0] / max(len(x), 1) for x in of]
+        # As high as the highest of its condition.
+        height = 0.92 / max(max(share.max() for share in shares), 1e-9)
+        for row, (share, x) in enumerate(zip(shares, of, strict=True)):
+            base = -float(row)
+            axes.stairs(base + height * share, edges_hz, baseline=base, fill=True, color=colours[i])
+            if len(x):
+                axes.plot([np.median(x)] * 2, [base, base + 0.92], color=MEDIAN, linewidth=1.6)
+        at = [f"{responses.start_min:g}" for responses in shown]
+        axes.set_yticks([-float(row) for row in range(len(shown))], at if i % columns == 0 else [""] * len(at))
+        axes.set_xlim(0, edges_hz[-1])
+        axes.set_ylim(-len(shown) + 0.9, 1.0)
+        axes.tick_params(labelbottom=True)
+        style_axes(axes, condition.label, "", "start of the recording (min)" if i % columns == 0 else "")
+    for axes in panels[len(conditions) :]:
+        axes.set_visible(False)
+    left_out = []
+    if len(shown) < len(series):
+        left_out.append(f"{len(shown)} of {len(series)} recordings")
+    if len(conditions) < len(shown[0].conditions):
+        left_out.append(f"{len(conditions)} of {len(shown[0].conditions)} conditions")
+    if left_out:
+        figure.suptitle(", ".join(left_out), fontsize=10)
+    figure.supxlabel("response x (Hz per channel)", fontsize=9)
     return figure

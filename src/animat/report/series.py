@@ -49,6 +49,6 @@ def draw_series(
         figures["array"] = draw_array(first)
     if len(ordered) > 1 and all(len(responses) for responses in ordered):
         figures["responses"] = draw_first_and_last(ordered)
-        figures["over-time"] = draw_responses_over_time(ordered, 0)
+        figures["over-time"] = draw_responses_over_time(ordered)
         figures["drift"] = draw_drift(ordered)
     return [save_figure(figure, Path(folder) / f"series-{what}.{file_format}") for what, figure in figures.items()]

@@ -32,7 +32,8 @@ def validation_text(name: str, validation: Validation) -> str:
         _HEADER,
     ]
     for s in v.scores:
-        off, runs = f"{s.distance:.3f} ({s.p_value:.3f})", s.run_length
+        runs = s.run_length
+        off = f"{s.distance:.3f} " + ("       " if s.p_value is None else f"({s.p_value:.3f})")
         lines.append(
             f"  {s.kind:<11}{s.bits.mean():>11.3f}{s.crps_hz.mean():>11.3f}{off:>14}{s.autocorrelation.mean[0]:>8.2f}"
             f"{f'{runs.mean:.2f} ({runs.low:.2f} to {runs.high:.2f})':>25}"

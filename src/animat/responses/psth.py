@@ -17,6 +17,7 @@ from animat.recordings.recording import Recording
 _SETTLED_MS = 100.0
 _ARTEFACT_MS = 20.0
 _QUIET_MS = 200.0
+_LEAST_QUIET_S = 1.0
 _ARTEFACT_AFTER_MS = 2.0
 _SUSTAINED_BINS = 3
 _BINS_MS = (1.0, 2.0, 5.0, 10.0)
@@ -96,14 +97,15 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
     """Spikes per second, on all channels together, in the quiet stretches before stimuli; and their total time in s.
 
     Quiet is what lies 100 ms or more after the previous pulse, and 20 to 220 ms before the next one. At 10 Hz and
-    above nothing is: such stimuli do not count, since what comes before them is the response to the previous one.
+    above nothing is: such stimuli do not count, since what comes before them is the response to the previous one. Less
+    than a second of quiet tells nothing: a single burst might fill it.
 
     Args:
         recording: the spikes and stimuli.
         after_ms: quiet begins this long after the previous pulse where that is more than 100 ms.
 
     Returns:
-        The rate, NaN without quiet time, and the quiet time.
+        The rate, NaN without a second of quiet time, and the quiet time.
     """
     times_s = recording.stimuli.time_s
     if not len(times_s):
@@ -115,7 +117,7 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
     quiet_s = float(np.sum((to_s - from_s)[quiet]))
     spikes = np.searchsorted(recording.spike_times_s, to_s[quiet])
     spikes -= np.searchsorted(recording.spike_times_s, from_s[quiet])
-    return (float(spikes.sum()) / quiet_s if quiet_s > 0 else float("nan")), quiet_s
+    return (float(spikes.sum()) / quiet_s if quiet_s >= _LEAST_QUIET_S else float("nan")), quiet_s
 
 
 def find_response(

@@ -144,19 +144,41 @@ ALL = Readouts()
 
 
 def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
-    """The name of readouts (`all`, `halves`, `quadrants`), or those in a file: `{"left": [1, 2], "right": [3, 4]}`.
+    """The name of readouts (`all`, `halves`, `quadrants`), or groups as JSON, also in a file: `{"left": [1, 2]}`.
 
     Raises:
         InvalidFile: naming the file, what was expected and what came.
     """
-    if text == "all":
-        return ALL
-    if text in CUT:
-        return str(text)
+    if text == "all" or text in CUT or str(text).lstrip().startswith("{"):
+        return readouts_named(str(text))
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
         raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(CUT)}") from error
+    try:
+        return _groups(written)
+    except InvalidArgument as error:
+        raise InvalidFile(f"{text}: {error}") from error
+
+
+def readouts_named(text: str) -> str | Readouts:
+    """The same by a name, or by the groups themselves as JSON: what a study's file says of them.
+
+    Raises:
+        InvalidArgument: for anything else.
+    """
+    if text == "all" or text in CUT:
+        return ALL if text == "all" else text
+    if not text.lstrip().startswith("{"):
+        raise InvalidArgument(
+            f"readouts: expected all, {', '.join(CUT)}, or groups of electrodes as JSON, "
+            f'{{"left": [1, 2], "right": [3, 4]}}, got {shown(text)}'
+        )
+    return _groups(text)
+
+
+def _groups(written: str) -> Readouts:
+    """Readouts from JSON."""
     try:
         data = json.loads(written, object_pairs_hook=_each_once)
         if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
@@ -165,10 +187,10 @@ def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
                 f"{shown(data)}"
             )
         return Readouts(tuple(data), tuple(map(tuple, data.values())))
-    except InvalidArgument as error:
-        raise InvalidFile(f"{text}: {error}") from error
+    except InvalidArgument:
+        raise
     except (ValueError, RecursionError) as error:
-        raise InvalidFile(f"{text}: readouts: expected JSON, got {error}") from error
+        raise InvalidArgument(f"readouts: expected JSON, got {error}") from error
 
 
 def _each_once(groups: list[tuple[str, object]]) -> dict[str, object]:

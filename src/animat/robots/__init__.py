@@ -6,6 +6,7 @@ from animat.robots.cartpole import Cartpole, CartpoleState
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.navigation import Navigation, NavigationState
 from animat.robots.registry import ROBOTS, register_robot, robot_from_dict, robot_named, robot_to_dict
+from animat.robots.shuttle import Shuttle, ShuttleState
 from animat.robots.swing_up import SwingUp, SwingUpState
 from animat.robots.wheels import Wheels, WheelsState
 
@@ -19,6 +20,8 @@ __all__ = [
     "NavigationState",
     "Quantity",
     "Robot",
+    "Shuttle",
+    "ShuttleState",
     "SwingUp",
     "SwingUpState",
     "TwoLinkArm",

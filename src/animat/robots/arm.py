@@ -92,7 +92,7 @@ class TwoLinkArm(Robot[ArmState]):
     name: ClassVar[str] = "arm"
     n_commands: ClassVar[int] = 2
     noise_size: ClassVar[int] = 0
-    paper_iterations: ClassVar[int] = 500_000
+    paper_iterations: ClassVar[int] = 2_000_000
 
     def __post_init__(self) -> None:
         nearest_m, farthest_m = self._target_distances_m
@@ -180,6 +180,10 @@ class TwoLinkArm(Robot[ArmState]):
         q1, q2, w1, w2, target_x_m, target_y_m = state
         joints = (jnp.cos(q1), jnp.sin(q1), jnp.cos(q2), jnp.sin(q2))
         return jnp.stack([*joints, w1, w2, target_x_m, target_y_m, *self._to_target(state)])
+
+    def with_goal_of(self, state: ArmState, other: ArmState) -> ArmState:
+        """As one stands and moves, with the other's target."""
+        return state._replace(target_x_m=other.target_x_m, target_y_m=other.target_y_m)
 
     def heuristic(self, observation: Any) -> Any:
         """The torques that a spring from tip to target would make, less a brake: J(q)^T e / l^2 stiffness - brake q'.

@@ -78,7 +78,7 @@ class Robot(abc.ABC, Generic[State]):
         draw_paths(axes, paths)                                        whole episodes on Matplotlib's axes
         value_grid() -> animat.robots.grid.Grid                        for the optimal return
         potential(state) -> float                                      shapes what is learned from, not what is best
-        succeeded(state) -> bool                                       of the last state of an episode
+        with_goal_of(state, other) -> State                            the body of one state with the goal of another
     """
 
     name: ClassVar[str]

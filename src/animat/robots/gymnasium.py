@@ -11,7 +11,7 @@ from functools import lru_cache
 from typing import Annotated, Any, final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from pydantic import Field
 
 from animat.errors import InvalidArgument, first_line, shown
@@ -109,7 +109,7 @@ class GymnasiumRobot(HostRobot):
         of = ["gymnasium", *known.get(engine, ()), *known.get(entry.partition(".")[0].partition(":")[0], ())]
         return {name: importlib.metadata.version(name) for name in dict.fromkeys(of)}
 
-    def body(self) -> Body:
+    def body(self, *, with_pictures: bool = False) -> Body:
         module = self.id.rpartition(":")[0]
         if module and module not in sys.modules:
             # A file could name any module.
@@ -117,7 +117,7 @@ class GymnasiumRobot(HostRobot):
                 f"{self.name}: expected {module} to be imported, got a policy alone: import it first (on the command "
                 f"line: --robot {self.name})"
             )
-        body = _Environment(self.id, self.settings)
+        body = _Environment(self.id, self.settings, with_pictures=with_pictures)
         if (body.low, body.high, body.levels, body.observed) != (self.low, self.high, self.levels, len(self.scales)):
             raise InvalidArgument(
                 f"{self.name}: expected {len(self.scales)} observations and {self.levels or len(self.low)} "
@@ -190,13 +190,14 @@ REGISTRY.add_family(FAMILY, GymnasiumRobot)
 class _Environment(Body):
     """One environment, without Gymnasium's checks and time limit."""
 
-    def __init__(self, id: str, settings: tuple[tuple[str, float], ...]) -> None:
+    def __init__(self, id: str, settings: tuple[tuple[str, float], ...], *, with_pictures: bool = False) -> None:
         import gymnasium
         from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
         name = f"{FAMILY}:{id}"
+        given = dict[str, Any](settings) | ({"render_mode": "rgb_array"} if with_pictures else {})
         try:
-            env: Any = gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **dict[str, Any](settings))
+            env: Any = gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **given)
             actions, observations = env.action_space, env.observation_space
         except (Exception, SystemExit) as error:
             # Anything may go wrong in somebody else's environment.
@@ -220,6 +221,10 @@ class _Environment(Body):
         given = action + self._start if self.levels else action.astype(self._dtype).reshape(self._shape)
         observation, reward, terminated, truncated, _ = self._step(given)
         return self._flat(observation), reward, terminated, truncated
+
+    def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        shown = np.asarray(self._env.render())
+        return shown if shown.ndim == 3 and shown.dtype == np.uint8 and shown.shape[2] == 3 else None
 
     def _flat(self, observation: Any) -> Float[np.ndarray, " observations"]:
         if not self._is_flat:

@@ -7,10 +7,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32
+from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 
 from animat.errors import AnimatError, BodyFailed, InvalidArgument, first_line
 from animat.robots.base import Robot
@@ -43,6 +44,10 @@ class Body(abc.ABC):
             whether it was cut off.
         """
 
+    def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """The body as it is now; None where it gives none."""
+        return None
+
 
 class HostRobot(Robot[Any]):
     """A robot of which the bodies are stepped in Python, one call a step.
@@ -68,8 +73,8 @@ class HostRobot(Robot[Any]):
         return self.keeps_state and self.episode_limit <= LONGEST_KEPT
 
     @abc.abstractmethod
-    def body(self) -> Body:
-        """A new body.
+    def body(self, *, with_pictures: bool = False) -> Body:
+        """A new body, that can be asked for its `picture` if it must.
 
         Raises:
             InvalidArgument: if it cannot be made, or is not what the parameters say.
@@ -155,11 +160,13 @@ class Bodies:
     Args:
         robot: whose bodies they are.
         seeds: of each body; the seed of an episode follows from it and the episode's number.
+        with_pictures: whether they can be asked for a picture.
     """
 
-    def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]]) -> None:
+    def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]], *, with_pictures: bool = False) -> None:
         self.robot, self._seeds = robot, [tuple(seed) for seed in seeds]
-        self._bodies = [tried(robot, "being made", robot.body) for _ in seeds]
+        make = partial(robot.body, with_pictures=True) if with_pictures else robot.body
+        self._bodies = [tried(robot, "being made", make) for _ in seeds]
         self._at = Standing.of_none(robot, len(self._bodies))
 
     def __len__(self) -> int:
@@ -210,6 +217,10 @@ class Bodies:
             raise BodyFailed(f"{robot.name}: expected finite rewards, got NaN or infinite ones")
         truncated |= iterations >= robot.episode_limit
         return Stepped(observation.copy(), reward, terminated, truncated & ~terminated)
+
+    def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """The first body as it is now; None where it gives none."""
+        return tried(self.robot, "render", self._bodies[0].picture)
 
     def stand(self, at: Standing) -> bool:
         """Bring new bodies to where others stood; returns whether they came there.

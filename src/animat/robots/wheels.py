@@ -194,6 +194,10 @@ class Wheels(Robot[WheelsState]):
         bearing = within_half_a_turn(jnp.arctan2(to_y_m, to_x_m) - heading)
         return jnp.concatenate([proximity, jnp.stack([jnp.hypot(to_x_m, to_y_m), bearing])])
 
+    def with_goal_of(self, state: WheelsState, other: WheelsState) -> WheelsState:
+        """Where one is, on the way to the other's goal."""
+        return state._replace(goal_x_m=other.goal_x_m, goal_y_m=other.goal_y_m)
+
     def heuristic(self, observation: Any) -> Any:
         """Turns to the goal and away from what its front sensors see, the more slowly ahead the more it turns."""
         xp = observation.__array_namespace__()

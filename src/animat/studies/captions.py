@@ -1,71 +1,102 @@
-"""What is to be seen in each figure of the report, in the order of the page."""
+"""How each figure of the report is read, and on how much it rests, in the order of the page.
+
+What stands in braces is filled in for the study (`animat.studies.publishing`).
+"""
 
 from __future__ import annotations
 
+HEADLINE = (
+    "A line an arm, at the last recording that it was evaluated on; further right is better. Small dots: each policy's "
+    "mean return. Large dot: their interquartile mean, with its 95 % interval; an arrow says that the interval goes on "
+    "beyond the axis. Crosses: random actions. Bars: the optimal return, where it is known. {policies} policies an arm."
+)
+
 CULTURE: dict[str, tuple[str, str]] = {
-    "array": ("the array", "Recording sites by their firing rate, and the electrodes that were stimulated."),
+    "array": (
+        "the array",
+        "The array from above: a dot a recording site, the brighter the more it fires, a circle round each electrode "
+        "that was stimulated. The first recording, {channels} channels.",
+    ),
     "raster": (
         "spikes around stimuli",
-        "A stretch of the first recording, and spikes around its stimuli; the response window is shaded.",
+        "Above: each spike of a short stretch of the first recording; rows are channels. Below: what follows each "
+        "stimulus, a row a stimulus; the darker, the more spikes. Between the two yellow lines a response is read.",
     ),
     "psth": (
         "post-stimulus time histogram",
-        "Mean rate per channel against the time from the stimulus; responses are read in the shaded window.",
+        "Mean rate of a channel against the time from the stimulus, over all {responses} stimuli of the first "
+        "recording; responses are read in the shaded window.",
     ),
     "bursts": (
         "bursts set apart",
-        "All responses x, bursts among them; x against the ratio of active channels; that ratio with Otsu's "
-        "threshold; x against it with bursts marked. Bursts come regardless of the stimulus and are left out.",
+        "A dot a response, {responses} of the first recording. A burst activates many channels at once: what lies "
+        "right of the dashed threshold (Otsu's) counts as one. Bursts come regardless of the stimulus and are left "
+        "out.",
     ),
     "responses": (
         "responses to each stimulus",
-        "Non-burst responses in the first recording, which the neuron simulators are made of; the line is P50, their "
-        "median over all stimuli.",
+        "How large the responses to each stimulus are, bursts left out (n: how many). The further the histograms lie "
+        "apart, the more a controller can do. The line is P50, the median over all stimuli. The first recording: the "
+        "neuron simulators are made of these numbers.",
     ),
     "first-and-last": (
         "responses, first and last",
-        "Non-burst responses. Filled: the first recording. Outline: the last. Lines: P50 of each.",
+        "The same in the first recording (filled) and in the last (outline), with P50 of each: how far the culture "
+        "moved in between. {recordings} recordings from {first_min} to {last_min} min.",
     ),
     "over-time": (
-        "one stimulus over time",
-        "Non-burst responses to the first stimulus, from recording to recording, with their medians.",
+        "each stimulus over time",
+        "A column a stimulus, a row a recording, from top to bottom; the mark is the median. A histogram that moves "
+        "left is a culture that answers with less. Bursts are left out.",
     ),
     "drift": (
         "drift",
-        "Percentiles of the non-burst responses to all stimuli, P(x ≥ P50) of each stimulus, and the share of "
-        "bursts, at every recording.",
+        "Above: percentiles of all responses. Middle: how often each stimulus is answered above the median of all; "
+        "curves that come together are control that is lost. Below: the share of bursts. {recordings} recordings of "
+        "about {responses} responses each.",
     ),
 }
 
 ROBOT: dict[str, tuple[str, str]] = {
     "learning": (
         "learning curves",
-        "Return of the episodes that ended in each part of training: every policy, their mean and its 95 % bootstrap "
-        "interval; actions are drawn. Lines: random actions and the optimal return with the simulator in use, "
-        "which steps on with it (from the second recording on: on a rough grid). A control has no such return: "
-        "whatever it chooses is as good as random.",
+        "Return against iterations of training; up is better. Thin: each of {policies} policies. Thick: their mean "
+        "with its 95 % bootstrap interval. Each point is over the episodes that ended within the {round} iterations "
+        "before, in which every environment ends at least one; curves begin there, as the first to end are no fair "
+        "sample. Actions are drawn. Lines: random actions and the optimal return with the simulator in use, which "
+        "steps on with it (from the second recording on: on a rough grid). A control has no such return: whatever it "
+        "chooses is as good as random.",
     ),
     "comparisons": (
         "comparisons",
-        "Every point is a policy's mean return. Boxes: quartiles and median. * p < 0.05, ** p < 0.01, *** p < 0.001, "
-        "two-sided Mann-Whitney U, normal approximation, corrected by Holm as in the table. Under each arm: "
-        "(mean − random) / (optimal − random).",
+        "A column a comparison, {policies} policies a side, each a point: its mean return over the episodes. Boxes: "
+        "quartiles and median; whiskers reach to the furthest point within 1.5 times the box's height. Above with "
+        "random actions and the optimal return, below close up. Stars: * p < 0.05, ** p < 0.01, *** p < 0.001, n.s. "
+        "neither; p is two-sided, Mann-Whitney, normal approximation, corrected by Holm: “p corrected” of the table. "
+        "Score, under each arm: (mean − random) / (optimal − random).",
     ),
     "over-time": (
         "at every recording",
-        "The same policies on the simulator of each recording: median and quartiles over policies, with the "
-        "optimal return. What falls with it is the simulator's: the culture's, and what its bins keep of it; what "
-        "falls faster is the policy's. At every recording that return is on a rough grid, which can lie some below "
-        "the fine one, and is left out for mappings without steps, such as `linear`.",
+        "The same policies on the simulator of each recording: median and quartiles over {policies} policies of "
+        "{episodes_over_time} episodes each, with the optimal return. What falls with it is the simulator's: the "
+        "culture's, and what its bins keep of it; what falls faster is the policy's. At every recording that return is "
+        "on a rough grid, which can lie some below the fine one, and is left out for mappings without steps, such as "
+        "linear.",
     ),
     "controls": (
         "controls",
-        "Mean returns with standard errors over policies (for a control of one actor: over episodes), at the "
-        "recordings of the comparisons.",
+        "A line an agent; further right is better. A control that does as well as trained policies says that what it "
+        "lacks was not needed. Whiskers: standard errors over policies (for a control of one actor: over episodes), of "
+        "{episodes} episodes each where no comparison says otherwise.",
     ),
     "paths": (
         "episodes",
-        "One episode of each policy at the last recording. Blue: it arrived, or stayed up to the end; orange: not.",
+        "One episode of each policy at the last recording. Blue: it arrived, or stayed up to the end; orange: not. "
+        "Examples: the figures above count.",
     ),
-    "frames": ("frames", "From the start of an episode to its end; the number under a frame is the iteration."),
+    "frames": (
+        "frames",
+        "From the start of an episode to its end; the number under a frame is the iteration. One episode an arm, that "
+        "of middle length: an example.",
+    ),
 }

@@ -34,6 +34,7 @@ the `SATISFACTION` in %.
 SUCCEEDED, MARGIN, SATISFACTION = "succeeded", "margin", "satisfaction_"
 POLICY = "policy"
 RANDOM = "random"
+COUPLING = "coupling"
 FORMER_AGENTS = {"made by hand": "heuristic"}
 """What files of before call agents."""
 FORMER_MAPPING = ", percentiles held", ", percentiles fixed"

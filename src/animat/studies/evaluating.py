@@ -8,12 +8,14 @@ from typing import Any, final
 
 from animat.environment import Environment
 from animat.evaluation.controls import controls_of
+from animat.evaluation.coupling import best_coupling
 from animat.evaluation.rollouts import Actor, Episodes, Networks, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
+from animat.robots.host import HostRobot
 from animat.studies.draws import draw_seed
-from animat.studies.episodes import RANDOM, tabulated, write_episodes
+from animat.studies.episodes import COUPLING, RANDOM, tabulated, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.simulating import load_timeline
@@ -63,7 +65,9 @@ class Evaluate(StudyTask):
 @final
 @dataclass(frozen=True)
 class Control(StudyTask):
-    """Run the controls of a mapping on a robot: random, constant, heuristic; and silent and shuffled with policies.
+    """Run the controls of a mapping on a robot: random, constant, heuristic; with policies silent and shuffled too.
+
+    And the best coupling, at the last recording alone, as the search takes as long as all others together.
 
     Attributes:
         plain: arm that gives the mapping; the one whose policies are used, if it is trained as usual.
@@ -93,6 +97,12 @@ class Control(StudyTask):
                 ran = roll_out(each.environment, each.simulator, each.actor, n, episodes=study.episodes, seed=seed)
                 parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:
+            if networks is not None and not isinstance(setting.environment.robot, HostRobot):
+                progress.update(len(minutes), len(minutes) + 1, "best coupling")
+                seeds = [draw_seed(study.seed, robot, name, last, COUPLING, part) for part in ("search", "episodes")]
+                coupling = best_coupling(setting.environment, setting.simulator(last), seed=seeds[0])
+                ran = setting.run(coupling, 1, last, study.episodes, seeds[1])
+                parts.append(tabulated(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
                 ran = setting.run(Uniform(), 1, at_min, study.episodes, seed)
@@ -124,7 +134,8 @@ class Setting:
 
 def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimeline | None) -> Setting:
     """What an arm's policies are evaluated in."""
-    training = training_of(study, spec, arm)
+    # Lessons are for training alone.
+    training = training_of(study, replace(spec, lessons=()), arm)
     if not arm.through_neurons or timeline is None:
         labels = tuple(f"{command:+g}" for command in training.commands or ())
         return Setting(training.environment(0), None, labels)

@@ -64,7 +64,10 @@ def source_files(study: Study, base: Path) -> list[Path]:
 
     Raises:
         InvalidFile: if one is missing.
+        InvalidArgument: for a study of many cultures.
     """
+    if study.culture.seeds or study.culture.folders:
+        raise InvalidArgument("culture: expected one culture, got many; animat study runs such a study")
     if study.culture.kind != "files":
         return []
     from animat.recordings.reading import list_recordings

@@ -13,6 +13,7 @@ import numpy as np
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.reading import read_recordings
+from animat.records import read_record
 from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.comparisons import Group, Pair, draw_comparisons
@@ -20,7 +21,7 @@ from animat.report.controls import Controls, draw_controls
 from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.first_and_last import draw_first_and_last
-from animat.report.learning_curves import LearningCurve, draw_learning_curves
+from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import MOST, Course, Courses, draw_over_time
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
@@ -49,6 +50,7 @@ from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import TRAINED, References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
+from animat.training.settings import SAC
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +63,7 @@ class CulturePictures(StudyTask):
     """Draw the first recording, and the series; write their numbers beside."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        series = read_series(self.study, folder)
+        series = read_series(self.study, folder, as_one=True)
         first = read_recordings(folder / RECORDINGS)[0]
         responses = series[0]
         to_ms = max(50.0, 2 * responses.window_ms[1])
@@ -85,7 +87,7 @@ class CulturePictures(StudyTask):
             tables.append(write_array(folder, first))
         if len(series) > 1:
             figures["first-and-last"] = draw_first_and_last(series)
-            figures["over-time"] = draw_responses_over_time(series, 0)
+            figures["over-time"] = draw_responses_over_time(series)
             figures["drift"] = draw_drift(series)
             tables.append(write_drift(folder, drift_of(series)))
         return tables + _save(folder, "culture", figures, progress)
@@ -168,8 +170,15 @@ def _curves(
             fallback = near[1] if arm.delivery == "chosen" else None
             optimum.append(fallback if best is None else best.best_return)
         beside = np.array(random, np.float64), np.array(optimum, np.float64)
-        curves.append(LearningCurve(arm.name, told[0, :, 0], told[:, :, 2], *beside))
+        iterations = told[0, :, 0]
+        returns = over_rounds(iterations, told[:, :, 1], told[:, :, 2], round_of(study, spec))
+        curves.append(LearningCurve(arm.name, iterations, returns, *beside))
     return curves
+
+
+def round_of(study: Study, spec: RobotSpec) -> int:
+    """Iterations in which every environment of a training ends at least one episode."""
+    return spec.robot().episode_limit * read_record(SAC, study.algorithm, "algorithm").environments
 
 
 def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, parts: int) -> list[float]:

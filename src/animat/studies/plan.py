@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from animat.execution.jobs import Job
+from animat.studies.folder import MANIFEST
 from animat.studies.specification import Arm, RobotSpec, Study
 
 ITERATIONS_PER_S = 110_000
@@ -55,7 +56,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "optimum", "train")]
     jobs.append(Job("tables", Tabulate(study), (*everything, *neurons), 2))
     pictures = [job.name for job in jobs if job.name.startswith("pictures/")]
-    jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1))
+    jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1, (MANIFEST,)))
     return jobs
 
 
@@ -70,7 +71,7 @@ def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job
         plain = plain_arm(study, kind)
         groups = [f"train/{spec.name}/{plain.slug}/p{members[0]}" for members in split_groups(study.policies)]
         name = f"controls/{spec.name}/{kind.thresholds}"
-        jobs.append(Job(name, Control(study, spec, plain), (*groups, *neurons), 6))
+        jobs.append(Job(name, Control(study, spec, plain), (*groups, *neurons), 15))
     resolution = spec.optimum_resolution or study.optimum_resolution
     cost_s = 40 * resolution ** len(spec.robot().observation_spec) + 10
     jobs.append(Job(f"optimum/{spec.name}", FindOptima(study, spec), neurons, cost_s))
@@ -82,4 +83,4 @@ def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job
 def plain_arm(study: Study, kind: Arm) -> Arm:
     """Of the arms with a mapping, the one trained most plainly: its policies stand for the mapping."""
     same = [c for c in study.arms if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
-    return max(same, key=lambda c: (c.trained, c.delivery == "chosen", c.shadowing))
+    return max(same, key=lambda c: (c.trained, c.delivery == "chosen", c.shadowing is True))

@@ -7,35 +7,42 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.progress import Progress
-from animat.report.html import Picture, Section, Table, write_page
-from animat.report.style import FORMATS
+from animat.report.headline import ArmReturns, draw_headline
+from animat.report.html import Picture, Section, Table, cell, write_page
+from animat.report.style import FORMATS, save_figure
 from animat.stimulation.protocol import Presentation
-from animat.studies.captions import CULTURE, ROBOT
+from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.folder import MANIFEST
 from animat.studies.goals import goals_shown
 from animat.studies.heuristic import not_outperforming
 from animat.studies.learned import beside_the_optimum, learned_of
+from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
-from animat.studies.results import ComparedReturns, Results, read_typed
+from animat.studies.reflex import reflexes_told
+from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
 from animat.studies.shown import (
     comparisons_shown,
     controllability_shown,
     controls_shown,
     heuristic_shown,
     optima_shown,
+    reflexes_shown,
     returns_shown,
     scores_shown,
 )
-from animat.studies.simulating import load_timeline
-from animat.studies.specification import Study
-from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL
+from animat.studies.simulating import controllability, load_timeline, read_series
+from animat.studies.specification import Arm, RobotSpec, Study
+from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @final
@@ -49,16 +56,20 @@ class Publish(StudyTask):
         kept: dict[float, Fidelity] = {}
         if study.needs_neurons:
             timeline = load_timeline(folder / TIMELINE)
-            kept = dict(zip(timeline.start_min.tolist(), timeline.fidelities, strict=True))
-        sections = [_short(study, results), _scores(study, results)]
+            kept = controllability(timeline)
+        headline = _headline(study, results, all_episodes(study, folder, study.robots))
+        figure = draw_headline(headline)
+        drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
+        sections = [_short(study, results, headline, drawn)]
+        for spec in study.robots:
+            pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT, _facts_of_robot(study, spec))
+            sections.append(Section(spec.name.capitalize(), pictures=pictures))
         if kept:
             table = controllability_shown(study, folder, kept)
-            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE)
+            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(study, folder))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
-        for spec in study.robots:
-            pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT)
-            sections.append(Section(spec.name.capitalize(), pictures=pictures))
-        sections += [_controls(study, results), _done(study, results)]
+        sections += [_controls(study, results), _compared(study, results), _scores(study, results)]
+        sections.append(_done(study, results))
         if study.paper:
             sections.append(_differences(study, results, kept))
         sections.append(_noticed(results))
@@ -69,7 +80,7 @@ class Publish(StudyTask):
             "versions and machine has the same results, bit for bit.",
             f"Study {manifest['fingerprint']}",
         ]
-        return [write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
+        return [*drawn, write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
 
 
 def _lead(study: Study) -> str:
@@ -83,21 +94,68 @@ def _lead(study: Study) -> str:
     )
 
 
-def _short(study: Study, results: Results) -> Section:
+def _headline(study: Study, results: Results, table: DataFrame) -> list[ArmReturns]:
+    """Each arm on each robot, at the last recording that it was evaluated on."""
+    last = {(row.robot, row.arm): row for row in sorted(results.scores, key=lambda row: row.at_min)}
+    told = []
+    for row in (row for row in results.scores if row is last[row.robot, row.arm]):
+        of_each = performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)
+        interval = row.interquartile_mean, row.low_95, row.high_95
+        told.append(ArmReturns(row.robot, row.arm, *interval, row.random, row.optimum, tuple(of_each.tolist())))
+    return told
+
+
+def _short(study: Study, results: Results, headline: Sequence[ArmReturns], drawn: Sequence[Path]) -> Section:
+    """How the best arm does on each robot, what comes of it without the culture, and how many comparisons hold."""
+    chosen = {arm.name for arm in study.arms if arm.trained and arm.through_neurons and arm.delivery == "chosen"}
+    sentences = []
+    for spec in study.robots:
+        of_robot = [row for row in headline if row.robot == spec.name]
+        best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.mean, default=None)
+        if best is not None:
+            at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
+            sentences.append(f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}.{at_random}")
     rows = results.comparisons
-    paragraphs = []
     printed = [row for row in rows if row.paper_p is not None]
     if printed:
-        paragraphs.append(_as_in_paper(printed))
+        sentences.append(_as_in_paper(printed))
+    elif rows:
+        found = sum(row.outcome == SECOND for row in rows)
+        sentences.append(f"In {found} of {len(rows)} comparisons the second arm was found to be better.")
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
-        paragraphs.append(
+        sentences.append(
             f"With {study.policies} policies a side no p can fall below {smallest:.2g}: these are the figures of a "
             "first look, and no results."
         )
+    picture = Picture(
+        drawn[0],
+        "Every arm on every robot",
+        HEADLINE.format(policies=study.policies),
+        (*(f"figures/{file.name}" for file in drawn[1:]), "tables/scores.csv"),
+    )
+    return Section("Results in short", tuple(sentences), pictures=(picture,))
+
+
+def _beside(row: ArmReturns) -> str:
+    words = f"through “{row.arm}” policies have an interquartile mean return of {cell(row.mean)}"
+    beside = [("random actions", row.random), ("the optimal controller", row.optimum)]
+    known = [f"{name} {cell(value)}" for name, value in beside if value is not None]
+    return words + (f"; {', '.join(known)}" if known else "")
+
+
+def _at_random(robot: str, arm: Arm, controls: Sequence[ControlReturns]) -> str:
+    """What is left where the stimuli are drawn at random."""
+    kind = robot, arm.mapping, arm.percentiles, "shuffled"
+    of = [row for row in controls if (row.robot, row.mapping, row.percentiles, row.control) == kind]
+    return f" With stimuli delivered at random the return is {cell(of[-1].mean_return)}." if of else ""
+
+
+def _compared(study: Study, results: Results) -> Section:
+    rows = results.comparisons
     if not rows:
-        paragraphs.append("The study compares no arms; how each did is under Scores.")
-    paragraphs.append(
+        return Section("Comparisons", ("The study compares no arms; how each did is under Scores.",))
+    said = (
         "A policy's performance is its mean return over the episodes. Policies are compared by the two-sided "
         "Mann-Whitney U test: p by the normal approximation with continuity correction, as in the paper, and "
         "exactly; p corrected is Holm's for the number of comparisons. Stars in figures are of the corrected p. The "
@@ -106,9 +164,7 @@ def _short(study: Study, results: Results) -> Section:
         "that there is no difference. The effect is the rank-biserial correlation, +1 where every "
         "policy of the second arm is better, with Newcombe's 95 % interval."
     )
-    return Section(
-        "Results in short", tuple(paragraphs), tables=(comparisons_shown(rows), returns_shown(rows)) if rows else ()
-    )
+    return Section("Comparisons", (said,), tables=(comparisons_shown(rows), returns_shown(rows)))
 
 
 def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
@@ -161,15 +217,41 @@ _NUMBERS_OF_ROBOT = {
 """Files that hold what figures show."""
 
 
+def _facts_of_robot(study: Study, spec: RobotSpec) -> dict[str, str]:
+    """On how much the figures of a robot rest."""
+    return {
+        "policies": f"{study.policies}",
+        "episodes": f"{study.episodes}",
+        "episodes_over_time": f"{study.episodes_over_time}",
+        "round": f"{round_of(study, spec):,}",
+    }
+
+
+def _facts_of_culture(study: Study, folder: Path) -> dict[str, str]:
+    """On how much the figures of the culture rest."""
+    series = read_series(study, folder, as_one=True)
+    return {
+        "channels": f"{series[0].n_channels:,}",
+        "responses": f"{len(series[0]):,}",
+        "recordings": f"{len(series)}",
+        "first_min": f"{series[0].start_min:g}",
+        "last_min": f"{series[-1].start_min:g}",
+    }
+
+
 def _pictures(
-    folder: Path, of: str, captions: dict[str, tuple[str, str]], numbers: dict[str, tuple[str, ...]]
+    folder: Path,
+    of: str,
+    captions: Mapping[str, tuple[str, str]],
+    numbers: Mapping[str, tuple[str, ...]],
+    facts: Mapping[str, str],
 ) -> tuple[Picture, ...]:
     pictures = []
     for name, (title, caption) in captions.items():
         files = [Path("figures") / f"{of}-{name}.{ending}" for ending in FORMATS]
         if (folder / files[0]).exists():
             beside = (*(file.as_posix() for file in files[1:]), *(n.format(of=of) for n in numbers.get(name, ())))
-            pictures.append(Picture(folder / files[0], f"{of.capitalize()}: {title}", caption, beside))
+            pictures.append(Picture(folder / files[0], f"{of.capitalize()}: {title}", caption.format(**facts), beside))
     return tuple(pictures)
 
 
@@ -184,13 +266,14 @@ def _controls(study: Study, results: Results) -> Section:
         ),
         ("silent", "The trained policies on a culture that always answers 0."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
+        ("coupling", "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and goal."),
     )
-    beside = heuristic_shown(results.heuristic)
+    beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
     return Section(
         "Is it the culture?",
-        ("Each control takes something away.", *not_outperforming(results)),
+        ("Each control takes something away.", *not_outperforming(results), *reflexes_told(results.reflexes)),
         points,
-        ((beside,) if beside.rows else ()) + (controls_shown(study, results.controls),),
+        (*(table for table in beside if table.rows), controls_shown(study, results.controls)),
     )
 
 
@@ -228,7 +311,7 @@ def _done(study: Study, results: Results) -> Section:
     for arm in study.arms:
         said = [f"mapping {arm.mapping}" if arm.through_neurons else "the robot is moved directly"]
         if arm.through_neurons:
-            said.append("simulators refreshed during training" if arm.shadowing else "the first simulator throughout")
+            said.append(_SHADOWING[arm.shadowing])
         if arm.delivery == "shuffled":
             said.append("the delivered stimulus is drawn at random, in training and in evaluation")
         if arm.percentiles == "first":
@@ -239,6 +322,11 @@ def _done(study: Study, results: Results) -> Section:
     return Section("How it was done", points=tuple(points))
 
 
+_SHADOWING: dict[bool | str, str] = {
+    True: "simulators refreshed during training",
+    False: "the first simulator throughout",
+    "drawn": "each episode draws one of the simulators",
+}
 _ACTIONS = {
     "most probable": "Policies take their most probable action.",
     "drawn": "Policies draw their actions, as in training.",

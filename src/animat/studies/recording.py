@@ -32,6 +32,10 @@ class Record(StudyTask):
 
     base: Path
 
+    @property
+    def reads_elsewhere(self) -> bool:
+        return self.study.culture.kind == "files"
+
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         out = folder / RECORDINGS
         _remove_changed(folder)
@@ -67,12 +71,11 @@ def _remove_changed(folder: Path) -> None:
 
 def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     from animat.cultures.virtual import VirtualCulture
-    from animat.stimulation.protocol import Protocol
 
     culture = study.culture
     return record_virtual_series(
         lambda: VirtualCulture(culture.seed),
-        Protocol(order=culture.order, pulses=culture.pulses, trials=culture.trials),
+        culture.protocol(),
         out,
         sessions=culture.sessions,
         interval_min=culture.interval_min,

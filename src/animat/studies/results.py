@@ -144,6 +144,32 @@ class BesideHeuristic:
 
 
 @dataclass(frozen=True)
+class BesideReflex:
+    """Trained policies beside the best coupling, as in `animat.evaluation.coupling`; None for what is not known.
+
+    Attributes:
+        coupling: its mean return.
+        gap: the context gap of the task, with the ends of its 95 % interval.
+        needs_context: whether the task surely needs more than a reflex.
+        score: the context score of the policies, with the ends of its 95 % interval.
+    """
+
+    robot: str
+    arm: str
+    at_min: float
+    coupling: float
+    coupling_standard_error: float | None
+    optimum: float
+    gap: float | None
+    gap_low_95: float | None
+    gap_high_95: float | None
+    needs_context: bool
+    score: float | None
+    score_low_95: float | None
+    score_high_95: float | None
+
+
+@dataclass(frozen=True)
 class ObjectiveMet:
     """How far episodes of an arm's policies or of a control met an objective of a robot's goal, and all of the goal.
 
@@ -175,6 +201,7 @@ class Results:
     optima: tuple[StudyOptimum, ...]
     findings: tuple[Finding, ...]
     goals: tuple[ObjectiveMet, ...] = ()
+    reflexes: tuple[BesideReflex, ...] = ()
 
 
 def write_typed(path: Path, value: Any) -> Path:

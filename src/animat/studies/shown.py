@@ -11,7 +11,7 @@ from animat.report.html import Table, cell, with_error
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.optima import optima_of_all, rough_kinds
-from animat.studies.results import BesideHeuristic, ComparedReturns, ControlReturns, Score, StudyOptimum
+from animat.studies.results import BesideHeuristic, BesideReflex, ComparedReturns, ControlReturns, Score, StudyOptimum
 from animat.studies.specification import Study, named_mapping
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
@@ -248,6 +248,29 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
         "return is larger, ties half. Highlighted: learning brought no more than the heuristic policy did.",
         beside="tables/heuristic.csv",
         marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
+    )
+
+
+def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
+    """Trained policies beside the best coupling: context gap and context score."""
+    return Table(
+        "Policies beside the best reflex",
+        *_columns(
+            rows,
+            [
+                ("robot", "robot"),
+                ("arm", "arm"),
+                ("at (min)", "at_min"),
+                ("best coupling", _pair("coupling", "coupling_standard_error")),
+                ("optimum", "optimum"),
+                ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
+                ("context score", _interval("score", "score_low_95", "score_high_95")),
+            ],
+        ),
+        note="Best coupling: a fixed rule from what is sensed to a stimulus, without memory and goal, found by a "
+        "search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
+        "score: (policies − coupling) / (optimum − coupling), where the task needs more. With 95 % intervals.",
+        beside="tables/reflexes.csv",
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.history import AT_FIRST
+from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -22,6 +23,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
+from animat.responses.readouts import ALL, Readouts, readouts_named
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Presentation
@@ -33,7 +35,9 @@ from animat.writing import atomic_write
 
 _FORMER = {"reach": "neighbour_exponent"}
 """What files of before call arrays of simulators."""
-_KINDS = {kind.__name__: kind for kind in (HistogramSimulator, EmpiricalSimulator, MemorySimulator)}
+_KINDS = {
+    kind.__name__: kind for kind in (HistogramSimulator, JointHistogramSimulator, EmpiricalSimulator, MemorySimulator)
+}
 
 
 @final
@@ -55,19 +59,26 @@ class Fit(StudyTask):
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)
-        rows = (
-            (responses.start_min, responses.conditions[c].label, x, ratio, int(burst))
-            for responses in series
-            for c, x, ratio, burst in zip(
-                responses.condition.tolist(),
-                responses.rate_hz.tolist(),
-                responses.active_ratio.tolist(),
-                responses.is_burst.tolist(),
-                strict=True,
-            )
+        return [folder / TIMELINE, _write_responses(folder / RESPONSES, series)]
+
+
+def _write_responses(path: Path, series: list[Responses]) -> Path:
+    """A line a response: x of all channels, which the figures show, and of each readout where there are several."""
+    names = () if series[0].readouts.are_all else series[0].readouts.names
+    rows = (
+        (responses.start_min, responses.conditions[c].label, x, ratio, int(burst), *(of_each if names else ()))
+        for responses in series
+        for c, x, ratio, burst, of_each in zip(
+            responses.condition.tolist(),
+            responses.rate_hz.tolist(),
+            responses.active_ratio.tolist(),
+            responses.is_burst.tolist(),
+            responses.read_hz.reshape(len(responses), -1).tolist(),
+            strict=True,
         )
-        head = ("start_min", "condition", "rate_hz", "active_ratio", "is_burst")
-        return [folder / TIMELINE, write_table(folder / RESPONSES, head, rows)]
+    )
+    head = ("start_min", "condition", "rate_hz", "active_ratio", "is_burst")
+    return write_table(path, [*head, *(f"rate_hz of {name}" for name in names)], rows)
 
 
 def _moved(study: Study, start_min: list[float]) -> list[Finding]:
@@ -85,8 +96,8 @@ def _moved(study: Study, start_min: list[float]) -> list[Finding]:
     ]
 
 
-def read_series(study: Study, folder: Path) -> list[Responses]:
-    """The responses of the study's recordings, in the order of time."""
+def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Responses]:
+    """The responses of the study's recordings, in the order of time; `as_one`: of all channels, whatever is read."""
     settings = study.simulators
     return extract_series(
         read_recordings(folder / RECORDINGS),
@@ -94,7 +105,19 @@ def read_series(study: Study, folder: Path) -> list[Responses]:
         settings.window_ms,
         burst_threshold=settings.burst_threshold,
         allow=settings.allow,
+        readouts=ALL if as_one else readouts_named(settings.readouts),
     )
+
+
+def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
+    """What each simulator keeps of its responses, by minute; of several readouts each condition and readout alone."""
+    found, names = {}, timeline.readouts.names
+    for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True):
+        if len(names) > 1:
+            labels = tuple(f"{label}, {name}" for label in kept.labels for name in names)
+            kept = replace(kept, labels=labels, in_data=kept.in_data.ravel(), in_simulator=kept.in_simulator.ravel())
+        found[at_min] = kept
+    return found
 
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
@@ -119,6 +142,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "n_above_range": [kept.n_above_range for kept in timeline.fidelities],
         "findings": [asdict(finding) for finding in timeline.findings],
         "fitted": timeline.fitted,
+        **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
     with atomic_write(path) as beside:
         beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
@@ -140,15 +164,17 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         labels = tuple(condition.label for condition in conditions)
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
+        readouts = Readouts.from_dict(told.get("readouts"))
         return SimulatorTimeline(
             simulators=_simulators(told["kind"], load(data)),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),
             presentation=None if presentation is None else Presentation(**presentation),
-            fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n) for a, b, n in kept),
+            fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n, readouts.names) for a, b, n in kept),
             findings=tuple(Finding.from_dict(each) for each in told["findings"]),
             fitted=told["fitted"],
+            readouts=readouts,
         )
     except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:
         raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error

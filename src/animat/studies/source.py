@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -11,7 +13,7 @@ from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
 from animat.recordings.synthetic import SyntheticCulture
 from animat.records import Positive, Seed, Whole, record
-from animat.stimulation.protocol import Protocol
+from animat.stimulation.protocol import TWO_COMMANDS, Protocol
 
 MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
 """Recordings, trials in each, and entries of a list; `docs/studies.md` states them."""
@@ -27,8 +29,12 @@ class Source:
         kind: `"virtual"`, simulated neurons; `"synthetic"`, responses of known distributions, to try things; `"files"`.
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
         seed: which virtual or synthetic culture.
+        seeds, folders: of a study over many cultures (`animat.studies.cultures`): seeds such as `"1-5, 8"` in place of
+            `seed`, or folders of recordings, one a culture, in place of `files`.
         sessions, interval_min: how many recordings, and the minutes from one to the next.
         order, pulses, trials: how stimuli are presented (`animat.stimulation.protocol`).
+        places, frequencies_hz: of a virtual culture, `"corners"`, `"halves"` or `"quadrants"`, each a condition of its
+            own, and the frequencies; None: the paper's patterns, and its frequencies, but 20 Hz alone at corners.
         channels: of a synthetic culture.
     """
 
@@ -41,28 +47,75 @@ class Source:
     pulses: Annotated[Whole, Field(ge=1, le=MOST_TRIALS)] = 1
     trials: Annotated[Whole, Field(ge=2, le=MOST_TRIALS)] = 100
     channels: Annotated[Whole, Field(ge=1, le=1024)] = 256
+    places: Literal["corners", "halves", "quadrants"] | None = None
+    frequencies_hz: Annotated[tuple[Positive, ...], LISTED] | None = None
+    seeds: str | None = None
+    folders: Annotated[tuple[str, ...], LISTED] | None = None
 
     def __post_init__(self) -> None:
-        if (self.kind == "files") != bool(self.files):
-            raise InvalidArgument(f"files: expected some for kind = 'files' only, got {len(self.files)}")
+        if (self.kind == "files") != bool(self.files or self.folders):
+            n = len(self.files) + len(self.folders or ())
+            raise InvalidArgument(f"files, folders: expected some for kind = 'files' only, got {n} for {self.kind!r}")
+        if self.files and self.folders:
+            raise InvalidArgument("folders: expected files of one culture or folders of many, got both")
+        names = [Path(each).name for each in self.folders or ()]
+        if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+            raise InvalidArgument(f"folders: expected different names, got {twice[0]!r} twice: rename one")
+        if self.seeds is not None:
+            read_seeds(self.seeds)
+            if self.seed != 1:
+                raise InvalidArgument(f"seeds: expected seed or seeds, got both, {self.seed} and {self.seeds!r}")
         if self.sessions * self.interval_min > LONGEST_MIN:
             raise InvalidArgument(
                 f"sessions, interval_min: expected recordings within a year, got {self.sessions} every "
                 f"{self.interval_min:g} min"
             )
-        for file in self.files:
+        for file in (*self.files, *(self.folders or ())):
             if not file or not file.isprintable():
                 raise InvalidArgument(f"files: expected names of files, got {shown(file)}")
         if self.kind == "files":
             for each in fields(self):
-                if each.name not in ("kind", "files") and getattr(self, each.name) != each.default:
+                if each.name not in ("kind", "files", "folders") and getattr(self, each.name) != each.default:
                     raise InvalidArgument(
                         f"{each.name}: expected only for a culture that is recorded, got one of files"
                     )
         if self.kind == "synthetic" and (self.order, self.pulses) != ("blocked", 1):
             raise InvalidArgument("order: a synthetic culture is recorded blocked with one pulse, got otherwise")
+        if self.kind == "synthetic" and (self.places, self.frequencies_hz) != (None, None):
+            raise InvalidArgument("places: expected none for a synthetic culture, nor frequencies_hz")
         # What the recordings themselves refuse is refused before there is a folder.
         if self.kind == "virtual":
-            Protocol(order=self.order, pulses=self.pulses, trials=self.trials)
+            self.protocol()
         elif self.kind == "synthetic":
             SyntheticCulture(self.seed, patterns=self.trials, channels=self.channels)
+
+    def protocol(self) -> Protocol:
+        """Of every recording of a virtual culture.
+
+        Raises:
+            InvalidArgument: for one that cannot be.
+        """
+        asked: dict[str, Any] = {} if self.places is None else {"places": self.places}
+        if self.frequencies_hz is not None or self.places == "corners":
+            asked["frequencies_hz"] = self.frequencies_hz or TWO_COMMANDS.frequencies_hz
+        return Protocol(order=self.order, pulses=self.pulses, trials=self.trials, **asked)
+
+
+def read_seeds(text: str) -> list[int]:
+    """Seeds that are written as numbers and ranges, such as `1-5, 8`.
+
+    Raises:
+        InvalidArgument: for anything else, a seed that comes twice, or too many.
+    """
+    seeds: list[int] = []
+    for part in text.split(","):
+        found = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", part)
+        first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, -1)
+        if last < first:
+            raise InvalidArgument(f"seeds: expected numbers and ranges, such as '1-5, 8', got {shown(text)}")
+        if len(seeds) + last - first >= MOST_ENTRIES:
+            raise InvalidArgument(f"seeds: expected at most {MOST_ENTRIES} cultures, got {shown(text)}")
+        seeds += range(first, last + 1)
+    if len(set(seeds)) < len(seeds):
+        raise InvalidArgument(f"seeds: expected each culture once, got {shown(text)}")
+    return seeds

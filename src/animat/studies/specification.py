@@ -16,9 +16,11 @@ from animat.errors import InvalidArgument, shown
 from animat.goals.robot import with_goal
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.registry import is_ours, place_of
+from animat.responses.readouts import count_readouts, readouts_named
 from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import REGISTRY, robot_named
 from animat.studies.source import LISTED, Source
+from animat.training.lessons import Lesson, expect_lessons
 from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 
 MOST_TRAINED = 20_000
@@ -56,6 +58,8 @@ class Simulators:
     Attributes:
         kind, bins, range_hz: of the simulators; by default 20 bins with edges at each recording's own percentiles.
         conditions: what the agent picks from, such as `frequency` or `interval:5,10+-25%`; empty: by frequency.
+        readouts: what becomes a command each: `all` channels as one, `halves` or `quadrants` of the array, or groups of
+            electrodes as JSON, `{"left": [1, 2], "right": [3, 4]}`; every robot of the study takes as many commands.
         window_ms: start and end of the response window.
         burst_threshold: share of active channels above which a response is a burst; None: Otsu's, where there are two
             groups.
@@ -66,6 +70,7 @@ class Simulators:
     bins: Whole = 20
     range_hz: Number | None = None
     conditions: str = ""
+    readouts: str = "all"
     window_ms: tuple[Number, Number] = (2.0, 10.0)
     burst_threshold: Share | None = None
     allow: Annotated[tuple[str, ...], LISTED] = ()
@@ -80,6 +85,7 @@ class Simulators:
         check_binning(self.bins, self.range_hz)
         check_window(self.window_ms)
         check_allowed(self.allow)
+        readouts_named(self.readouts)
         if self.conditions:
             conditions_named(self.conditions)
 
@@ -97,6 +103,7 @@ class RobotSpec:
         parameters: in place of its defaults, such as `pole_mass_kg`.
         optimum_resolution: of its optimal return, in place of the study's.
         goal: what is wanted of it in place of its own task (`animat.goals.text`); None: its own task.
+        lessons: that its policies are taught in turn, a table `[[robots.lessons]]` each (`animat.training.lessons`).
     """
 
     name: Name
@@ -105,6 +112,7 @@ class RobotSpec:
     parameters: Numbers = Field(default_factory=dict)
     kind: str = ""
     goal: str | None = None
+    lessons: Annotated[tuple[Lesson, ...], LISTED] = ()
 
     def __post_init__(self) -> None:
         key = "kind" if self.kind else "name"
@@ -118,11 +126,9 @@ class RobotSpec:
             raise InvalidArgument(f"parameters: {error}") from error
         if self.name == "culture":
             raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
-        if robot.n_commands > 1:
-            told = f"expected a robot of one command, as a study reads all channels as one, got {robot.n_commands}"
-            raise InvalidArgument(f"{key}: {told} of {robot.name}: train it with animat train --readouts")
         if self.goal is not None:
             with_goal(robot, self.goal)
+        expect_lessons(self.lessons, self.robot(), draws_recordings=True)
         if not is_ours(robot):
             # Workers know it by that.
             object.__setattr__(self, "kind", place_of(kind))
@@ -146,7 +152,7 @@ class Arm:
         name: what it is called in tables and folders.
         mapping: from responses to commands, or where to import one from, `my_package.mappings:Steep` (filled in for
             mappings that are not ours); `"none"` is the baseline without neurons.
-        shadowing: whether simulators are refreshed during training.
+        shadowing: whether simulators are refreshed during training; `"drawn"`: each episode draws one of them.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
         percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording.
         trained: false for policies as they are before training.
@@ -154,7 +160,7 @@ class Arm:
 
     name: Name
     mapping: str = "1-threshold"
-    shadowing: Flag = True
+    shadowing: Flag | Literal["drawn"] = True
     delivery: Literal["chosen", "shuffled"] = "chosen"
     percentiles: Literal["moving", "first"] = "moving"
     trained: Flag = True
@@ -265,6 +271,21 @@ class Study:
         for what in ("robots", "arms"):
             if not getattr(self, what):
                 raise InvalidArgument(f"{what}: expected at least one, got none")
+        n_readouts = count_readouts(readouts_named(self.simulators.readouts))
+        for spec in self.robots:
+            if self.needs_neurons and (n := spec.robot().n_commands) != n_readouts:
+                raise InvalidArgument(
+                    f"simulators.readouts: expected as many as the commands of {spec.name} ({n}), got "
+                    f"{self.simulators.readouts!r}, which are {n_readouts}; robots of more or fewer commands are a "
+                    "study of their own"
+                )
+        for spec in self.robots:
+            for arm in self.arms:
+                drawn = arm.shadowing == "drawn" and arm.through_neurons
+                try:
+                    expect_lessons(spec.lessons, spec.robot(), draws_recordings=drawn)
+                except InvalidArgument as error:
+                    raise InvalidArgument(f"robots.lessons: {error} ({spec.name}, {arm.name})") from error
         _expect_unlike("robots", [spec.name for spec in self.robots])
         _expect_unlike("arms", [arm.slug for arm in self.arms])
         _expect_unlike("comparisons", [compared.name for compared in self.comparisons])
@@ -359,6 +380,13 @@ class Study:
             if robot["goal"] is None:
                 # Studies of before have none, and go on.
                 del robot["goal"]
+            if not robot["lessons"]:
+                del robot["lessons"]
+        for name in ("seeds", "folders", "places", "frequencies_hz"):
+            if plain["culture"][name] is None:
+                del plain["culture"][name]
+        if plain["simulators"]["readouts"] == "all":
+            del plain["simulators"]["readouts"]
         return plain
 
 

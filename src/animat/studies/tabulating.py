@@ -23,8 +23,10 @@ from animat.studies.heuristic import beside_heuristic
 from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
+from animat.studies.reflex import beside_reflex
 from animat.studies.results import (
     BesideHeuristic,
+    BesideReflex,
     ComparedReturns,
     ControlReturns,
     ObjectiveMet,
@@ -35,6 +37,7 @@ from animat.studies.results import (
     write_table,
     write_typed,
 )
+from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
@@ -79,6 +82,7 @@ class Tabulate(StudyTask):
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
             goals=tuple(goals_met(study, table)),
+            reflexes=tuple(row for spec in study.robots for row in beside_reflex(study, table, spec, optima)),
         )
         files = [write_typed(results_file(folder), results)]
         for name, kind in (
@@ -86,6 +90,7 @@ class Tabulate(StudyTask):
             ("comparisons", ComparedReturns),
             ("controls", ControlReturns),
             ("heuristic", BesideHeuristic),
+            ("reflexes", BesideReflex),
             ("optima", StudyOptimum),
         ):
             files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
@@ -98,7 +103,7 @@ class Tabulate(StudyTask):
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             rows = (
                 (at_min, *told)
-                for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True)
+                for at_min, kept in controllability(timeline).items()
                 for told in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True)
             )
             files.append(write_table(table_file(folder, "controllability"), head, rows))

@@ -10,6 +10,7 @@ from typing import Any
 from animat import plain_file
 from animat.errors import InvalidArgument, InvalidFile
 from animat.records import read_record
+from animat.studies.grid import without_lists
 from animat.studies.specification import Study
 from animat.training.settings import FORMER as FORMER_SETTINGS
 
@@ -31,7 +32,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study's specification.
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it; what is left out has its
-    default; a key that is not known is refused.
+    default; a key that is not known is refused. Lists in robots, arms and comparisons stand for their products
+    (`animat.studies.grid`).
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -62,7 +64,7 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")
             raise InvalidFile(f"{path}: {name}: expected [[{name}]] for each, and its name in it, got {wrote}")
     try:
-        return read_record(Study, _in_todays_words(data))
+        return read_record(Study, without_lists(_in_todays_words(data)))
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
 

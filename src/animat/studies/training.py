@@ -56,10 +56,11 @@ def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:
         iterations=spec.trained_for,
         # Tests of ranks take the policies of two arms for independent: none starts as another one does.
         seed=draw_seed("training", study.seed, spec.name, arm.slug),
-        shadowing=arm.shadowing,
+        shadowing=arm.shadowing if through_neurons else bool(arm.shadowing),
         duration_min=study.training_min,
         percentiles=arm.percentiles,
         delivery=arm.delivery,
         commands=None if through_neurons else spec.robot().baseline_commands,
         algorithm=SAC(**study.algorithm),  # type: ignore[arg-type]
+        lessons=spec.lessons,
     )

@@ -8,11 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float64
 
 from animat.compilation import FAST_TO_COMPILE
 from animat.environment import Environment
@@ -38,6 +39,10 @@ CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
 
 
+AddPart: TypeAlias = Callable[[Float64[np.ndarray, "policies 3"]], None]
+"""What is given a part of the learning curves, a row a policy."""
+
+
 @dataclass(frozen=True, eq=False)
 class Group:
     """Some of a training's policies, and what they are trained on.
@@ -58,7 +63,12 @@ class Group:
 
 
 def train_group(
-    group: Group, checkpoint: Path | None, progress: Progress, *, checkpoint_s: float = CHECKPOINT_S
+    group: Group,
+    checkpoint: Path | None,
+    progress: Progress,
+    *,
+    checkpoint_s: float = CHECKPOINT_S,
+    add_part: AddPart | None = None,
 ) -> list[Policy]:
     """Train a group of policies, going on from its checkpoint where there is one.
 
@@ -70,6 +80,7 @@ def train_group(
             none is written.
         progress: told after each chunk how many are done, and the mean return of the episodes that ended in it.
         checkpoint_s: seconds between checkpoints; they change how much is done again, never the result.
+        add_part: given each part of the learning curves, a row a policy, those from the checkpoint first.
 
     Raises:
         InvalidFile: if the checkpoint cannot be read or written, or is of another training.
@@ -80,12 +91,17 @@ def train_group(
     together = SideBySide(group)
     done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
     start_min = 0.0 if timeline is None else float(timeline.start_min[0])
+    if add_part is not None:
+        for part in together.curve:
+            add_part(part)
     written = time.monotonic()
     for index in range(done, CHUNKS):
         simulator = None if timeline is None else timeline.at(start_min + training.minute(index))
         if timeline is not None and training.shadowing == "drawn":
             simulator = timeline.simulators
         mean_return = together.train(index, simulator)
+        if add_part is not None:
+            add_part(together.curve[-1])
         if checkpoint is not None and time.monotonic() - written > checkpoint_s:
             together.keep(checkpoint)
             written = time.monotonic()
@@ -105,7 +121,6 @@ def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> lis
     best = []
     for file, policy in zip(files, policies, strict=True):
         if policy.best is not None:
-            (folder / BEST).mkdir(exist_ok=True)
             best.append(folder / BEST / file.name)
             policy.best.save(best[-1])
         policy.save(file)
@@ -148,6 +163,11 @@ class SideBySide:
         keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
         self._learners = beginning(keys)
         self._curve: list[np.ndarray] = []
+
+    @property
+    def curve(self) -> Sequence[Float64[np.ndarray, "policies 3"]]:
+        """The learning curves so far: of each part, a row a policy."""
+        return self._curve
 
     def train(self, index: int, simulator: NeuronSimulator | None) -> float:
         """Train one chunk; returns the mean return of the episodes that ended in it, NaN for none.

@@ -133,7 +133,9 @@ class Training:
             ("delivery", get_args(Delivery)),
         ):
             if getattr(self, name) not in allowed:
-                raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
+                raise InvalidArgument(
+                    f"{name}: expected one of {', '.join(map(str, allowed))}, got {getattr(self, name)!r}"
+                )
 
     def register(self) -> None:
         """Make its robot and its mapping known in a process that they came to, so that policies can be loaded there."""

@@ -59,7 +59,7 @@ class Tuned:
 
     Attributes:
         folder: where everything is.
-        best: of the finals, the first of which are the study's own settings.
+        best: of the finals, the first of which are the study's own settings, and the defaults if they were tried.
         finals: in the order of the trials that they come from, by what they got there.
         told: all trials.
         importance: share of each setting, the largest first; empty for fewer trials than four.
@@ -130,6 +130,8 @@ def train_command(study: Study) -> str:
             words += ["--range-hz", f"{simulators.range_hz:g}"]
         if simulators.conditions:
             words += ["--conditions", simulators.conditions]
+        if simulators.readouts != Simulators().readouts:
+            words += ["--readouts", simulators.readouts]
         if simulators.window_ms != Simulators().window_ms:
             words += ["--window-ms", *(f"{ms:g}" for ms in simulators.window_ms)]
         if simulators.burst_threshold is not None:
@@ -137,6 +139,7 @@ def train_command(study: Study) -> str:
         if simulators.allow:
             words += ["--allow", *simulators.allow]
     words += ["--policies", str(study.policies), "--iterations", str(spec.trained_for)]
+    words += ["--seed", str(study.seed)] * (study.seed != 1)
     usual = Arm("usual")
     words += ["--shadowing", "off"] * (not arm.shadowing)
     words += ["--percentiles", arm.percentiles] * (arm.percentiles != usual.percentiles)

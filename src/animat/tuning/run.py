@@ -30,7 +30,7 @@ from animat.tuning.folder import describe_tuning, held
 from animat.tuning.journal import Told, read_journal, write_journal
 from animat.tuning.results import Final, Tuned, write_results
 from animat.tuning.search import Search, expect_optuna, importance_of
-from animat.tuning.space import own_settings, with_settings
+from animat.tuning.space import first_settings, own_settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, returns_file, same_shapes, timeline_file
 
@@ -86,9 +86,10 @@ class _Run:
     def __init__(self, tuning: Tuning, folder: Path, fingerprint: str, at: Executor, progress: Progress) -> None:
         self._tuning, self._folder, self._fingerprint, self._at = tuning, folder, fingerprint, at
         tune = tuning.tune
+        self._first = min(len(first_settings(tuning.study, tuning.space)), tune.trials)
         self._progress, self._done_s = progress, 0.0
         self._total_s = 20 + self._cost_s(tune.policies * tune.trials, CHUNKS) * 0.4
-        self._total_s += self._cost_s(tuning.study.policies * (tune.finalists + 1), CHUNKS)
+        self._total_s += self._cost_s(tuning.study.policies * (tune.finalists + self._first), CHUNKS)
 
     def fit(self, base: Path) -> None:
         """Have the recordings, and simulators of every kind that is searched."""
@@ -97,9 +98,10 @@ class _Run:
             return
         own = own_settings(study)
         variants = [
-            with_settings(study, {"simulator": kind, "conditions": conditions})
+            with_settings(study, {"simulator": kind, "conditions": conditions, "readouts": readouts})
             for kind in {own["simulator"]: None, **dict.fromkeys(_choices(space.get("simulator")))}
             for conditions in {own["conditions"]: None, **dict.fromkeys(_choices(space.get("conditions")))}
+            for readouts in {own["readouts"]: None, **dict.fromkeys(_choices(space.get("readouts")))}
         ]
         fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
         self._do([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
@@ -140,13 +142,11 @@ class _Run:
         diverged, racing = set(), list(trials)
         for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
             jobs = [
-                Job(
+                self._job(
                     f"rung-{rung + 1}/trials-{'+'.join(str(trial.number) for trial in group)}",
                     TrainTrials(
                         self._tuning.study, group, members, seeds, tune.episodes, (first, last), place, last < CHUNKS
                     ),
-                    (),
-                    self._cost_s(len(group) * len(members), last - first),
                 )
                 for group in same_shapes(racing, tune.policies)
             ]
@@ -165,8 +165,8 @@ class _Run:
             if last < CHUNKS:
                 ranked = sorted(racing, key=lambda trial: (-sum(returns[trial.number][-1]), trial.number))
                 goes_on = {trial.number for trial in ranked[: -(-len(trials) // tune.keep ** (rung + 1))]}
-                # The study's own settings go the whole way, to compare with.
-                racing = [trial for trial in racing if trial.number in goes_on or trial.number == 0]
+                # The settings that were there before the search go the whole way, to compare with.
+                racing = [trial for trial in racing if trial.number in goes_on or trial.number < self._first]
         complete = {trial.number for trial in racing}
         return [
             Told(
@@ -180,7 +180,7 @@ class _Run:
         ]
 
     def finals(self, told: Sequence[Told]) -> list[Final]:
-        """The study's own settings and the best trials, trained anew with the study's policies, in fresh episodes."""
+        """The first settings and the best of the others, trained anew with the study's policies, in fresh episodes."""
         tune, study = self._tuning.tune, self._tuning.study
         complete = [each for each in told if each.state == "complete"]
         if not complete:
@@ -189,20 +189,18 @@ class _Run:
                 "learning rates and reward scales"
             )
         ranked = sorted(complete, key=lambda each: (-each.means[-1], each.trial))
-        others = [each for each in ranked if each.trial != 0][: tune.finalists]
-        finalists = [Trial(0, told[0].settings), *(Trial(each.trial, each.settings) for each in others)]
+        others = [each for each in ranked if each.trial >= self._first][: tune.finalists]
+        finalists = [Trial(each.trial, each.settings) for each in (*told[: self._first], *others)]
         seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
         jobs = [
-            Job(
+            self._job(
                 f"final/trial-{trial.number}/p{members[0]}",
                 TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS, False),
-                (),
-                self._cost_s(len(members), CHUNKS),
             )
             for trial in finalists
             for members in split_groups(study.policies)
         ]
-        self._do(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "the best and the study's own settings, anew")
+        self._do(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "the best and the first settings, anew")
         finals = []
         for trial in finalists:
             returns: list[float] | None = []
@@ -213,6 +211,10 @@ class _Run:
         if all(each.returns is None for each in finals):
             raise UnusableData(f"{self._folder}: expected finite returns of the best trials, got none")
         return finals
+
+    def _job(self, name: str, task: TrainTrials) -> Job:
+        first, last = task.chunks
+        return Job(name, task, (), self._cost_s(len(task.trials) * len(task.members), last - first), task.reads)
 
     def _do(self, jobs: list[Job], receipts: str, cost_s: float, words: str) -> None:
         left = Jobs(jobs, self._folder, self._folder / receipts, self._fingerprint)

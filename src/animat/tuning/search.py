@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from animat.errors import AnimatError
+from animat.extras import expect_extra
 from animat.studies.draws import draw_seed
 from animat.training.settings import SAC
 from animat.tuning.journal import Told
-from animat.tuning.space import Range, Settings, Space, Value, own_settings
+from animat.tuning.space import Range, Settings, Space, Value, first_settings
 from animat.tuning.specification import Tuning
 
 if TYPE_CHECKING:
@@ -42,26 +42,27 @@ class Search:
         )
         self._optuna = optuna
         self._study = optuna.create_study(direction="maximize", sampler=sampler)
-        self._distributions = distributions(tuning.space)
-        own = own_settings(tuning.study)
-        self._study.enqueue_trial({name: own[name] for name in tuning.space})
+        self._space, self._distributions = tuning.space, distributions(tuning.space)
+        for settings in first_settings(tuning.study, tuning.space):
+            self._study.enqueue_trial(_mirrored(tuning.space, settings))
         self._running: list[Trial] = []
 
     def ask(self, n: int) -> list[Settings]:
         """Settings of the next trials, before any of them is known."""
         self._running = [self._study.ask(self._distributions) for _ in range(n)]
-        return [dict(trial.params) for trial in self._running]
+        return [_mirrored(self._space, trial.params) for trial in self._running]
 
     def tell(self, told: Sequence[Told]) -> None:
         """What the trials that were asked for last got, in the same order."""
         states = self._optuna.trial.TrialState
         for trial, each in zip(self._running, told, strict=True):
-            for chunks, mean in zip(each.chunks, each.means, strict=True):
-                trial.report(mean, chunks)
+            if each.state != "diverged":
+                for chunks, mean in zip(each.chunks, each.means, strict=True):
+                    trial.report(mean, chunks)
             if each.state == "complete":
                 self._study.tell(trial, each.means[-1])
             else:
-                # One that diverged may have reported nothing, and is then the worst of all.
+                # One that diverged reports nothing, however it began, and is then the worst of all.
                 self._study.tell(trial, state=states.PRUNED)
 
 
@@ -71,22 +72,32 @@ def importance_of(space: Space, told: Sequence[Told]) -> dict[str, float]:
     By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255). All trials that did not diverge were run until there; of
     those that were stopped no more is known.
     """
-    known = [each for each in told if each.returns]
+    known = [each for each in told if each.state != "diverged"]
     if len(known) < FEWEST or len({each.means[0] for each in known}) < 2:
         return {}
     optuna = expect_optuna()
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
     among = distributions(space)
     for each in known:
-        study.add_trial(optuna.trial.create_trial(params=each.settings, distributions=among, value=each.means[0]))
+        params = _mirrored(space, each.settings)
+        study.add_trial(optuna.trial.create_trial(params=params, distributions=among, value=each.means[0]))
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     shares = optuna.importance.get_param_importances(study, evaluator=evaluator, params=list(space))
     return {name: float(share) for name, share in sorted(shares.items(), key=lambda pair: (-pair[1], pair[0]))}
 
 
 def distributions(space: Space) -> dict[str, BaseDistribution]:
-    """The search in Optuna's words."""
+    """The search in Optuna's words, where a discount may stand for its distance from 1."""
     return {name: _distribution(name, among) for name, among in space.items()}
+
+
+def _mirrored(space: Space, settings: Settings) -> Settings:
+    """Settings as Optuna has them, and back: a discount that is searched in its logarithm is its distance from 1."""
+    return {name: 1 - value if _is_mirrored(name, space[name]) else value for name, value in settings.items()}  # type: ignore[operator]
+
+
+def _is_mirrored(name: str, among: Range | tuple[Value, ...]) -> bool:
+    return name == "discount" and isinstance(among, Range) and among.log
 
 
 def _distribution(name: str, among: Range | tuple[Value, ...]) -> BaseDistribution:
@@ -96,6 +107,8 @@ def _distribution(name: str, among: Range | tuple[Value, ...]) -> BaseDistributi
         return made
     if isinstance(asdict(SAC())[name], int):
         made = d.IntDistribution(int(among.low), int(among.high), log=among.log)
+    elif _is_mirrored(name, among):
+        made = d.FloatDistribution(1 - among.high, 1 - among.low, log=True)
     else:
         made = d.FloatDistribution(among.low, among.high, log=among.log)
     return made
@@ -107,8 +120,4 @@ def expect_optuna() -> Any:
     Raises:
         AnimatError: if it is not installed.
     """
-    try:
-        import optuna
-    except ImportError as error:
-        raise AnimatError("tuning needs Optuna, which is not installed: pip install 'animat[tune]'") from error
-    return optuna
+    return expect_extra("optuna", package="Optuna", extra="tune", what="tuning")

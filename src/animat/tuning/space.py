@@ -23,19 +23,22 @@ NUMBERS = (
     "entropy_nats",
 )
 """Settings of the algorithm that a compiled program takes as numbers: trials that differ in nothing else share one."""
-THROUGH_NEURONS = ("mapping", "simulator", "conditions")
+THROUGH_NEURONS = ("mapping", "simulator", "conditions", "readouts")
 FITTING = ("environments", "replay")
 """Settings of the algorithm that depend on each other: one is a multiple of the other."""
 SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
 
 Value = float | int | str
 Settings = dict[str, Value]
-"""Settings by name: of the algorithm, and `mapping`, `simulator`, `conditions`."""
+"""Settings by name: of the algorithm, and `mapping`, `simulator`, `conditions`, `readouts`."""
 
 
 @record
 class Range:
-    """Numbers from `low` to `high`; with `log` evenly in their logarithm. Whole ones for settings that are counts."""
+    """Numbers from `low` to `high`; with `log` evenly in their logarithm. Whole ones for settings that are counts.
+
+    The logarithm of a discount is that of its distance from 1: from 0.9 to 0.99 is as far as from 0.99 to 0.999.
+    """
 
     low: Number
     high: Number
@@ -55,7 +58,7 @@ Space = dict[str, Range | tuple[Value, ...]]
 
 USUAL: Space = {
     "learning_rate": Range(1e-4, 1e-2, True),
-    "discount": Range(0.9, 0.999),
+    "discount": Range(0.9, 0.999, True),
     "tau": Range(1e-3, 5e-2, True),
     "reward_scale": Range(0.02, 1.0, True),
     "initial_alpha": Range(0.01, 1.0, True),
@@ -80,7 +83,8 @@ def usual_space(study: Study) -> Space:
         own: Any = own_settings(study)[name]
         if isinstance(among, Range):
             # The logarithm of nothing is none: such a setting is searched evenly.
-            low, high, log = min(among.low, own), max(among.high, own), among.log and own > 0
+            low, high = min(among.low, own), max(among.high, own)
+            log = among.log and low > 0 and not (name == "discount" and high == 1)
             space[name] = Range(low, high, log)
         else:
             space[name] = among if own in among else (own, *among)
@@ -108,6 +112,8 @@ def read_space(given: Mapping[str, Any], study: Study) -> Space:
             if name in (*THROUGH_NEURONS, *FITTING):
                 raise InvalidArgument(f"{where}: expected a list of choices, got a table")
             space[name] = read_record(Range, among, where)
+            if name == "discount" and among.get("log") and among["high"] == 1:
+                raise InvalidArgument(f"{where}: expected high below 1 with log = true, got 1")
         elif isinstance(among, list) and len(among) > 1 and all(each not in among[:i] for i, each in enumerate(among)):
             space[name] = tuple(_whole(each, own_settings(study)[name]) for each in among)
         else:
@@ -161,8 +167,22 @@ def own_settings(study: Study) -> dict[str, Any]:
     """What a study of one robot and one arm has for every setting that can be searched."""
     algorithm = asdict(SAC(**study.algorithm))  # type: ignore[arg-type]
     kind, conditions = study.simulators.kind, study.simulators.conditions
-    own: dict[str, Any] = {**algorithm, "mapping": study.arms[0].mapping, "simulator": kind, "conditions": conditions}
-    return own
+    return {
+        **algorithm,
+        "mapping": study.arms[0].mapping,
+        "simulator": kind,
+        "conditions": conditions,
+        "readouts": study.simulators.readouts,
+    }
+
+
+def first_settings(study: Study, space: Space) -> list[Settings]:
+    """What is tried first: the study's own settings, and the algorithm's defaults if they are others and searched."""
+    own = own_settings(study)
+    usual = {**own, **asdict(SAC())}
+    first, second = ({name: of[name] for name in space} for of in (own, usual))
+    is_searched = all(value in space[name] for name, value in second.items())
+    return [first, second] if is_searched and second != first else [first]
 
 
 def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
@@ -175,5 +195,6 @@ def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
     arm, simulators = study.arms[0], study.simulators
     arm = replace(arm, mapping=changed.pop("mapping", arm.mapping))
     kind, conditions = changed.pop("simulator", simulators.kind), changed.pop("conditions", simulators.conditions)
-    simulators = replace(simulators, kind=kind, conditions=conditions)
+    readouts = changed.pop("readouts", simulators.readouts)
+    simulators = replace(simulators, kind=kind, conditions=conditions, readouts=readouts)
     return replace(study, arms=(arm,), simulators=simulators, algorithm={**study.algorithm, **changed})

@@ -22,14 +22,14 @@ class Tune:
     """How settings are searched: the table `[tune]`.
 
     Attributes:
-        trials: settings that are tried, the study's own first.
+        trials: settings that are tried; first the study's own, then the defaults of what is searched of the algorithm.
         together: trials that are decided at once, before any of them is known. It bounds how many can run side by
             side, and the same seed gives the same trials with any number of workers.
         policies: of each trial; what counts is their mean return.
         rungs, keep: successive halving: trials are trained for a share of the whole training, one in `keep` of those
             decided together goes on, and so on; the last of the `rungs` is the whole training. One rung: no halving.
         episodes: of each policy, on the simulator.
-        finalists: the best trials that were trained anew, beside the study's own settings, with the study's number of
+        finalists: the best trials that were trained anew, beside the settings tried first, with the study's number of
             policies, other random numbers and fresh episodes; the best of these wins.
         seed: decides every draw of the search, of its trainings and of their episodes.
         search: of each setting a range or choices, as TOML has them; empty: the usual ones.
@@ -97,6 +97,11 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
     if isinstance(robot := study.robots[0].robot(), HostRobot):
         raise InvalidArgument(
             f"robots: expected one that is stepped in JAX, as trials are trained side by side, got {robot.name}"
+        )
+    if study.robots[0].lessons or study.arms[0].shadowing == "drawn":
+        raise InvalidArgument(
+            "robots.lessons: expected none, nor shadowing = 'drawn', as trials are trained side by side; teach "
+            "the best settings afterwards with animat train --lessons"
         )
     return Tuning(study, tune, usual_space(study) if tune.search is None else read_space(tune.search, study))
 

@@ -29,10 +29,11 @@ from animat.writing import atomic_write
 
 
 def timeline_file(study: Study) -> Path:
-    """Where the simulators of a study's kind and conditions lie, in a tuning's folder."""
+    """Where the simulators of a study's kind, conditions and readouts lie, in a tuning's folder."""
     simulators = study.simulators
-    digest = hashlib.sha256(simulators.conditions.encode()).hexdigest()[:8]
-    return Path("simulators") / f"{simulators.kind}{simulators.conditions and '-' + digest}.safetensors"
+    other = simulators.conditions + ("" if simulators.readouts == "all" else f" {simulators.readouts}")
+    digest = hashlib.sha256(other.encode()).hexdigest()[:8]
+    return Path("simulators") / f"{simulators.kind}{other and '-' + digest}.safetensors"
 
 
 @final
@@ -90,6 +91,15 @@ class TrainTrials(StudyTask):
     chunks: tuple[int, int]
     place: str
     goes_on: bool
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Places of the files that it reads, which other jobs left."""
+        study, first = with_settings(self.study, self.trials[0].settings), self.chunks[0]
+        places = [kept_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials] if first else []
+        if study.arms[0].through_neurons:
+            places += {timeline_file(each) for each in (study, replace(study, simulators=_judge(self.study, study)))}
+        return tuple(place.as_posix() for place in places)
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         place, (first, last) = folder / self.place, self.chunks

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.compilation import user_cache
+from animat.compilation import pynwb_importable
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.nwb_layout import (
@@ -65,7 +65,7 @@ def write_nwb(
         InvalidArgument: for text that HDF5 cannot hold, or a `recorded_at` that is no date.
         UnusableData: for `spikes` that are not finite, of no channel, or outside of the recording.
     """
-    with user_cache():
+    with pynwb_importable():
         from pynwb import NWBHDF5IO
 
         from animat.recordings.formats.nwb_tables import nwb_file

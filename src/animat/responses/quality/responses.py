@@ -147,15 +147,15 @@ def _timing(responses: Responses, recording: Recording, assignment: Assignment) 
             f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window",
             float(overlapping),
         )
-    rate_hz, quiet_s = spontaneous_rate(recording, after_ms=end_ms)
+    rate_hz, _ = spontaneous_rate(recording, after_ms=end_ms)
     response = find_response(recording)
     parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
-    if quiet_s * 1e3 < 10 * (end_ms - start_ms) and parts.count.any():
+    if math.isnan(rate_hz) and parts.count.any():
         yield Finding(
             "window-not-tested",
             "note",
-            "stimuli follow each other too fast to see how the culture fires without them (no 100 ms of quiet before a "
-            "stimulus), so it is not known whether the window holds a response",
+            "stimuli follow each other too fast to see how the culture fires without them (less than a second in all "
+            "is 100 ms after a pulse and before the next), so it is not known whether the window holds a response",
         )
         return
     spikes = _without_artefact(parts)

@@ -1,0 +1,43 @@
+"""The command that starts a cluster on this machine, for a try."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+from animat.errors import AnimatError, InvalidArgument
+
+
+@dataclass(frozen=True)
+class ClusterCommand:
+    """A Dask scheduler and workers, for --cluster of train, study, reproduce and tune; until Ctrl-C."""
+
+    where: Positional[Literal["local"]]
+    """local: on this machine, for a try; docs/cluster.md has the few lines for several"""
+    workers: int | None = None
+    """Processes, each on its own core; default: one a core"""
+    file: Path = Path("cluster.json")
+    """Where the scheduler writes its address; gone at the end"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Keep it up."""
+        from animat.execution.local_cluster import local_cluster
+
+        workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+        if workers < 1:
+            raise InvalidArgument(f"--workers: expected at least 1, got {workers}")
+        with local_cluster(workers, self.file) as processes:
+            print(f"{workers} workers; to use them: --cluster {self.file}; to end them: Ctrl-C", flush=True)
+            try:
+                while all(process.poll() is None for process in processes):
+                    time.sleep(0.2)
+            except KeyboardInterrupt:
+                return {"workers": workers}
+        raise AnimatError("the scheduler or the workers ended; start again")

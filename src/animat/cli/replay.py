@@ -1,0 +1,69 @@
+"""The command that films a session, or policies on the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from animat.cli.responses import Fitting, policies_for
+from animat.errors import InvalidArgument
+
+
+@dataclass(frozen=True)
+class Replay(Fitting):
+    """Film a closed-loop session, or policies on the simulator, in real time: robot, spikes, command and return."""
+
+    source: Positional[Path] = Path("session")
+    """A session's folder, also of one that was killed; or a policy file or a folder of them"""
+    recordings: tuple[Path, ...] = ()
+    """Of policies: files or folders of recordings of one culture, whose simulator answers"""
+    at_min: float | None = None
+    """Of policies: minute whose newest recording answers; default: the last recording"""
+    span_s: tuple[float, float] | None = None
+    """What to show, in s from the start; default: the first minute"""
+    robot: str | None = None
+    """The robot that is expected, and imported: my_package.robots:Rover"""
+    seed: int = 1
+    """Of policies: decides every random draw"""
+    out: Path = Path("film.gif")
+    """The film: .gif, or .mp4, which needs animat[film]"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Film."""
+        from animat.progress import Bar
+        from animat.report.film.session import is_session, scene_of_session
+        from animat.report.film.writing import check_film, write_film
+        from animat.robots.registry import REGISTRY
+
+        check_film(self.out)
+        if self.span_s is not None and not 0 <= self.span_s[0] < self.span_s[1] < float("inf"):
+            raise InvalidArgument(
+                f"--span-s: expected a start from 0 s and a later end, got {self.span_s[0]:g} {self.span_s[1]:g}"
+            )
+        if self.robot is not None:
+            REGISTRY.name_of(self.robot)
+        if is_session(self.source):
+            if self.recordings:
+                raise InvalidArgument("--recordings: expected none with a session, which is shown as it was")
+            scene = scene_of_session(self.source, self.span_s)
+        else:
+            scene = self._on_simulator()
+        with Bar("drawing") as progress:
+            write_film(scene, self.out, progress)
+        print(f"{self.out}: {scene.title}, {scene.start_s:g} to {scene.stop_s:.1f} s")
+        return {"film": str(self.out), "span_s": [scene.start_s, scene.stop_s], "robot": scene.robot.name}
+
+    def _on_simulator(self) -> Any:
+        from animat.report.film.simulated import scene_of_policies
+
+        if self.source.is_dir() and not any(self.source.glob("*.safetensors")):
+            raise InvalidArgument(f"{self.source}: expected a session (session.log) or policies in it, got neither")
+        policies = policies_for(self.robot, None, self.source)
+        trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
+        timeline = None if trained is None else self.timeline(self.recordings, trained)
+        return scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)

@@ -1,0 +1,40 @@
+"""The command that shows a folder in a browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from animat.errors import InvalidArgument
+
+
+@dataclass(frozen=True)
+class Watch:
+    """A page of what runs, ran or was killed in a folder, for a browser on this machine; until Ctrl-C."""
+
+    folder: Positional[Path]
+    """Of a session, a training, a study, a tuning, recordings, or several of these"""
+    port: int = 0
+    """That is listened on, on this machine alone; 0: any that is free"""
+    json: bool = False
+    """End with a line of JSON"""
+
+    def run(self) -> dict[str, Any]:
+        """Serve it."""
+        from animat.watch.serving import serve
+
+        if not self.folder.is_dir():
+            raise InvalidArgument(f"{self.folder}: expected a folder to watch, got {_what(self.folder)}")
+        serve(self.folder, self.port, _say)
+        return {"folder": str(self.folder)}
+
+
+def _what(path: Path) -> str:
+    return "a file" if path.exists() else "none"
+
+
+def _say(address: str) -> None:
+    print(f"{address}  (Ctrl-C ends the page, and nothing else)", flush=True)

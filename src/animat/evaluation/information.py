@@ -1,0 +1,188 @@
+"""Goal information: how much the stimulus that is chosen tells of the goal, beside what the sensors tell."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float64, Int
+
+from animat.environment import Environment
+from animat.errors import InvalidArgument
+from animat.evaluation.rollouts import Actor
+from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.evaluation.traces import trace
+from animat.neurons.simulator import NeuronSimulator
+from animat.robots.capabilities import capability
+
+EPISODES = 64
+"""Of each actor: a state of each, met with the goal of each other one."""
+DRAWS = 128
+"""Actions drawn at each state with each goal."""
+PERMUTATIONS = 199
+"""Of two actions with each goal, at a state among the goals: p is 0.005 at least."""
+
+
+@dataclass(frozen=True)
+class GoalInformation:
+    """I(action; goal | sensors) in bits.
+
+    Attributes:
+        bits: with its interval, for the states and the actors.
+        p: share of permutations of the actions at each state among the goals whose estimate is as large as that of the
+            actions as they are, or larger.
+        most: log2 of the number of actions, or of goals where these are fewer.
+    """
+
+    bits: Interval
+    p: float
+    most: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return asdict(self)
+
+    def to_text(self) -> str:
+        """In a line."""
+        bits = self.bits
+        return (
+            f"goal information {bits.value:.2f} of {self.most:.2f} bits ({bits.low:.2f} to {bits.high:.2f}; "
+            f"permutation test of no dependence on the goal: p = {self.p:.2g})"
+        )
+
+
+def goal_information(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actors: Actor,
+    n_actors: int,
+    *,
+    draws: int = DRAWS,
+    seed: int = 1,
+) -> GoalInformation:
+    """How much the chosen stimulus tells of the goal at the same sensors.
+
+        I(A; G | S) = E_s[H(A | s) - E_g H(A | s, g)]
+
+    with s the states that the actors come through, one of each episode at a random iteration, and g the goals of the
+    other episodes, each put in place of the state's own: the sensors and all else are the same then. Goals do not
+    depend on s, as they would where an actor has been on its way to its own.
+
+    Args:
+        environment, simulator: that the actors act in.
+        actors: one kind of actor, its arrays with a leading axis of actors.
+        n_actors: how many there are.
+        draws: actions drawn at each state with each goal; 2 are enough for actors that draw nothing.
+        seed: decides every random draw.
+
+    Raises:
+        InvalidArgument: for continuous actions, or a robot whose goal cannot be switched (`Robot.with_goal_of`).
+    """
+    capability(environment.robot, "with_goal_of")
+    if environment.n_actions is None:
+        raise InvalidArgument("environment: expected discrete actions for a goal information in bits")
+    rng = np.random.default_rng([seed, 41])
+    traced = trace(environment, simulator, actors, n_actors, episodes=EPISODES, seed=seed)
+    when = (rng.random(traced.lengths.shape) * traced.lengths).astype(np.int64)
+    rows, columns = np.indices(when.shape)
+    states = jax.tree.map(lambda x: x[rows, columns, when], traced.states)
+    key = jax.random.key(int(rng.integers(2**31)))
+    actions = np.asarray(_at_each_goal(environment, draws, states, actors, jax.random.split(key, n_actors)))
+    # As samples, the actors; of one alone its states.
+    found = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)
+    of_each = found.reshape(when.shape).mean(axis=1) if n_actors > 1 else found
+    pairs = actions[..., :2].reshape(len(found), -1, 2)
+    null = [
+        _plug_in(rng.permuted(pairs.reshape(len(found), -1), axis=1).reshape(pairs.shape), environment.n_actions).mean()
+        for _ in range(PERMUTATIONS)
+    ]
+    # Sums of the same numbers in another order may differ in the last bit.
+    reached = np.sum(np.array(null) >= _plug_in(pairs, environment.n_actions).mean() - 1e-9)
+    p = float((1 + reached) / (1 + PERMUTATIONS))
+    most = float(np.log2(min(environment.n_actions, _count_goals(environment, states))))
+    return GoalInformation(interval_of_mean(of_each), p, most)
+
+
+def _count_goals(environment: Environment[Any], states: Any) -> int:
+    """Of the goals of all states, how many look different at one of them."""
+    robots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states.robot)
+    own = jax.tree.map(lambda x: x[0], robots)
+    switched = jax.vmap(capability(environment.robot, "with_goal_of"), (None, 0))(own, robots)
+    return len(np.unique(np.asarray(jax.vmap(environment.robot.observe)(switched)), axis=0))
+
+
+def conditional_information(
+    actions: Int[np.ndarray, "states goals draws"], n_actions: int
+) -> Float64[np.ndarray, " states"]:
+    """At each state H(A) - E_g H(A | g) in bits, corrected for few draws and few goals.
+
+    The entropy of the actions with one goal is Miller and Madow's, that of the mixture of goals a jackknife over goals.
+
+    Args:
+        actions: drawn with each goal.
+        n_actions: they are from 0 to `n_actions` - 1.
+
+    Source: Miller 1955, in Information Theory in Psychology, 95; Efron & Stein 1981, doi:10.1214/aos/1176345462.
+    """
+    shares = _shares(actions, n_actions)
+    goals, draws = actions.shape[1:]
+    mixture = shares.mean(axis=1)
+    without = (goals * mixture[:, None] - shares) / (goals - 1)
+    entropy = goals * _entropy(mixture) - (goals - 1) * _entropy(without).mean(axis=1)
+    with_goal = _entropy(shares) + ((shares > 0).sum(axis=-1) - 1) / (2 * draws * np.log(2))
+    information: Float64[np.ndarray, " states"] = entropy - with_goal.mean(axis=1)
+    return information
+
+
+def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
+    """The mean with its interval by Student's t; infinite of one sample."""
+    from scipy.stats import t
+
+    mean, n = float(samples.mean()), len(samples)
+    if n < 2:
+        return Interval(mean, -np.inf, np.inf, CONFIDENCE)
+    half = float(t.ppf((1 + CONFIDENCE) / 2, n - 1) * samples.std(ddof=1) / np.sqrt(n))
+    return Interval(mean, mean - half, mean + half, CONFIDENCE)
+
+
+def _plug_in(actions: Int[np.ndarray, "states goals draws"], n_actions: int) -> Float64[np.ndarray, " states"]:
+    shares = _shares(actions, n_actions)
+    information: Float64[np.ndarray, " states"] = _entropy(shares.mean(axis=1)) - _entropy(shares).mean(axis=1)
+    return information
+
+
+def _shares(actions: Int[np.ndarray, "*any draws"], n_actions: int) -> Float64[np.ndarray, "*any actions"]:
+    return np.stack([(actions == action).mean(axis=-1) for action in range(n_actions)], axis=-1)
+
+
+def _entropy(shares: Float64[np.ndarray, "*any actions"]) -> Float64[np.ndarray, "*any"]:
+    entropy: Float64[np.ndarray, "*any"] = -(shares * np.log2(np.where(shares > 0, shares, 1.0))).sum(axis=-1)
+    return entropy
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _at_each_goal(environment: Environment[Any], draws: int, states: Any, actors: Actor, keys: Any) -> Array:
+    """Actions at each state with the goal of each other one, shape (actors, states, goals, draws)."""
+    switched = capability(environment.robot, "with_goal_of")
+
+    def of_actor(states: Any, actor: Actor, key: Any) -> Array:
+        def at(state: Any, other: Any, key: Any) -> Array:
+            seen = environment.observe(state._replace(robot=switched(state.robot, other)))
+            uniforms = jax.random.uniform(key, (draws, environment.n_drawn))
+            return actor.act(environment, jnp.tile(seen / environment.scales, (draws, 1)), uniforms)
+
+        def with_others(number: Array, state: Any, key: Any) -> Array:
+            others = (number + 1 + jnp.arange(EPISODES - 1)) % EPISODES
+            goals = jax.tree.map(lambda x: x[others], states.robot)
+            return jax.vmap(at, (None, 0, 0))(state, goals, jax.random.split(key, EPISODES - 1))
+
+        each = jnp.arange(EPISODES), states, jax.random.split(key, EPISODES)
+        # State after state: those of all at once would take gigabytes.
+        found: Array = jax.lax.map(lambda one: with_others(*one), each)
+        return found
+
+    return jax.vmap(of_actor)(states, actors, keys)

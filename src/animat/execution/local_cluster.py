@@ -1,0 +1,91 @@
+"""A Dask cluster on this machine, for a try: a scheduler and workers as processes, over TCP on loopback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from animat.errors import AnimatError, InvalidFile
+from animat.execution.cluster import expect_distributed
+from animat.execution.dask_worker import work
+
+_PATIENCE_S = 10.0
+_RUN = """
+import runpy, sys
+from animat.execution.worker import end_with_parent
+end_with_parent()
+runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
+"""
+"""A module that ends with this process; nothing runs between fork and exec, which JAX's threads would not stand."""
+
+
+@contextmanager
+def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """A scheduler, and so many workers, until the block ends. A worker that dies is replaced.
+
+    Args:
+        workers: how many.
+        file: where the scheduler writes its address; gone at the end.
+        threads: cores of each worker.
+
+    Yields:
+        The processes of the scheduler and of what looks after the workers.
+
+    Raises:
+        AnimatError: if Dask is not installed, or the scheduler does not start.
+        InvalidFile: if the file is there already.
+    """
+    expect_distributed()
+    if file.exists():
+        raise InvalidFile(f"{file}: expected no file, got one; another cluster may be at work: stop it, or remove it")
+    scheduler = _start("scheduler", file, "--host", "127.0.0.1", "--port", "0")
+    looks_after = None
+    try:
+        while not file.exists():
+            if scheduler.poll() is not None:
+                raise AnimatError(f"{file}: the scheduler ended before it wrote its address there; see what it said")
+            time.sleep(0.1)
+        counts = ("--nworkers", str(workers), "--nthreads", str(threads))
+        looks_after = _start("worker", file, *counts, "--preload", work.__module__)
+        yield [scheduler, looks_after]
+    finally:
+        for process in (looks_after, scheduler):
+            if process is not None:
+                _stop(process)
+        file.unlink(missing_ok=True)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        # Workers whose scheduler died as they began wait for it for ever.
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _start(part: str, file: Path, *options: str) -> subprocess.Popen[bytes]:
+    quiet = {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    return subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            _RUN,
+            f"distributed.cli.dask_{part}",
+            "--no-dashboard",
+            "--scheduler-file",
+            file,
+            *options,
+        ],
+        # As for pinned processes: robots may lie beside a script.
+        env={**os.environ, **quiet, "PYTHONPATH": os.pathsep.join(sys.path)},
+        # Ctrl-C reaches this process alone, which then ends the others.
+        process_group=0,
+    )

@@ -1,0 +1,86 @@
+"""The history state of a culture in a closed loop, trial by trial, as the simulator of a recording has it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by
+from animat.neurons.memory import MemorySimulator
+from animat.neurons.simulator import NeuronSimulator
+from animat.responses.extraction import SILENCE_S
+from animat.responses.responses import Responses
+
+
+class Remembered(NamedTuple):
+    """The history state after a trial, and when that was: trace and load as in `animat.neurons.history.Memory`."""
+
+    trace: float = 0.0
+    load: float = 0.0
+    at_s: float = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Remembering:
+    """What a response on the culture adds to the history state, by the ranks of a recording's responses.
+
+    Attributes:
+        memory: of the recording's simulator; without memory the state stays as it is at first.
+        added: what a trial adds to the load.
+        sorted_hz: non-burst responses of that recording, all channels as one, rising, shape (responses,).
+        mean_ranks: of each condition's, shape (conditions,).
+    """
+
+    memory: Memory
+    added: float
+    sorted_hz: Float64[np.ndarray, " responses"]
+    mean_ranks: Float64[np.ndarray, " conditions"]
+
+    @classmethod
+    def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
+        """As a simulator of these responses remembers."""
+        ranked = Ranked(responses)
+        memory, added = NO_MEMORY, 0.0
+        if isinstance(simulator, MemorySimulator):
+            memory, added = simulator.memory, float(simulator.added)
+        return cls(memory, added, ranked.sorted_hz, ranked.means)
+
+    def after(
+        self, before: Remembered, condition: int, rate_hz: float, first_s: float, at_s: float, *, is_burst: bool
+    ) -> Remembered:
+        """The state after a trial.
+
+        Args:
+            before: the state after the trial before it; `Remembered()` after silence.
+            condition: that was presented.
+            rate_hz: the response of all channels, Hz a channel.
+            first_s, at_s: its first and its last pulse, s.
+            is_burst: whether the response was a burst, after which nothing is known of the trace.
+        """
+        trace = 0.0 if first_s - before.at_s > SILENCE_S else before.trace
+        below, no_larger = (np.searchsorted(self.sorted_hz, rate_hz, side=side) for side in ("left", "right"))
+        rank = np.array([(below + no_larger) / (2 * len(self.sorted_hz))])
+        (more,) = left_by(rank, float(self.mean_ranks[condition]), self.memory).tolist()
+        trace = 0.5 if is_burst else self.memory.decay * trace + more
+        load_s = self.memory.load_s
+        load = before.load * np.exp((before.at_s - at_s) / load_s) + self.added if load_s else before.load
+        return Remembered(float(trace), float(load), at_s)
+
+    def observed(self, state: Remembered) -> tuple[float, float]:
+        """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""
+        if self.memory == NO_MEMORY:
+            return AT_FIRST
+        return state.trace, state.load if self.memory.load_s else AT_FIRST[1]
+
+    def beside(
+        self, observation: Float64[np.ndarray, " numbers"], state: Remembered
+    ) -> Float64[np.ndarray, " more_numbers"]:
+        """What a policy is given: the robot's observation, then trace and load."""
+        return np.concatenate([observation, self.observed(state)])
+
+    def to_dict(self) -> dict[str, float]:
+        """What it is made with, as plain data."""
+        return {**self.memory._asdict(), "added": self.added}

@@ -1,0 +1,111 @@
+"""A line of the table of predicted and measured returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.evaluation.verdict import Beside
+from animat.records import as_json
+
+_RESAMPLES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        name, meaning: who acted.
+        predicted: returns on the simulator, shape (episodes,).
+        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
+        measured: returns of whole episodes on the culture, shape (episodes,).
+        pulses_per_action: that the culture was given, without the warm-up; so are the next three.
+        seconds_per_action: of the culture's time.
+        bursts: share of responses that were.
+        late: share of trials that came late.
+        beside: the policies' measured returns beside these; None for the policies, and where either has none.
+        met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without one,
+            and where no episode came to its end.
+    """
+
+    name: str
+    meaning: str
+    predicted: Float64[np.ndarray, " predicted"]
+    predicted_anew: Float64[np.ndarray, " bootstraps"]
+    measured: Float64[np.ndarray, " measured"]
+    pulses_per_action: float
+    seconds_per_action: float
+    bursts: float
+    late: float
+    beside: Beside | None = None
+    met: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def prediction(self) -> Interval:
+        """Mean predicted return, and between which it lies as the recording's responses are drawn anew."""
+        return between(self.predicted.mean(), self.predicted_anew)
+
+    @property
+    def gap(self) -> Interval:
+        """Mean measured less mean predicted return; its interval is over recordings and measured episodes drawn anew.
+
+        Its ends are infinite with fewer than two measured episodes. Responses are drawn as if they were independent:
+        a drift between the recording and the loop is not in the interval, and shows as a gap.
+        """
+        value = self.measured.mean() - self.predicted.mean()
+        if len(self.measured) < 2:
+            return Interval(float(value), -np.inf, np.inf, CONFIDENCE)
+        rng = np.random.default_rng(0)
+        measured = resampled_means(self.measured, rng)
+        return between(value, measured - rng.choice(self.predicted_anew, len(measured)))
+
+    @property
+    def gap_sign(self) -> Literal[-1, 0, 1]:
+        """-1 where less was measured than predicted, 1 where more, 0 where that cannot be told."""
+        if not len(self.measured):
+            return 0
+        gap = self.gap
+        return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """The line as plain data."""
+        measured = bool(len(self.measured))
+        return {
+            "name": self.name,
+            "meaning": self.meaning,
+            "predicted": float(self.predicted.mean()),
+            "prediction": as_json(self.prediction.to_dict()),
+            "measured": float(self.measured.mean()) if measured else None,
+            "gap": as_json(self.gap.to_dict()) if measured else None,
+            "episodes": len(self.measured),
+            "measured_returns": self.measured.tolist(),
+            "pulses_per_action": self.pulses_per_action,
+            "seconds_per_action": self.seconds_per_action,
+            "bursts": self.bursts,
+            "late": self.late,
+            "p": None if self.beside is None else self.beside.p,
+            "wins": None if self.beside is None else self.beside.wins,
+            **self.met,
+        }
+
+
+def between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
+    """A value with the interval that holds 95 % of what was drawn anew."""
+    # Of a hundred draws the usual interpolation would hold 93 %.
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
+    return Interval(float(value), float(low), float(high), CONFIDENCE)
+
+
+def resampled_means(
+    returns: Float64[np.ndarray, " episodes"], rng: np.random.Generator
+) -> Float64[np.ndarray, " resamples"]:
+    """Means of returns drawn anew, with replacement."""
+    n = len(returns)
+    often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
+    means: Float64[np.ndarray, " resamples"] = often @ returns / n
+    return means

@@ -1,0 +1,1 @@
+"""Films: a robot, the neurons and the command, in step."""

@@ -1,0 +1,178 @@
+"""One picture of a film: the robot on the left; raster, response, command and return of the last seconds beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from animat.report.film.scene import Moment, Scene
+from animat.report.style import BLUE, ORANGE, RED, condition_colours
+
+WIDTH_PX, HEIGHT_PX = 880, 440
+"""Even, as encoders of films want it."""
+SHOWN_S = 4.0
+"""How far back the strips go."""
+ROBOT_PX = 360
+_PAPER, _INK, _FAINT, _LINE = "#fafaf8", "#343a40", "#868e96", "#dee2e6"
+_LEFT, _RIGHT = 478, WIDTH_PX - 14
+COMMANDS = (ORANGE, BLUE, RED)
+"""Colours of one command after the other."""
+
+
+class Frames:
+    """Draws a scene at any time.
+
+    Args:
+        scene: what is drawn.
+        picture: the robot as it is at a moment, None where it cannot be drawn.
+    """
+
+    def __init__(self, scene: Scene, picture: Callable[[int], UInt8[np.ndarray, "height width 3"] | None]) -> None:
+        self._scene, self._picture = scene, picture
+        self._times_s = np.array([moment.time_s for moment in scene.moments])
+        self._colours = dict(zip(scene.conditions, condition_colours(["Hz"] * len(scene.conditions)), strict=True))
+        rates = np.array([moment.rate_hz for moment in scene.moments if math.isfinite(moment.rate_hz)])
+        # Bursts would press all others to the ground: they are at the upper edge.
+        self._most_hz = _round_up(max(1.0, float(np.percentile(rates, 95)))) if len(rates) else 1.0
+        totals = np.array([moment.total for moment in scene.moments])
+        self._totals = min(0.0, float(totals.min())), max(1.0, float(totals.max()))
+
+    @property
+    def colours(self) -> tuple[str, ...]:
+        """All that pictures have, whenever; robots aside."""
+        return (*self._colours.values(), *COMMANDS, _PAPER, _INK, _FAINT, _LINE, "#ffffff")
+
+    def at(self, time_s: float) -> Image.Image:
+        """The picture of a time."""
+        scene = self._scene
+        now = max(0, int(np.searchsorted(self._times_s, time_s, "right")) - 1)
+        moment = scene.moments[now]
+        image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), _PAPER)
+        draw = ImageDraw.Draw(image)
+        draw.text((14, 12), scene.title, _INK, _font(17))
+        self._draw_robot(image, draw, now)
+        self._draw_words(draw, moment)
+        first = int(np.searchsorted(self._times_s, time_s - SHOWN_S))
+        past = scene.moments[max(0, first - 1) : now + 1]
+        top = 18
+        if scene.n_channels:
+            self._draw_raster(_Strip(draw, (top, 150), time_s, (-1, scene.n_channels), "spikes by channel", ""), time_s)
+            top = 178
+        height = (HEIGHT_PX - 26 - top) // 3
+        strips = [(top + i * height, top + (i + 1) * height - 26) for i in range(3)]
+        response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), "response", "Hz a channel")
+        for each in past:
+            if math.isfinite(each.rate_hz):
+                response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
+        command = _Strip(draw, strips[1], time_s, (-1.0, 1.0), "command", "", zero=True)
+        total = _Strip(draw, strips[2], time_s, self._totals, "return so far", "")
+        for episode in dict.fromkeys(each.episode for each in past):
+            of_it = [each for each in past if each.episode == episode]
+            until_s = time_s if episode == moment.episode else of_it[-1].time_s
+            total.steps([(each.time_s, each.total) for each in of_it], until_s, BLUE)
+            for i in range(scene.robot.n_commands):
+                known = [(each.time_s, np.atleast_1d(each.command)[i]) for each in of_it if each.command is not None]
+                command.steps(known, until_s, COMMANDS[i % len(COMMANDS)])
+        draw.text((_RIGHT, HEIGHT_PX - 8), f"{time_s:.1f} s", _INK, _font(13), anchor="rs")
+        draw.text((_LEFT, HEIGHT_PX - 8), f"-{SHOWN_S:g} s", _FAINT, _font(11), anchor="ls")
+        return image
+
+    def _draw_robot(self, image: Image.Image, draw: ImageDraw.ImageDraw, now: int) -> None:
+        box_px = (400, ROBOT_PX - 30)
+        picture = self._picture(now)
+        if picture is None:
+            draw.text((14 + box_px[0] // 2, 190), "no picture of this robot", _FAINT, _font(14), anchor="mm")
+            return
+        robot = Image.fromarray(picture)
+        robot.thumbnail(box_px, Image.Resampling.BOX)
+        image.paste(robot, (14 + (box_px[0] - robot.width) // 2, 40 + (box_px[1] - robot.height) // 2))
+
+    def _draw_words(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
+        step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration + 1:,}"
+        draw.text((14, HEIGHT_PX - 48), f"{moment.agent}, episode {moment.episode}, {step}", _INK, _font(15))
+        x = 14
+        for label, colour in self._colours.items() if len(self._colours) <= 6 else ():
+            is_now = label == moment.delivered
+            font = _font(14 if is_now else 12)
+            draw.text((x, HEIGHT_PX - 8), label, colour if is_now else _FAINT, font, anchor="ls")
+            x += int(font.getlength(label)) + 14
+        if len(self._colours) > 6 and moment.delivered:
+            draw.text((14, HEIGHT_PX - 8), f"stimulus: {moment.delivered}", _INK, _font(13), anchor="ls")
+
+    def _draw_raster(self, strip: _Strip, time_s: float) -> None:
+        scene = self._scene
+        pulses_s = scene.pulse_times_s
+        for pulse_s in pulses_s[(pulses_s > time_s - SHOWN_S) & (pulses_s <= time_s)].tolist():
+            strip.tick(pulse_s)
+        first, last = np.searchsorted(scene.spike_times_s, (time_s - SHOWN_S, time_s))
+        strip.points(scene.spike_times_s[first:last], scene.spike_channels[first:last])
+
+
+class _Strip:
+    """Something over the last seconds, the newest at the right."""
+
+    def __init__(
+        self,
+        draw: ImageDraw.ImageDraw,
+        rows_px: tuple[int, int],
+        now_s: float,
+        span: tuple[float, float],
+        name: str,
+        unit: str,
+        *,
+        zero: bool = False,
+    ) -> None:
+        self._draw, (self._top, self._bottom), self._now_s, self._span = draw, rows_px, now_s, span
+        draw.rectangle((_LEFT, self._top, _RIGHT, self._bottom), "#ffffff", _LINE)
+        draw.text((_LEFT, self._top - 3), f"{name} ({unit})" if unit else name, _INK, _font(12), anchor="ls")
+        if name != "spikes by channel":
+            for value, row in ((span[1], self._top + 5), (span[0], self._bottom - 4)):
+                draw.text((_LEFT - 5, row), f"{value:,.4g}", _FAINT, _font(11), anchor="rm")
+        if zero:
+            self._draw.line((_LEFT, self._y(0.0), _RIGHT, self._y(0.0)), _LINE)
+
+    def dot(self, time_s: float, value: float, colour: str) -> None:
+        if time_s >= self._now_s - SHOWN_S:
+            self._draw.circle((self._x(time_s), self._y(value)), 3, colour)
+
+    def steps(self, known: Sequence[tuple[float, float]], until_s: float, colour: str) -> None:
+        """What stays as it is until the next one is known."""
+        if not known:
+            return
+        points = []
+        for (time_s, value), (end_s, _) in zip(known, [*known[1:], (until_s, 0.0)], strict=True):
+            points += [(self._x(time_s), self._y(value)), (self._x(end_s), self._y(value))]
+        self._draw.line(points, colour, 2)
+
+    def tick(self, time_s: float) -> None:
+        self._draw.line((self._x(time_s), self._top + 1, self._x(time_s), self._top + 5), RED, 2)
+
+    def points(self, times_s: Float[np.ndarray, " spikes"], rows: Float[np.ndarray, " spikes"]) -> None:
+        x = np.rint(_RIGHT - (self._now_s - times_s) * (_RIGHT - _LEFT) / SHOWN_S)
+        low, high = self._span
+        y = np.rint(self._top + 7 + (high - rows) * (self._bottom - self._top - 8) / (high - low))
+        self._draw.point(np.stack([x, y], axis=1).reshape(-1).tolist(), _INK)
+
+    def _x(self, time_s: float) -> float:
+        return max(_LEFT, _RIGHT - (self._now_s - time_s) * (_RIGHT - _LEFT) / SHOWN_S)
+
+    def _y(self, value: float) -> float:
+        low, high = self._span
+        value = min(max(value, low), high)
+        return self._bottom - 2 - (value - low) * (self._bottom - self._top - 4) / (high - low)
+
+
+def _round_up(value: float) -> float:
+    """To one digit: the end of an axis."""
+    unit = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
+    return math.ceil(value / unit) * unit
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)

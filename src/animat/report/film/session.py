@@ -1,0 +1,132 @@
+"""The scene of a closed-loop session, from its log: whole, or as far as a killed one came."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.closed_loop.gathering import LOG_FILE, expecting_a_session
+from animat.closed_loop.header import read_header
+from animat.closed_loop.session import read_session
+from animat.errors import InvalidArgument, UnusableData
+from animat.goals.robot import robot_of
+from animat.report.film.scene import Moment, Scene
+
+USUAL_S = 60.0
+"""That are shown where nothing else is asked for."""
+
+
+def is_session(path: Path) -> bool:
+    """Whether a path is a session's folder or its log."""
+    return path.name == LOG_FILE or (path / LOG_FILE).exists()
+
+
+def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] | None = None) -> Scene:
+    """What a session's log has of a span.
+
+    Args:
+        path: of its folder or its log.
+        span_s: on the session's clock; None: its first minute.
+
+    Raises:
+        InvalidFile: if there is no session, or its log cannot be read.
+        InvalidArgument: for a span in which nothing happened, or a robot that is not known here.
+        UnusableData: for a session without episodes.
+    """
+    session = read_session(path)
+    file = session.folder / LOG_FILE
+    header, words = read_header(file, session.log.header), session.log.header
+    from_s, to_s = span_s or (0.0, USUAL_S)
+    reading = _Reading(header.conditions)
+    with expecting_a_session(file):
+        reading.window_s = float(words["loop"]["window_ms"][1]) * 1e-3
+        robot_data, seed = words["loop"] | {"robot": words["loop"]["robot"]}, int(words["seed"])
+        for record in session.log.records:
+            if record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s:
+                break
+            reading.add(record.words)
+            if reading.stop_s > from_s - LOOK_BACK_S and len(record.spike_times_s):
+                reading.spikes.append((record.spike_times_s, record.spike_channels))
+    if not reading.moments:
+        raise UnusableData(f"{file}: expected at least one episode, got none: {session.ending.message}")
+    if not from_s < min(reading.stop_s, to_s):
+        raise InvalidArgument(
+            f"span_s: expected a stretch that begins within the session's {reading.stop_s:.1f} s, got {from_s:g} to "
+            f"{to_s:g}"
+        )
+    moments = reading.moments
+    first = max((each.episode for each in moments if each.time_s <= from_s), default=moments[0].episode)
+    # Of a session without any spike, too.
+    seen = [(np.empty(0), np.empty(0, np.int64)), *reading.spikes]
+    times_s, channels = (np.concatenate(each) for each in zip(*seen, strict=True))
+    order = np.argsort(times_s, kind="stable")
+    robot = robot_of(robot_data)
+    return Scene(
+        title=f"{robot.name} on the {words.get('culture', '')} culture",
+        robot=robot,
+        conditions=header.conditions,
+        moments=tuple(each for each in moments if each.episode >= first),
+        start_s=from_s,
+        stop_s=min(reading.stop_s, to_s),
+        spike_times_s=times_s[order],
+        spike_channels=channels[order],
+        pulse_times_s=np.array(reading.pulses_s, np.float64),
+        n_channels=len(header.channels),
+        runner_seed=(seed, 22),
+    )
+
+
+LOOK_BACK_S = 5.0
+"""Before a span, of which spikes and pulses are in its first pictures."""
+
+
+class _Reading:
+    def __init__(self, conditions: tuple[str, ...]) -> None:
+        self.moments: list[Moment] = []
+        self.spikes: list[tuple[np.ndarray, np.ndarray]] = []
+        self.pulses_s: list[float] = []
+        self.stop_s = self.window_s = 0.0
+        self._conditions, self._turns = conditions, Counter[str]()
+        self._starts: dict[int, tuple[float, ...]] = {}
+
+    def add(self, words: dict[str, Any]) -> None:
+        if words["kind"] == "start":
+            self._starts[words["episode"]] = tuple(words["observation"])
+        elif words["kind"] == "seen":
+            if words.get("start_s") is not None:
+                self.stop_s = max(self.stop_s, words["start_s"] + words["duration_s"])
+            if words["tick"]:
+                self._add_tick(words["tick"])
+
+    def _add_tick(self, tick: dict[str, Any]) -> None:
+        before = self.moments[-1] if self.moments else None
+        agent, episode = str(tick["agent"]), int(tick["episode"])
+        self.pulses_s += tick["pulse_time_s"]
+        if before is None or before.episode != episode:
+            # Of a session that is broken off before it moves nothing more is known than where it starts.
+            start = Moment(tick["read_after_s"], agent, episode, -1, self._turns[agent], (), None, 0.0, "", math.nan)
+            before = replace(start, observation=self._starts.get(episode, ()))
+            self._turns[agent] += 1
+            self.moments.append(before)
+        command = tick["command"]
+        self.moments.append(
+            Moment(
+                time_s=float(tick["read_after_s"]) + self.window_s,
+                agent=agent,
+                episode=episode,
+                iteration=int(tick["iteration"]),
+                turn=before.turn,
+                observation=tuple(tick["observation"]) or before.observation,
+                command=tuple(command) if isinstance(command, list) else command,
+                total=before.total + (tick["reward"] or 0.0),
+                delivered=self._conditions[tick["delivered"]] if tick["pulse_time_s"] else "",
+                rate_hz=float(tick["rate_hz"]),
+                ended=bool(tick["terminated"] or tick["truncated"]),
+            )
+        )

@@ -1,0 +1,120 @@
+"""A scene as a film: GIF by Pillow, MP4 by the ffmpeg of imageio-ffmpeg (extra `[film]`)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+
+from PIL import Image
+
+from animat.errors import InvalidArgument, InvalidFile
+from animat.progress import Progress, Silent
+from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames
+from animat.report.film.robot import pictures_of
+from animat.report.film.scene import Scene
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL
+from animat.writing import atomic_write
+
+FRAMES_PER_S = {".mp4": 25, ".gif": 10}
+"""By the kind of film."""
+_COLOURS = 96
+"""Of a GIF."""
+ROBOTS = (ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL)
+"""Colours of robots, which may come later than the first picture."""
+
+
+def check_film(path: str | os.PathLike[str]) -> None:
+    """Refuse a film that cannot be written, before any work.
+
+    Raises:
+        InvalidArgument: for a name that ends otherwise, or where an MP4 needs what is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FRAMES_PER_S:
+        raise InvalidArgument(f"{path}: expected a film's name to end in .mp4 or .gif, got {path.suffix!r}")
+    if path.is_dir():
+        raise InvalidArgument(f"{path}: expected a file for the film, got a folder")
+    if path.suffix.lower() == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise InvalidArgument(
+                f'{path}: an MP4 needs imageio-ffmpeg: pip install "animat[film]"; or end the name in .gif'
+            ) from error
+
+
+def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
+    """Film a scene in real time; the file is complete or absent.
+
+    Args:
+        scene: what is shown.
+        path: of the film, .mp4 or .gif.
+        progress: told how many pictures are drawn.
+
+    Raises:
+        InvalidArgument: as `check_film`.
+        InvalidFile: if it cannot be written.
+    """
+    path, progress = Path(path), progress or Silent()
+    check_film(path)
+    kind = path.suffix.lower()
+    frames = Frames(scene, pictures_of(scene))
+    pictures = _pictures(scene, frames, FRAMES_PER_S[kind], progress)
+    with atomic_write(path) as beside:
+        if kind == ".gif":
+            _write_gif(pictures, frames.colours, beside)
+        else:
+            _write_mp4(pictures, beside)
+    return path
+
+
+def _pictures(scene: Scene, frames: Frames, frames_per_s: int, progress: Progress) -> Iterator[Image.Image]:
+    n = max(1, round((scene.stop_s - scene.start_s) * frames_per_s))
+    for number in range(n):
+        yield frames.at(scene.start_s + number / frames_per_s)
+        progress.update(number + 1, n)
+
+
+def _write_gif(pictures: Iterator[Image.Image], colours: Sequence[str], path: Path) -> None:
+    first = next(pictures)
+    # One palette for all, without dithering: what stands still costs nothing then.
+    every = Image.new("RGB", (first.width, first.height + 20 * (len(colours) + len(ROBOTS))))
+    every.paste(first)
+    swatches: list[str | tuple[int, int, int]] = [*colours, *ROBOTS]
+    for number, colour in enumerate(swatches):
+        row = first.height + 20 * number
+        every.paste(colour, (0, row, first.width, row + 20))
+    palette = every.quantize(_COLOURS, Image.Quantize.MEDIANCUT)
+    # One after the other: all of a long film would not fit into memory.
+    indexed = (each.quantize(palette=palette, dither=Image.Dither.NONE) for each in chain([first], pictures))
+    start = next(indexed)
+    ms = 1000 // FRAMES_PER_S[".gif"]
+    start.save(path, "GIF", save_all=True, append_images=indexed, duration=ms, loop=0, optimize=True)
+
+
+def _write_mp4(pictures: Iterator[Image.Image], path: Path) -> None:
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    # Its own writer forks, which a process with JAX's threads must not.
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH_PX}x{HEIGHT_PX}", "-r", str(FRAMES_PER_S[".mp4"])]
+    made = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path.absolute())]
+    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *given, "-i", "-", *made]
+    pipe = subprocess.PIPE
+    # A session of its own: Ctrl-C is ours alone.
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True) as ffmpeg:
+        assert ffmpeg.stdin is not None
+        try:
+            # What it says when it ends before its time is in the error below.
+            with suppress(BrokenPipeError):
+                for picture in pictures:
+                    ffmpeg.stdin.write(picture.tobytes())
+            _, said = ffmpeg.communicate()
+        except BaseException:
+            ffmpeg.kill()
+            raise
+    if ffmpeg.returncode:
+        raise InvalidFile(f"{path}: cannot be written: {' '.join(said.decode(errors='replace').split())}")

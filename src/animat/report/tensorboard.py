@@ -1,0 +1,58 @@
+"""Learning curves for TensorBoard, through the extra `[tensorboard]`; imported only when asked for."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from animat.errors import InvalidFile
+from animat.extras import expect_extra
+from animat.training.callbacks import CurveRow
+
+
+class TensorBoard:
+    """A callback of `train` that writes each policy's curve as a run of its own: `return` and `episodes`.
+
+        with TensorBoard("runs") as board:
+            train(training, timeline, "policies", callbacks=[board])
+
+    Args:
+        folder: for the runs, `p0`, `p1` and so on; made where it is missing.
+
+    Raises:
+        AnimatError: if tensorboardX is not installed.
+        InvalidFile: when it is entered or called, if the folder cannot be written to.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        board = expect_extra("tensorboardX", package="tensorboardX", extra="tensorboard", what="TensorBoard")
+        self._make, self._folder = board.SummaryWriter, Path(folder)
+        self._writers: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InvalidFile(f"{self._folder}: cannot be made: {error.strerror or error}") from error
+        return self
+
+    def __call__(self, row: CurveRow) -> None:
+        """Write a row; a return that is not known is left out."""
+        try:
+            if row.policy not in self._writers:
+                self._writers[row.policy] = self._make(str(self._folder / row.policy))
+            writer = self._writers[row.policy]
+            writer.add_scalar("episodes", row.episodes, row.iterations)
+            if not math.isnan(row.mean_return):
+                writer.add_scalar("return", row.mean_return, row.iterations)
+        except OSError as error:
+            raise InvalidFile(f"{self._folder}: cannot be written: {error.strerror or error}") from error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for writer in self._writers.values():
+            writer.close()
+        self._writers = {}

@@ -1,0 +1,247 @@
+"""The context study: on several cultures and tasks, whether more than a reflex is asked for, and whose work it is."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import shutil
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from animat.differences import description_in, fingerprint_of, first_difference, of_another
+from animat.errors import InvalidFile
+from animat.execution.jobs import Job, Jobs, expect_workers
+from animat.execution.task import UNFINISHED
+from animat.progress import Progress, Silent
+from animat.studies.context_tasks import (
+    MEASURED,
+    SIMULATED,
+    ContextStudy,
+    Judge,
+    Measure,
+    RecordCulture,
+    TrainPolicies,
+    read_json,
+    rows_by_name,
+    write_json,
+)
+from animat.studies.places import RECEIPTS
+from animat.studies.results import write_records, write_table
+from animat.training.settings import LEARNER
+from animat.writing import exclusive_lock
+
+MANIFEST, TABLE, WHOSE_WORK = "study.json", "context.csv", "whose-work.csv"
+ADMITTED = 0.5
+"""The context gap of a task that needs more than a reflex, on every culture."""
+
+
+@dataclass(frozen=True)
+class ContextRow:
+    """A task on a culture: mean returns on the simulator and, measured, on the culture; None for what is not known.
+
+    Attributes:
+        gap, score: the context gap of the task and the context score of the policies, on the simulator.
+        bits: goal information; None for a robot with one goal alone.
+    """
+
+    culture: int
+    robot: str
+    random: float
+    heuristic: float | None
+    coupling: float | None
+    policies: float
+    optimum: float | None
+    gap: float | None
+    gap_low_95: float | None
+    gap_high_95: float | None
+    score: float | None
+    score_low_95: float | None
+    score_high_95: float | None
+    bits: float | None
+    measured_random: float | None
+    measured_heuristic: float | None
+    measured_coupling: float | None
+    measured_policies: float | None
+    predicted_policies: float
+
+    @property
+    def needs_context(self) -> bool:
+        """Whether a reflex leaves half of the task undone."""
+        return self.gap is not None and self.gap >= ADMITTED
+
+    @property
+    def has_context(self) -> bool:
+        """Whether the policies do more than the best reflex: the whole interval of their score is above 0."""
+        return self.score_low_95 is not None and self.score_low_95 > 0
+
+
+@dataclass(frozen=True)
+class LostRow:
+    """What the policies lose by an intervention, with its 95 % interval over policies, on a culture's simulator."""
+
+    culture: int
+    robot: str
+    intervention: str
+    mean_return: float
+    lost: float
+    lost_low_95: float | None
+    lost_high_95: float | None
+
+
+@dataclass(frozen=True)
+class RanContext:
+    """What a run of the study came to.
+
+    Attributes:
+        folder: of the study.
+        rows: of each culture and robot.
+        lost: of each culture, robot and intervention.
+        done_now: processor seconds of each job that this run did.
+    """
+
+    folder: Path
+    rows: tuple[ContextRow, ...]
+    lost: tuple[LostRow, ...]
+    done_now: dict[str, float]
+
+
+def run_context_study(
+    study: ContextStudy,
+    folder: str | os.PathLike[str],
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> RanContext:
+    """Run the study into a folder, or go on with one: what is done is not done again.
+
+    Args:
+        study: the specification.
+        folder: where everything goes; made if it is missing.
+        workers: processes, each on a core of its own; None: one a core. Not with an executor.
+        executor: where jobs are run, in view of the folder; it stays open. None: processes on this machine.
+        progress: told how far it is, and what runs.
+
+    Raises:
+        Mismatch: if the folder is another study's, or another run is at work in it.
+        InvalidFile: if a file cannot be read or written.
+        InvalidArgument: for fewer workers than one, or any beside an executor.
+        AnimatError: if a job failed; its message names the job.
+    """
+    expect_workers(workers, executor)
+    folder = Path(folder).absolute()
+    manifest = _describe(study)
+    # Seen before it is touched: somebody else's folder stays as it is.
+    is_ours = _is_ours(folder, manifest)
+    with exclusive_lock(folder):
+        if not is_ours:
+            write_json(folder / MANIFEST, manifest)
+        left = Jobs(_plan(study), folder, folder / RECEIPTS, manifest["fingerprint"])
+        took_s = {}
+        if left.waiting:
+            took_s = left.run(workers=workers, executor=executor, progress=progress or Silent())
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        pairs = [(culture, robot) for robot in study.robots for culture in study.cultures]
+        rows = tuple(_row(folder, *pair) for pair in pairs)
+        lost = tuple(row for pair in pairs for row in _lost(folder, *pair))
+        write_records(folder / TABLE, ContextRow, rows)
+        write_table(
+            folder / WHOSE_WORK, list(LostRow.__dataclass_fields__), [tuple(asdict(row).values()) for row in lost]
+        )
+    return RanContext(folder, rows, lost, took_s)
+
+
+def _describe(study: ContextStudy) -> dict[str, Any]:
+    from animat.cultures.tissue.parameters import REVISION
+
+    packages = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba")
+    versions = {name: importlib.metadata.version(name) for name in packages}
+    versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
+    told = json.loads(json.dumps({"context study": asdict(study), "versions": versions}))
+    return {**told, "fingerprint": fingerprint_of(told)}
+
+
+def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
+    found = description_in(folder / MANIFEST, "study")
+    if found is None:
+        if folder.is_dir() and any(not each.name.startswith(".") for each in folder.iterdir()):
+            raise InvalidFile(
+                f"{folder}: expected an empty folder or one of this study, got one with other files in it"
+            )
+        return False
+    if found["fingerprint"] != manifest["fingerprint"]:
+        raise of_another(folder, "study", first_difference(found, manifest, ignoring=("fingerprint",)))
+    return True
+
+
+def _plan(study: ContextStudy) -> list[Job]:
+    jobs = []
+    for culture in study.cultures:
+        recorded = f"record/{culture}"
+        jobs.append(Job(recorded, RecordCulture(study, culture), (), 60))
+        for robot in study.robots:
+            trained = f"train/{culture}/{robot}"
+            jobs += [
+                Job(trained, TrainPolicies(study, culture, robot), (recorded,), 30),
+                Job(f"judge/{culture}/{robot}", Judge(study, culture, robot), (trained,), 100),
+                Job(f"measure/{culture}/{robot}", Measure(study, culture, robot), (trained,), 100),
+            ]
+    return jobs
+
+
+def _row(folder: Path, culture: int, robot: str) -> ContextRow:
+    told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)
+    in_turn = read_json(folder / f"culture-{culture}" / robot / MEASURED)["rows"]
+    measured = rows_by_name(in_turn)
+    simulated = rows_by_name(told["rows"])
+    gap = (told["context"] or {}).get("context_gap") or {}
+    score = told["context_score"] or {}
+    information = told["whose_work"]["rows"][0]["goal_information"]
+
+    def in_loop(name: str) -> float | None:
+        return measured[name]["measured"] if name in measured else None
+
+    def on_simulator(name: str) -> float | None:
+        return simulated[name]["mean_return"] if name in simulated else None
+
+    return ContextRow(
+        culture=culture,
+        robot=robot,
+        random=simulated["random"]["mean_return"],
+        heuristic=on_simulator("heuristic"),
+        coupling=on_simulator("coupling"),
+        policies=simulated["policies"]["mean_return"],
+        optimum=None if told["optimum"] is None else told["optimum"]["value"],
+        gap=gap.get("value"),
+        gap_low_95=gap.get("low"),
+        gap_high_95=gap.get("high"),
+        score=score.get("value"),
+        score_low_95=score.get("low"),
+        score_high_95=score.get("high"),
+        bits=None if information is None else information["bits"]["value"],
+        measured_random=in_loop("random"),
+        measured_heuristic=in_loop("heuristic"),
+        measured_coupling=in_loop("coupling"),
+        # All of them together; of one alone its own row.
+        measured_policies=in_turn[0]["measured"],
+        predicted_policies=in_turn[0]["predicted"],
+    )
+
+
+def _lost(folder: Path, culture: int, robot: str) -> list[LostRow]:
+    told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)["whose_work"]["rows"]
+    return [
+        LostRow(
+            culture=culture,
+            robot=robot,
+            intervention=row["name"],
+            mean_return=row["mean_return"],
+            lost=row["lost"]["value"],
+            lost_low_95=row["lost"]["low"],
+            lost_high_95=row["lost"]["high"],
+        )
+        for row in told[1:]
+    ]

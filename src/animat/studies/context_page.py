@@ -1,0 +1,171 @@
+"""The page of the context study: figures first, then what holds on how many cultures, then every number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from animat.report.context import Estimate, draw_context, draw_whose_work
+from animat.report.html import Picture, Section, Table, cell, write_page
+from animat.report.style import FORMATS, save_figure
+from animat.studies.context import ADMITTED, TABLE, WHOSE_WORK, ContextRow, LostRow, RanContext
+from animat.studies.context_tasks import ContextStudy
+from animat.studies.places import REPORT
+
+_GAPS, _LOST = "context", "whose-work"
+
+
+def write_context_page(study: ContextStudy, found: RanContext) -> Path:
+    """Write the page and its figures beside it."""
+    by_robot = {robot: [row for row in found.rows if row.robot == robot] for robot in study.robots}
+    gaps, scores = (
+        {robot: [_estimate(row, name) for row in rows] for robot, rows in by_robot.items()} for name in ("gap", "score")
+    )
+    lost = _shares_lost(found.rows, found.lost)
+    figures = {_GAPS: draw_context(gaps, scores, ADMITTED)} | ({_LOST: draw_whose_work(lost)} if lost else {})
+    for name, figure in figures.items():
+        for ending in FORMATS:
+            save_figure(figure, found.folder / f"{name}.{ending}")
+    sections = [
+        Section("Results in short", points=tuple((robot, in_short(rows)) for robot, rows in by_robot.items()),
+                pictures=(_context_picture(study, found.folder),)),
+        _whose_work(study, found, lost),
+        Section("Every culture", tables=(_table(found.rows),)),
+    ]  # fmt: skip
+    cultures = ", ".join(map(str, study.cultures))
+    lead = (
+        f"Virtual cultures {cultures}; {study.policies} policies of each robot on every one, on the simulator and in "
+        "closed loop on the culture."
+    )
+    return write_page(
+        found.folder / REPORT, "Does it need context, and whose work is it?", lead, sections, [f"Seed {study.seed}."]
+    )
+
+
+def _whose_work(study: ContextStudy, found: RanContext, lost: dict[str, dict[str, list[float]]]) -> Section:
+    """What the policies lose, on cultures on which they have something to lose."""
+    left_out = [f"{row.robot} on culture {row.culture}" for row in found.rows if not _has_something(row)]
+    told = (f"Left out, as the policies are hardly above random stimuli: {', '.join(left_out)}.",) if left_out else ()
+    if not lost:
+        return Section("Whose work is it?", told)
+    return Section(
+        "Whose work is it?", told, pictures=(_lost_picture(study, found.folder),), tables=(_lost_table(lost),)
+    )
+
+
+def _has_something(row: ContextRow) -> bool:
+    """Whether the policies are above random stimuli by a tenth of the way to the best that is known."""
+    best = max(each for each in (row.optimum, row.policies, row.coupling) if each is not None)
+    return row.policies - row.random > 0.1 * (best - row.random) > 0
+
+
+def in_short(rows: Sequence[ContextRow]) -> str:
+    """In two sentences, of one robot on all cultures: what the task asks for, and what the policies do."""
+    n, needs = sum(row.gap is not None for row in rows), sum(row.needs_context for row in rows)
+    if not n:
+        return "The context gap is not known, as no optimal return is."
+    has = sum(row.has_context for row in rows)
+    gaps = [row.gap for row in rows if row.gap is not None]
+    between = f" (context gap {_range(gaps)})" if gaps else ""
+    asked = f"A reflex leaves half of the task or more undone on {needs} of {n} cultures{between}."
+    scores = [row.score for row in rows if row.score is not None]
+    scored = f" (context score {_range(scores)})" if scores else ""
+    return f"{asked} The policies do significantly more than the best reflex on {has} of {n}{scored}."
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = (f"{value:.2f}".replace("-", "−") for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def _estimate(row: ContextRow, name: str) -> Estimate:
+    return Estimate(*(getattr(row, each) for each in (name, f"{name}_low_95", f"{name}_high_95")))
+
+
+def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[str, dict[str, list[float]]]:
+    """By robot and intervention: what was lost in parts of what the policies have over random stimuli."""
+    over_random = {(row.culture, row.robot): row.policies - row.random for row in rows if _has_something(row)}
+    shares: dict[str, dict[str, list[float]]] = {}
+    for row in lost:
+        span = over_random.get((row.culture, row.robot))
+        if span is not None:
+            shares.setdefault(row.robot, {}).setdefault(row.intervention, []).append(row.lost / span)
+    return shares
+
+
+def _context_picture(study: ContextStudy, folder: Path) -> Picture:
+    return Picture(
+        folder / f"{_GAPS}.png",
+        "Context gaps and context scores",
+        "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
+        f"random); from the dashed line on a task is taken to need context. Right: how far the {study.policies} "
+        "policies come from that reflex to the optimum. A point is a culture, with its 95 % interval on the culture's "
+        "simulator.",
+        (*(f"{_GAPS}.{ending}" for ending in FORMATS[1:]), TABLE),
+    )
+
+
+def _lost_picture(study: ContextStudy, folder: Path) -> Picture:
+    return Picture(
+        folder / f"{_LOST}.png",
+        "Return lost by each intervention",
+        "The same policies with the culture, what it is given, or what is made of its answer changed. 0: nothing is "
+        "lost; 1: all that the policies have over random stimuli; below 0: something is gained. A point is a culture: "
+        f"the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator.",
+        (*(f"{_LOST}.{ending}" for ending in FORMATS[1:]), WHOSE_WORK),
+    )
+
+
+def _lost_table(lost: dict[str, dict[str, list[float]]]) -> Table:
+    names = list(dict.fromkeys(name for each in lost.values() for name in each))
+    rows = [(name, *(float(np.mean(each[name])) if name in each else None for each in lost.values())) for name in names]
+    note = "Mean over cultures of the return lost, in parts of what the policies have over random stimuli."
+    return Table("Lost", ("", *lost), tuple(rows), note=note, beside=WHOSE_WORK)
+
+
+def _table(rows: Sequence[ContextRow]) -> Table:
+    head = (
+        "robot",
+        "culture",
+        "random",
+        "heuristic",
+        "best coupling",
+        "policies",
+        "optimum",
+        "gap",
+        "score, 95 %",
+        "bits",
+        "measured: random",
+        "measured: heuristic",
+        "measured: best coupling",
+        "measured: policies",
+        "predicted: policies",
+    )
+    cells = tuple(
+        (
+            row.robot,
+            row.culture,
+            row.random,
+            row.heuristic,
+            row.coupling,
+            row.policies,
+            row.optimum,
+            None if row.gap is None else f"{row.gap:.2f}".replace("-", "−"),
+            None if row.score is None else f"{cell(row.score)} ({cell(row.score_low_95)} to {cell(row.score_high_95)})",
+            row.bits,
+            row.measured_random,
+            row.measured_heuristic,
+            row.measured_coupling,
+            row.measured_policies,
+            row.predicted_policies,
+        )
+        for row in rows
+    )
+    note = (
+        "Mean returns on the simulator of the last recording; measured: in closed loop on the culture, from where its "
+        "recordings ended, beside the returns predicted for the same policies. Bits: goal information, of robots with "
+        "several goals."
+    )
+    return Table("Tasks and cultures", head, cells, note=note, beside=TABLE)

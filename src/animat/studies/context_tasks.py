@@ -1,0 +1,255 @@
+"""Parts of the context study as tasks: record a culture, train on it, judge the policies, and run them on it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from animat.errors import AnimatError, InvalidArgument
+from animat.execution.task import UNFINISHED, Task
+from animat.execution.training import train_into
+from animat.progress import Progress
+from animat.records import Positive, Seed, Whole, as_json, record
+from animat.responses.responses import Responses
+from animat.studies.draws import draw_seed
+from animat.writing import atomic_write
+
+RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
+SIMULATED, MEASURED = "simulated.json", "measured.json"
+
+
+@record
+class ContextStudy:
+    """Which tasks, on which virtual cultures, and how much of everything.
+
+    Attributes:
+        cultures: seeds of virtual cultures, each recorded as it will run (`animat.stimulation.protocol.CLOSED_LOOP`).
+        robots: by name; each with one command, a best coupling and an optimal return.
+        policies: trained for each robot and culture.
+        iterations_share: of the robot's own number of iterations.
+        episodes: of each policy and control, on the simulator.
+        episodes_measured: of each policy, on the culture.
+        optimum_resolution: of the grid of the optimal return (`animat.evaluation.optimum`).
+        seed: decides every draw of training and evaluation.
+    """
+
+    cultures: tuple[Seed, ...] = (1, 2, 3, 4, 5)
+    robots: tuple[str, ...] = ("cartpole", "navigation", "swing-up", "shuttle")
+    policies: Whole = 4
+    iterations_share: Positive = 0.5
+    episodes: Whole = 400
+    episodes_measured: Whole = 5
+    optimum_resolution: Positive = 0.5
+    seed: Seed = 1
+
+    def __post_init__(self) -> None:
+        from animat.robots.grid import no_grid
+        from animat.robots.host import HostRobot
+        from animat.robots.registry import robot_named
+
+        for what in ("cultures", "robots"):
+            given = getattr(self, what)
+            if not given or len(set(given)) < len(given):
+                raise InvalidArgument(f"{what}: expected at least one, each once, got {given}")
+        for name in self.robots:
+            robot = robot_named(name)
+            if robot.n_commands != 1 or isinstance(robot, HostRobot) or no_grid(robot) is not None:
+                raise InvalidArgument(
+                    f"robots: expected ones in JAX with one command and an optimal return, got {name!r}"
+                )
+
+
+def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
+    """Every step, with less of everything: a first look, no results."""
+    return ContextStudy(
+        cultures=tuple(cultures),
+        policies=2,
+        iterations_share=0.1,
+        episodes=30,
+        episodes_measured=1,
+        optimum_resolution=0.25,
+        seed=seed,
+    )
+
+
+@dataclass(frozen=True)
+class ContextTask(Task):
+    """A part of the study on one culture.
+
+    Attributes:
+        study: the specification.
+        culture: its seed.
+    """
+
+    study: ContextStudy
+    culture: int
+
+    @property
+    def grows_with(self) -> Mapping[str, object]:
+        return {"policies": self.study.policies, "episodes": self.study.episodes}
+
+    def at(self, folder: Path) -> Path:
+        """The culture's folder."""
+        return folder / f"culture-{self.culture}"
+
+    def series(self, folder: Path) -> list[Responses]:
+        """The responses of its recordings."""
+        from animat.recordings.reading import read_sources
+        from animat.responses.series import extract_series
+
+        return extract_series(read_sources([self.at(folder) / RECORDINGS]))
+
+
+@final
+@dataclass(frozen=True)
+class RecordCulture(ContextTask):
+    """Record the culture twice, five minutes apart."""
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
+        from animat.cultures.virtual import VirtualCulture
+        from animat.stimulation.protocol import CLOSED_LOOP
+
+        out = self.at(folder) / RECORDINGS
+        files = record_virtual_series(
+            lambda: VirtualCulture(self.culture),
+            CLOSED_LOOP,
+            out,
+            sessions=2,
+            interval_min=5.0,
+            needs_state=True,
+            progress=progress,
+        )
+        return [*files, out / STATE_FILE, out / SELECTION_FILE]
+
+
+@dataclass(frozen=True)
+class RobotTask(ContextTask):
+    """A part of the study with one robot.
+
+    Attributes:
+        robot: its name.
+    """
+
+    robot: str
+
+    def drawn(self, what: str) -> int:
+        """A seed of its own for each culture and robot: else sessions of all begin at the same few starts."""
+        return draw_seed(what, self.study.seed, self.robot, str(self.culture))
+
+    def beside(self, folder: Path, name: str) -> Path:
+        """A file or folder of this robot on this culture."""
+        return self.at(folder) / self.robot / name
+
+
+@final
+@dataclass(frozen=True)
+class TrainPolicies(RobotTask):
+    """Train the policies as `animat train` does by default, going on from where a killed run stopped."""
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        from animat.coding.mapping import mapping_named
+        from animat.neurons.timeline import fit_timeline
+        from animat.robots.registry import robot_named
+        from animat.training.folder import describe, provenance_of, write_description
+        from animat.training.group import Group
+        from animat.training.specification import Training
+
+        robot, timeline = robot_named(self.robot), fit_timeline(self.series(folder))
+        training = Training(
+            robot=robot,
+            mapping=mapping_named("9-thresholds"),
+            policies=self.study.policies,
+            iterations=int(self.study.iterations_share * robot.paper_iterations),
+            seed=self.drawn("context"),
+            shadowing=True,
+        ).over(timeline)
+        manifest = describe(training, timeline)
+        out = self.beside(folder, POLICIES)
+        members = tuple(range(training.policies))
+        group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
+        checkpoint = folder / UNFINISHED / f"culture-{self.culture}" / f"{self.robot}.npz"
+        return [*train_into(out, group, checkpoint, progress), write_description(out, manifest)]
+
+
+@final
+@dataclass(frozen=True)
+class Judge(RobotTask):
+    """On the simulator: policies, controls, best coupling, optimum, context gap and score, and whose work it is."""
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        from animat.evaluation.table import evaluate
+        from animat.neurons.timeline import fit_timeline
+        from animat.training.policy import load_policies
+
+        evaluation = evaluate(
+            load_policies(self.beside(folder, POLICIES)),
+            fit_timeline(self.series(folder)),
+            episodes=self.study.episodes,
+            seed=self.drawn("judge"),
+            optimum_resolution=self.study.optimum_resolution,
+            interventions=True,
+            progress=progress,
+        )
+        return [write_json(self.beside(folder, SIMULATED), evaluation.to_dict())]
+
+
+@final
+@dataclass(frozen=True)
+class Measure(RobotTask):
+    """In closed loop on the culture, from where its recordings ended, with controls between the policies' episodes."""
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        from animat.cultures.series import STATE_FILE
+        from animat.cultures.virtual import VirtualCulture
+        from animat.reality_gap import Calibration, run_policies
+        from animat.stimulation.protocol import CLOSED_LOOP
+        from animat.training.policy import load_policies
+
+        policies = load_policies(self.beside(folder, POLICIES))
+        calibration = Calibration.of_series(self.series(folder), next(iter(policies.values())))
+        session = self.beside(folder, SESSION)
+        # Of a run that was killed: its culture is gone with it.
+        shutil.rmtree(session, ignore_errors=True)
+        culture = VirtualCulture(self.culture)
+        culture.restore_state(self.at(folder) / RECORDINGS / STATE_FILE)
+        with culture:
+            gap = run_policies(
+                policies,
+                culture,
+                calibration,
+                session,
+                episodes=self.study.episodes_measured,
+                with_coupling=True,
+                seed=self.drawn("measure"),
+                pulse=CLOSED_LOOP.pulse,
+                patterns=CLOSED_LOOP.patterns,
+                progress=progress,
+            )
+        if gap.session.ending.by != "plan":
+            raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to go on")
+        told = gap.to_dict()
+        # The session is told by its folder, with the times at which it ran.
+        kept = {name: told[name] for name in ("robot", "mapping", "rows", "optimum", "verdict", "reasons")}
+        return [write_json(self.beside(folder, MEASURED), kept)]
+
+
+def write_json(path: Path, words: Any) -> Path:
+    """Plain data as a file, whole or absent."""
+    with atomic_write(path) as beside:
+        beside.write_text(json.dumps(as_json(words), indent=1, sort_keys=True) + "\n")
+    return path
+
+
+def read_json(path: Path) -> Any:
+    """What `write_json` wrote."""
+    return json.loads(path.read_text())
+
+
+def rows_by_name(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Rows of a table that was written, by their names."""
+    return {row["name"]: row for row in rows}

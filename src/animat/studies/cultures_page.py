@@ -1,0 +1,79 @@
+"""The page of a study over many cultures: what holds over all of them, then each, with the way to its own report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from animat.report.html import Picture, Section, Table, write_page
+from animat.report.over_cultures import Compared, draw_over_cultures
+from animat.report.style import FORMATS, save_figure
+from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
+from animat.studies.places import REPORT
+from animat.studies.specification import Study
+from animat.studies.tabulating import LEVEL
+
+
+def write_cultures_page(study: Study, found: RanCultures) -> Path:
+    """Write the page and its figure beside it."""
+    sections = []
+    if found.summary:
+        drawn = [_drawn(found, i, row) for i, row in enumerate(found.summary)]
+        figure = draw_over_cultures(drawn)
+        for ending in FORMATS:
+            save_figure(figure, found.folder / f"over-cultures.{ending}")
+        sections.append(_in_short(study, found))
+    sections.append(_each(found))
+    cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
+    lead = f"{cultures}; {len(study.arms)} arms with {study.policies} policies each on every one."
+    return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
+
+
+def _drawn(found: RanCultures, i: int, row: OverCultures) -> Compared:
+    of_each = [rows[i] for rows in found.comparisons.values()]
+    differences = tuple(each.mean_second - each.mean_first for each in of_each)
+    return Compared(row.comparison, row.robot, differences, row.difference, row.low_95, row.high_95)
+
+
+def _in_short(study: Study, found: RanCultures) -> Section:
+    n = len(found.ran)
+    points = tuple(
+        (f"{row.robot}, {row.comparison}", f"the second arm was better in {row.holds_in} of {n} cultures.")
+        for row in found.summary
+    )
+    head = ("comparison", "robot", "mean first", "mean second", "difference", "95 % interval", "better in")
+    rows = tuple(
+        (
+            row.comparison,
+            row.robot,
+            row.mean_first,
+            row.mean_second,
+            row.difference,
+            "–" if row.low_95 is None else f"{row.low_95:.1f} to {row.high_95:.1f}".replace("-", "−"),
+            f"{row.holds_in} of {row.cultures}",
+        )
+        for row in found.summary
+    )
+    table = Table(
+        "Over cultures",
+        head,
+        rows,
+        note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
+        "narrow of fewer than ten.",
+        beside=SUMMARY,
+    )
+    picture = Picture(
+        found.folder / "over-cultures.png",
+        "Differences on each culture",
+        "A point is a culture: the mean return of the second arm's policies less that of the first's; right of 0 the "
+        "second arm is better. Above each row of points their mean with its 95 % interval, of "
+        f"{len(found.comparisons)} cultures.",
+        ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
+    )
+    said = f"The second arm counts as better in a culture at p < {LEVEL:g}, as in its own report."
+    return Section("Results in short", (said,), points, (table,), (picture,))
+
+
+def _each(found: RanCultures) -> Section:
+    points = [(name, f"finished: {name}/{REPORT}") for name in found.ran]
+    points += [(name, f"failed: {why}") for name, why in found.failed.items()]
+    return Section("Each culture", points=tuple(points))

@@ -1,0 +1,80 @@
+"""A study's policies beside the best coupling: whether a task needs more than a reflex, and what they do beyond one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+from animat.evaluation.coupling import context_gap
+from animat.evaluation.optimum import Optimum
+from animat.evaluation.statistics import Interval
+from animat.studies.episodes import COUPLING, POLICY, RANDOM, mean_returns
+from animat.studies.evaluating import is_usual
+from animat.studies.results import BesideReflex, StudyOptimum
+from animat.studies.specification import RobotSpec, Study, named_mapping
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+def beside_reflex(
+    study: Study, table: DataFrame, spec: RobotSpec, optima: Iterable[StudyOptimum]
+) -> Iterator[BesideReflex]:
+    """Each arm that is trained as usual, at the minute at which the best coupling was run too.
+
+    Where there is no optimal return of all conditions there is no context gap, and no row.
+
+    Args:
+        table: of episodes.
+        optima: of all robots.
+    """
+    at = table[(table["robot"] == spec.name) & ~table["over_time"]]
+    known = {
+        (each.mapping, each.percentiles, each.at_min): each
+        for each in optima
+        if each.robot == spec.name and each.left_out is None and each.best_return is not None
+    }
+    for arm in study.arms:
+        if not is_usual(arm):
+            continue
+        of = at[at["arm"] == named_mapping(arm.mapping, arm.percentiles)]
+        for at_min, coupled in of[of["agent"] == COUPLING].groupby("at_min")["return"]:
+            best = known.get((arm.mapping, arm.percentiles, at_min))
+            policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY) & (at["at_min"] == at_min)]
+            if best is None or not len(policies):
+                continue
+            random = of[(of["agent"] == RANDOM) & (of["at_min"] == at_min)]["return"].to_numpy()
+            nan = float("nan")
+            optimum = Optimum(best.best_return or 0.0, best.grid_error or 0.0, nan, nan, nan, nan, 0, 0)
+            context = context_gap(coupled.to_numpy(), random, optimum)
+            gap, score = context.gap, context.score(mean_returns(policies), optimum)
+            yield BesideReflex(
+                spec.name,
+                arm.name,
+                at_min,
+                context.coupling,
+                context.standard_error if len(coupled) > 1 else None,
+                optimum.value,
+                *_ends(gap),
+                context.needs_context,
+                *_ends(score),
+            )
+
+
+def reflexes_told(rows: Iterable[BesideReflex]) -> list[str]:
+    """A sentence for each row of which the gap is known."""
+    told = []
+    for row in rows:
+        if row.gap is None:
+            continue
+        where = f"{row.robot}, {row.arm}, at {row.at_min:g} min: the best reflex returns {row.coupling:.1f}"
+        if not row.needs_context:
+            told.append(f"{where}; the task needs no more than that.")
+        else:
+            score = "" if row.score is None else f"; the policies' context score is {row.score:.2f}"
+            told.append(f"{where}; the task needs more{score}.")
+    return told
+
+
+def _ends(interval: Interval | None) -> tuple[float | None, float | None, float | None]:
+    return (None, None, None) if interval is None else (interval.value, interval.low, interval.high)

@@ -1,0 +1,198 @@
+"""What the page asks for: its own files, what there is to watch, and each view of it."""
+
+from __future__ import annotations
+
+import functools
+import importlib.resources
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from animat.errors import AnimatError, InvalidArgument, first_line
+from animat.watch.found import Kind, find, place_within
+from animat.watch.guard import App, Guard
+from animat.watch.picture import picture_of
+from animat.watch.plain import text
+from animat.watch.recording import RecordingView
+from animat.watch.session import SessionView
+from animat.watch.stopping import stop_session
+from animat.watch.study import StudyView
+from animat.watch.training import TrainingView
+from animat.watch.tuning import TuningView
+
+_FILES = {
+    "": ("index.html", "text/html"),
+    "style.css": ("style.css", "text/css"),
+    "icon.svg": ("icon.svg", "image/svg+xml"),
+    **{name: (name, "text/javascript") for name in ("page.js", "draw.js", "session.js", "blocks.js")},
+}
+"""Of the page, by their addresses."""
+_MOST_VIEWS = 8
+"""That are kept open."""
+
+
+class View(Protocol):
+    """Something that is watched."""
+
+    def about(self) -> dict[str, Any]:
+        """What does not change while it goes on."""
+
+    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """How it is, in the seconds before a time."""
+
+    def close(self) -> None:
+        """Let go of files."""
+
+
+_VIEWS: dict[Kind, Callable[[Path], View]] = {
+    "session": SessionView,
+    "training": TrainingView,
+    "study": StudyView,
+    "tuning": TuningView,
+    "recording": RecordingView,
+}
+
+
+class Watched:
+    """A folder and the views of what is in it; asked by one thread at a time.
+
+    Args:
+        folder: that is watched; it may come to be later.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._views: OrderedDict[tuple[str, str], View] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def things(self) -> dict[str, Any]:
+        """What there is."""
+        found = [
+            {"kind": each.kind, "place": each.place, "changed_s": each.changed_s}
+            for each in find(self.folder)
+            # A name that is no text cannot be asked for.
+            if text(each.place, 4096) == each.place
+        ]
+        return {"folder": text(self.folder.name or str(self.folder)), "things": found}
+
+    def about(self, kind: str, place: str) -> dict[str, Any]:
+        """What something is."""
+        with self._lock:
+            return self._view(kind, place).about()
+
+    def view(self, kind: str, place: str, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """How it is."""
+        with self._lock:
+            return self._view(kind, place).view(to_s, span_s)
+
+    def picture(self, place: str, at: int) -> bytes | None:
+        """The robot of a session at a record, as PNG."""
+        with self._lock:
+            view = self._session(place)
+            tick, robot = view.tick_at(at), view.robot_data
+        return None if tick is None else picture_of(robot, *tick)
+
+    def stop(self, place: str) -> None:
+        """End a session; nothing else is waited for."""
+        stop_session(place_within(self.folder, place))
+
+    def _session(self, place: str) -> SessionView:
+        view = self._view("session", place)
+        assert isinstance(view, SessionView)
+        return view
+
+    def _view(self, kind: str, place: str) -> View:
+        key = kind, place
+        if key not in self._views:
+            if kind not in _VIEWS:
+                raise InvalidArgument(f"kind: expected one of {', '.join(_VIEWS)}, got {text(kind, 40)}")
+            self._views[key] = _VIEWS[kind](place_within(self.folder, place))
+            if len(self._views) > _MOST_VIEWS:
+                self._views.popitem(last=False)[1].close()
+        self._views.move_to_end(key)
+        return self._views[key]
+
+
+def app_for(folder: Path, token: str, port: int) -> App:
+    """The page of a folder as an ASGI application, guarded."""
+    from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.routing import Route
+
+    watched = Watched(folder)
+    pages = {address: (_file(name), kind) for address, (name, kind) in _FILES.items()}
+
+    async def file(request: Request) -> Response:
+        content, kind = pages[request.url.path.removeprefix("/")]
+        return Response(content, media_type=kind)
+
+    def answering(answer: Callable[[Any], Any]) -> Callable[[Request], Any]:
+        @functools.wraps(answer)
+        async def endpoint(request: Request) -> Response:
+            status, body = 200, b"{}"
+            try:
+                found = await run_in_threadpool(answer, request.query_params)
+                if isinstance(found, bytes):
+                    return Response(found, media_type="image/png")
+                body = json.dumps(found, allow_nan=False).encode()
+            except AnimatError as error:
+                status, body = 409, _told(str(error))
+            except Exception as error:
+                # Anything may be in a file.
+                status, body = 500, _told(f"cannot be shown: {first_line(error)}")
+            return Response(body, status, media_type="application/json")
+
+        return endpoint
+
+    def picture(asked: Any) -> bytes:
+        found = watched.picture(asked.get("in", ""), int(_number(asked, "at") or 0))
+        if found is None:
+            raise InvalidArgument("at: no picture of the robot there")
+        return found
+
+    def stop(asked: Any) -> dict[str, Any]:
+        watched.stop(asked.get("in", ""))
+        return {"stopped": True}
+
+    routes = [Route(f"/{address}", file) for address in pages]
+    routes += [
+        Route("/things", answering(lambda asked: watched.things())),
+        Route("/about", answering(lambda asked: watched.about(asked.get("kind", ""), asked.get("in", "")))),
+        Route(
+            "/view",
+            answering(
+                lambda asked: watched.view(
+                    asked.get("kind", ""), asked.get("in", ""), _number(asked, "to"), _number(asked, "span") or 8.0
+                )
+            ),
+        ),
+        Route("/robot.png", answering(picture)),
+        Route("/stop", answering(stop), methods=["POST"]),
+    ]
+    return Guard(Starlette(routes=routes), token, port)
+
+
+def _file(name: str) -> bytes:
+    return (importlib.resources.files("animat.watch") / "page" / name).read_bytes()
+
+
+def _told(message: str) -> bytes:
+    return json.dumps({"error": text(" ".join(message.split()), 1000)}).encode()
+
+
+def _number(asked: Any, name: str) -> float | None:
+    given = asked.get(name)
+    if given is None:
+        return None
+    try:
+        value = float(given)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < 1e15:
+        raise InvalidArgument(f"{name}: expected a number, got {text(given, 40)}")
+    return value

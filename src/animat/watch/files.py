@@ -1,0 +1,100 @@
+"""Small files of a run that may be at work: whole, or as if they were not there."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.errors import InvalidFile
+from animat.plain_file import read_plain_text
+from animat.watch.plain import listed, number, text
+
+_MOST_BYTES = 2**24
+_MOST_CURVE_BYTES = 2**22
+_MOST_EPISODES_BYTES = 2**27
+
+
+def json_of(path: Path) -> Any:
+    """What a file of JSON holds; None where there is none that can be read."""
+    try:
+        return json.loads(read_plain_text(path, _MOST_BYTES))
+    except (InvalidFile, ValueError, RecursionError):
+        return None
+
+
+def told_by_jobs(folder: Path) -> dict[str, tuple[float, str, float]]:
+    """What running jobs told last: of each its share, a remark, and when that was."""
+    found = {}
+    for path in sorted(folder.glob("*.json"))[:1000]:
+        told = listed(json_of(path))
+        try:
+            changed_s = path.stat().st_mtime
+        except OSError:
+            continue
+        if len(told) == 2 and number(told[0]) is not None:
+            found[path.stem.replace("+", "/")] = (float(told[0]), text(told[1]), changed_s)
+    return found
+
+
+def curve_of_checkpoint(path: Path) -> Float64[np.ndarray, "chunks policies columns"] | None:
+    """The learning curves in a checkpoint; None where there is none that can be read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            member = archive.getinfo("curve.npy")
+            if member.file_size > _MOST_CURVE_BYTES:
+                return None
+            with archive.open(member) as file:
+                content = file.read(_MOST_CURVE_BYTES)
+        curve = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive
+        return None
+    return (
+        np.asarray(curve, np.float64) if curve.ndim == 3 and curve.shape[2] == 3 and curve.dtype.kind == "f" else None
+    )
+
+
+def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
+    """The learning curve in a policy's file; None where there is none that can be read."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            curve = file.get_tensor("learning_curve")
+    except (OSError, SafetensorError, ValueError, TypeError):
+        return None
+    return np.asarray(curve, np.float64) if curve.ndim == 2 and curve.shape[1] == 3 else None
+
+
+def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
+    """Of an arm's episodes in a study: mean return, and of how many policies and episodes; None where not known."""
+    try:
+        if path.stat().st_size > _MOST_EPISODES_BYTES:
+            return None
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            if sum(member.file_size for member in file.zip.infolist()) > _MOST_EPISODES_BYTES:
+                return None
+            columns = (file[name] for name in ("return", "actor", "over_time", "agent", "at_min"))
+            returns, actors, over_time, agents, at_min = columns
+        # Those of every recording are few, and those of a comparison may be on another one.
+        own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max())
+        mean = float(returns[own].mean()) if own.any() else float("nan")
+    except Exception:  # as for a checkpoint
+        return None
+    return (mean, len(np.unique(actors[own])), int(own.sum())) if np.isfinite(mean) else None
+
+
+def newest_s(paths: list[Path]) -> float:
+    """When one of these changed last; 0 where none is there."""
+    times = [0.0]
+    for path in paths:
+        try:
+            times.append(path.stat().st_mtime)
+        except OSError:
+            continue
+    return max(times)

@@ -1,0 +1,113 @@
+"""What a folder holds that can be watched: sessions, trainings, studies, tunings and recordings, and where."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from animat.closed_loop.gathering import LOG_FILE
+from animat.errors import InvalidArgument
+
+Kind = Literal["session", "training", "study", "tuning", "recording"]
+
+_MARKS: tuple[tuple[Kind, str], ...] = (
+    ("session", LOG_FILE),
+    ("training", "training.json"),
+    ("tuning", "tune.json"),
+    ("study", "study.json"),
+)
+"""By which file each is known; the modules that write them import JAX, which a page has no need of."""
+_DEPTH, _MOST_FOLDERS, _MOST_FOUND = 4, 2000, 200
+_PASSED_OVER = ("jobs", "figures", "tables", "checkpoints")
+
+
+@dataclass(frozen=True)
+class Found:
+    """Something that can be watched.
+
+    Attributes:
+        kind: what it is.
+        place: of its folder in the one that is watched, "" for that itself.
+        changed_s: when something in it changed last.
+    """
+
+    kind: Kind
+    place: str
+    changed_s: float
+
+
+def find(folder: Path) -> list[Found]:
+    """What is in a folder and in those below it, what changed last first; links that lead out of it are left out.
+
+    A folder that is not there yet holds nothing.
+    """
+    found = [each for place in _folders(folder) for each in _in_folder(folder, place)]
+    return sorted(found, key=lambda each: (-each.changed_s, each.place))[:_MOST_FOUND]
+
+
+def place_within(folder: Path, place: str) -> Path:
+    """A folder below the one that is watched, by its place there.
+
+    Raises:
+        InvalidArgument: for one that is outside of it.
+    """
+    try:
+        inside = (folder / place).resolve()
+    except (OSError, ValueError) as error:
+        raise InvalidArgument("in: expected a folder below the one that is watched, got no name of one") from error
+    if not inside.is_relative_to(folder.resolve()):
+        raise InvalidArgument("in: expected a folder below the one that is watched, got one outside")
+    return inside
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    """The folder and those below it, nearest first."""
+    level, seen = [folder], 0
+    for _ in range(_DEPTH):
+        below: list[Path] = []
+        for each in level:
+            seen += 1
+            if seen > _MOST_FOLDERS:
+                return
+            yield each
+            try:
+                with os.scandir(each) as entries:
+                    below += [
+                        each / entry.name
+                        for entry in entries
+                        if entry.is_dir(follow_symlinks=False)
+                        and entry.name[0] != "."
+                        and entry.name not in _PASSED_OVER
+                    ]
+            except OSError:
+                continue
+        level = sorted(below)
+
+
+def _in_folder(root: Path, folder: Path) -> Iterator[Found]:
+    place = "" if folder == root else folder.relative_to(root).as_posix()
+    for kind, name in _MARKS:
+        file = folder / name
+        try:
+            if file.is_file() and file.resolve().is_relative_to(root.resolve()):
+                newest_s = max(file.stat().st_mtime, folder.stat().st_mtime)
+                yield Found(kind, place, newest_s)
+        except OSError:
+            continue
+    files = recordings_in(folder)
+    if files:
+        yield Found("recording", place, max(file.stat().st_mtime for file in files))
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """The recordings of a folder in NWB, but for that of a session, by their names."""
+    try:
+        named = sorted(folder.glob("[!.]*.nwb"))
+        return [
+            file for file in named if file.is_file() and not file.is_symlink() and not (folder / LOG_FILE).exists()
+        ][:500]
+    except OSError:
+        return []

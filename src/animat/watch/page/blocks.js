@@ -1,0 +1,82 @@
+// Views that are made of tables, lists and charts.
+
+import { Frame, colour, list, make, series, shown, spanOf, table, unpacked } from "./draw.js";
+
+// Of the house's kind, in texts as in numbers.
+const minus = (text) => text.replace(/(^|[\s(,])-(?=\d)/g, "$1\u2212");
+const cell = (value) => (typeof value === "number" ? shown(value, 5) : minus(value ?? "none"));
+
+export class BlocksPage {
+  constructor(main) {
+    this.main = main;
+    this.made = [];
+  }
+
+  draw(view) {
+    const key = view.blocks.map((each) => `${each.kind} ${each.title}`).join("\n");
+    if (this.key !== key) {
+      this.key = key;
+      this.main.replaceChildren();
+      this.made = view.blocks.map((block) => this.#make(block));
+    }
+    view.blocks.forEach((block, i) => this[block.kind](this.made[i], block));
+  }
+
+  #make(block) {
+    const words = make("p", { className: "words" });
+    const body = { chart: () => make("canvas", { className: "tall" }), raster: () => make("canvas", { className: "tall" }), table: () => make("table"), facts: () => make("dl") }[block.kind]();
+    if (body instanceof HTMLCanvasElement) body.setAttribute("aria-label", block.title);
+    const legend = make("div", { className: "legend" });
+    const held = block.kind === "table" ? make("div", { className: "table" }, body) : body;
+    this.main.append(make("section", { className: block.width ?? (block.kind === "facts" ? "third" : "two-thirds") }, make("h2", { textContent: block.title }), held, legend, words));
+    return { body, words, legend };
+  }
+
+  table({ body, words }, block) {
+    table(body, block.head, block.rows.map((row) => row.map(cell)));
+    words.textContent = minus(block.rows.length ? block.words : block.words || "none");
+  }
+
+  facts({ body, words }, block) {
+    list(body, block.rows.map(([name, value]) => [name, cell(value)]));
+    words.textContent = minus(block.words);
+  }
+
+  chart({ body, words, legend }, block) {
+    words.textContent = minus(block.words);
+    const xs = block.series.flatMap((each) => each.x), ys = block.series.flatMap((each) => each.y);
+    const frame = new Frame(body, spanOf([...xs, ...block.marks.map(([at]) => at), block.until]), spanOf(ys), { top: block.marks.length ? 22 : 6, xLabel: block.x });
+    frame.text(block.y, frame.left + 4, frame.top + 9, colour("faint"));
+    const named = block.series.filter((each) => each.name);
+    const paint = (each) => (each.colour ? colour(each.colour) : series(named.indexOf(each)));
+    for (const each of block.series) {
+      const how = { line: { width: 2.2 }, thin: { width: 0.8 }, dashed: { dashes: [5, 4] }, steps: { steps: true }, dots: null }[each.style];
+      if (how) frame.line(each.x, each.y, paint(each), how);
+      // A single point is no line.
+      if (!how || each.x.filter((x, i) => x !== null && each.y[i] !== null).length === 1) each.x.forEach((x, i) => { if (x !== null && each.y[i] !== null) frame.dot(x, each.y[i], paint(each)); });
+    }
+    for (const [at, what] of block.marks) {
+      frame.line([at, at], frame.y, colour("red"), { dashes: [4, 3], width: 1 });
+      frame.text(what, Math.min(frame.atX(at) - 2, frame.right - 60), 10, colour("faint"));
+    }
+    legend.replaceChildren(...named.map((each) => {
+      const mark = make("i");
+      mark.style.background = paint(each);
+      return make("span", {}, mark, each.name);
+    }));
+  }
+
+  raster({ body, words, legend }, block) {
+    legend.replaceChildren();
+    words.textContent = minus(block.words);
+    const times = unpacked(block.spikes.times), channels = unpacked(block.spikes.channels);
+    const frame = new Frame(body, [block.from_s, block.to_s], [-0.5, Math.max(0.5, block.n_channels - 0.5)], { top: 18, left: 52, xLabel: "recording's clock (s)" });
+    const width = frame.right - frame.left, high = Math.max(1, Math.min(2.5, (frame.bottom - frame.top) / Math.max(1, block.n_channels)));
+    frame.within((g) => {
+      g.fillStyle = colour("ink");
+      for (let i = 0; i < times.length; i += 1) g.fillRect(frame.left + (times[i] / 65535) * width - 0.5, frame.atY(channels[i]) - high / 2, 1.2, high);
+    });
+    frame.g.fillStyle = colour("red");
+    for (const pulse of block.pulses_s) frame.g.fillRect(frame.atX(pulse) - 1, 4, 2, 12);
+  }
+}

@@ -1,0 +1,223 @@
+// Canvases in the house's colours: a frame with numbers at its axes, and what is drawn in it.
+
+const CIVIDIS = ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
+
+let style = null;
+
+export function colour(name) {
+  style ??= getComputedStyle(document.documentElement);
+  return style.getPropertyValue(`--${name}`).trim();
+}
+
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { style = null; });
+
+// One after the other for what has an order, as frequencies have: along cividis, which all eyes can tell apart.
+export function ordered(i, n) {
+  const first = Number(colour("first")), last = Number(colour("last"));
+  const at = (n < 2 ? last : first + ((last - first) * i) / (n - 1)) * (CIVIDIS.length - 1);
+  const low = Math.min(Math.floor(at), CIVIDIS.length - 2), share = at - low;
+  const [a, b] = [CIVIDIS[low], CIVIDIS[low + 1]].map((hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16)));
+  return `rgb(${a.map((x, k) => Math.round(x + share * (b[k] - x))).join(",")})`;
+}
+
+export const SERIES = ["blue", "orange", "green", "purple", "sky", "red"];
+
+export function series(i) {
+  return colour(SERIES[i % SERIES.length]);
+}
+
+const MINUS = "\u2212";
+
+export function shown(value, digits = 4) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "not known";
+  if (Number.isInteger(value) && Math.abs(value) < 1e15) return value.toLocaleString("en").replace("-", MINUS);
+  const text = Math.abs(value) >= 1e-4 || value === 0 ? Number(value.toPrecision(digits)).toLocaleString("en", { maximumFractionDigits: 12 }) : value.toExponential(2);
+  return text.replace("-", MINUS);
+}
+
+// Few round numbers within a span.
+export function marks(low, high, most) {
+  const raw = (high - low) / Math.max(1, most);
+  if (!(raw > 0) || !Number.isFinite(raw)) return [low];
+  const unit = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((k) => k * unit).find((each) => each >= raw * 0.999);
+  const found = [];
+  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i += 1) found.push(Number((i * step).toPrecision(12)));
+  return found;
+}
+
+// A canvas with a frame: x and y are spans in units.
+export class Frame {
+  constructor(canvas, x, y, options = {}) {
+    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio);
+      canvas.height = Math.round(height * ratio);
+    }
+    const g = canvas.getContext("2d");
+    g.setTransform(ratio, 0, 0, ratio, 0, 0);
+    g.clearRect(0, 0, width, height);
+    g.font = "12px system-ui, 'DejaVu Sans', sans-serif";
+    if (Math.abs(y[1] - y[0]) < 1e-12) y = [y[0] - 1, y[1] + 1];
+    Object.assign(this, { g, x, y, width, height });
+    const yMarks = options.yMarks ?? marks(Math.min(...y), Math.max(...y), Math.max(2, Math.floor(height / 45)));
+    const labels = options.yLabels ?? yMarks.map((each) => shown(each, 6));
+    this.left = options.left ?? Math.min(width / 3, 8 + Math.max(18, ...labels.map((each) => g.measureText(each).width)));
+    this.right = width - (options.right ?? 8);
+    this.top = options.top ?? 6;
+    this.bottom = height - (options.xMarks === null ? 6 : options.xLabel ? 34 : 20);
+    this.#axes(yMarks, labels, options);
+  }
+
+  #axes(yMarks, labels, options) {
+    const { g } = this;
+    g.lineWidth = 1;
+    g.textBaseline = "middle";
+    g.textAlign = "right";
+    yMarks.forEach((each, i) => {
+      const at = this.atY(each);
+      if (at < this.top - 1 || at > this.bottom + 1) return;
+      if (!options.yLabels) this.#rule(this.left, at, this.right, at, colour("grid"));
+      g.fillStyle = colour("faint");
+      g.fillText(labels[i], this.left - 5, at);
+    });
+    if (options.xMarks !== null) {
+      g.textAlign = "center";
+      g.textBaseline = "top";
+      const most = Math.max(2, Math.floor((this.right - this.left) / 80));
+      for (const each of options.xMarks ?? marks(this.x[0], this.x[1], most)) {
+        const at = this.atX(each);
+        if (at < this.left - 1 || at > this.right + 1) continue;
+        this.#rule(at, this.bottom, at, this.bottom + 3, colour("faint"));
+        g.fillStyle = colour("faint");
+        const half = g.measureText(shown(each, 6)).width / 2;
+        g.fillText(shown(each, 6), Math.min(at, this.width - half - 1), this.bottom + 5);
+      }
+      if (options.xLabel) g.fillText(options.xLabel, (this.left + this.right) / 2, this.bottom + 20);
+    }
+    g.strokeStyle = colour("line");
+    g.strokeRect(this.left + 0.5, this.top + 0.5, this.right - this.left - 1, this.bottom - this.top - 1);
+  }
+
+  #rule(x0, y0, x1, y1, stroke) {
+    const { g } = this;
+    g.strokeStyle = stroke;
+    g.beginPath();
+    g.moveTo(Math.round(x0) + 0.5, Math.round(y0) + 0.5);
+    g.lineTo(Math.round(x1) + 0.5, Math.round(y1) + 0.5);
+    g.stroke();
+  }
+
+  atX(value) { return this.left + ((value - this.x[0]) / (this.x[1] - this.x[0] || 1)) * (this.right - this.left); }
+
+  atY(value) { return this.bottom - ((value - this.y[0]) / (this.y[1] - this.y[0] || 1)) * (this.bottom - this.top); }
+
+  // Whatever is drawn by `what` stays within the frame.
+  within(what) {
+    const { g } = this;
+    g.save();
+    g.beginPath();
+    g.rect(this.left, this.top, this.right - this.left, this.bottom - this.top);
+    g.clip();
+    what(g);
+    g.restore();
+  }
+
+  level(value, stroke, dashes = [4, 3]) {
+    this.within((g) => {
+      g.setLineDash(dashes);
+      this.#rule(this.left, this.atY(value), this.right, this.atY(value), stroke);
+      g.setLineDash([]);
+    });
+  }
+
+  // Points that are joined; null breaks the line. As steps each holds until the next.
+  line(xs, ys, stroke, { steps = false, width = 1.6, dashes = [] } = {}) {
+    this.within((g) => {
+      g.strokeStyle = stroke;
+      g.lineWidth = width;
+      g.lineJoin = "round";
+      g.setLineDash(dashes);
+      g.beginPath();
+      let pen = false, lastY = 0;
+      xs.forEach((x, i) => {
+        if (x === null || ys[i] === null || ys[i] === undefined) { pen = false; return; }
+        const at = [this.atX(x), this.atY(ys[i])];
+        if (pen && steps) g.lineTo(at[0], lastY);
+        if (pen) g.lineTo(...at); else g.moveTo(...at);
+        lastY = at[1];
+        pen = true;
+      });
+      g.stroke();
+      g.setLineDash([]);
+    });
+  }
+
+  band(xs, lows, highs, fill) {
+    this.within((g) => {
+      g.globalAlpha = 0.22;
+      g.fillStyle = fill;
+      g.beginPath();
+      xs.forEach((x, i) => g.lineTo(this.atX(x), this.atY(lows[i])));
+      for (let i = xs.length - 1; i >= 0; i -= 1) g.lineTo(this.atX(xs[i]), this.atY(highs[i]));
+      g.fill();
+      g.globalAlpha = 1;
+    });
+  }
+
+  dot(x, y, fill, { radius = 3, ring = false } = {}) {
+    const { g } = this;
+    const edge = Math.max(Math.min(...this.y), Math.min(Math.max(...this.y), y));
+    g.beginPath();
+    g.arc(this.atX(x), this.atY(edge), radius, 0, 2 * Math.PI);
+    if (ring) { g.strokeStyle = fill; g.lineWidth = 1.5; g.stroke(); } else { g.fillStyle = fill; g.fill(); }
+  }
+
+  text(words, x, y, fill, align = "left", baseline = "middle") {
+    const { g } = this;
+    g.fillStyle = fill;
+    g.textAlign = align;
+    g.textBaseline = baseline;
+    g.fillText(words, x, y);
+  }
+}
+
+// The least span that holds all values, a little wider.
+export function spanOf(values, least = 1e-9) {
+  const known = values.filter((each) => each !== null && Number.isFinite(each));
+  if (!known.length) return [0, 1];
+  let low = Infinity, high = -Infinity;
+  for (const each of known) { low = Math.min(low, each); high = Math.max(high, each); }
+  const more = Math.max((high - low) * 0.06, least, Math.abs(high) * 1e-6);
+  return [low - more, high + more];
+}
+
+export function unpacked(base64) {
+  const text = atob(base64), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i += 1) bytes[i] = text.charCodeAt(i);
+  return new Uint16Array(bytes.buffer);
+}
+
+export function make(name, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+}
+
+export function list(target, pairs) {
+  target.replaceChildren(...pairs.flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: value })]));
+}
+
+// Numbers to the right, texts to the left; a column is as most of it is.
+export function table(target, head, rows) {
+  const isText = head.map((_, i) => rows.some((row) => /[a-z]{3}/i.test(row[i])));
+  const line = (cells, kind) => make("tr", {}, ...cells.map((each, i) => make(kind, { textContent: each.replaceAll(" %", "\u00a0%"), className: isText[i] ? "text" : "" })));
+  target.replaceChildren(make("thead", {}, line(head, "th")), make("tbody", {}, ...rows.map((row) => line(row, "td"))));
+}
+
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "not known yet";
+  if (seconds < 100) return `${seconds.toFixed(0)} s`;
+  if (seconds < 6000) return `${(seconds / 60).toFixed(1)} min`;
+  return `${(seconds / 3600).toFixed(1)} h`;
+}

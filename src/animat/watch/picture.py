@@ -1,0 +1,67 @@
+"""The robot of a tick as a picture, where it is one that is known here and can be drawn."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from animat.closed_loop.log import Record
+from animat.errors import AnimatError
+from animat.goals.robot import robot_of
+from animat.robots.base import Robot
+from animat.robots.drawing import draw_robot
+from animat.watch.plain import mapped, numbers
+
+
+def is_drawn(loop: dict[str, Any]) -> bool:
+    """Whether the robot of a session's header is known here and can be drawn."""
+    try:
+        return _robot_of(loop) is not None
+    except (AnimatError, ArithmeticError, ValueError, TypeError):
+        return False
+
+
+def picture_of(loop: dict[str, Any], record: Record, earlier: list[list[float | None]]) -> bytes | None:
+    """A picture as PNG; None for a robot that is not known here, or cannot be drawn.
+
+    Args:
+        loop: of the session's header, with the robot and its goal.
+        record: with a tick.
+        earlier: the observations of the episode before it.
+    """
+    tick = mapped(record.words.get("tick"))
+    observation, command = numbers(tick.get("observation")), numbers(tick.get("command"))
+    if not observation and earlier:
+        observation = earlier[-1]
+    try:
+        robot = _robot_of(loop)
+        if robot is None or not observation or None in observation:
+            return None
+        given = np.array([0.0 if each is None else each for each in command]) if command else 0.0
+        drawn = draw_robot(
+            robot,
+            np.array(observation, np.float64),
+            command=given if robot.n_commands > 1 else float(np.ravel(given)[0]),
+            earlier=[np.array(each, np.float64) for each in earlier if None not in each],
+        )
+    except (AnimatError, ArithmeticError, ValueError, TypeError, IndexError, MemoryError):
+        # What a damaged log says of a robot may be anything.
+        return None
+    packed = io.BytesIO()
+    Image.fromarray(drawn).save(packed, "PNG", compress_level=1)
+    return packed.getvalue()
+
+
+def _robot_of(loop: dict[str, Any]) -> Robot[Any] | None:
+    return _robot(json.dumps({name: loop[name] for name in ("robot", "goal") if name in loop}))
+
+
+@functools.lru_cache(maxsize=8)
+def _robot(data: str) -> Robot[Any] | None:
+    robot = robot_of(json.loads(data))
+    return robot if hasattr(robot, "draw") else None

@@ -1,0 +1,173 @@
+"""The view of recordings: which are there, and of the newest its raster, rates, responses and findings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from animat.errors import AnimatError, InvalidArgument, InvalidFile
+from animat.recordings.recording import Recording
+from animat.responses.inspection import Inspection, inspect_recording
+from animat.watch.blocks import chart, curve, facts, table
+from animat.watch.found import recordings_in
+from animat.watch.held import is_held
+from animat.watch.plain import text
+from animat.watch.spikes import packed_spikes
+
+_MOST_SPAN_S = 60.0
+_LARGEST = 2**31
+"""Bytes of a file that is read for a look."""
+
+
+class RecordingView:
+    """A folder of recordings, looked at again and again; the newest is read once it is there."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._key: Any = None
+        self._recording: Recording | None = None
+        self._inspection: Inspection | None = None
+        self._trouble = ""
+        self._shares: dict[Path, tuple[float, dict[str, float]]] = {}
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+    def about(self) -> dict[str, Any]:
+        """What it is."""
+        return {"generation": 0, "title": "recordings"}
+
+    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """The newest recording, and the seconds of it before a time."""
+        if not 0 < span_s <= _MOST_SPAN_S:
+            raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
+        files = recordings_in(self.folder)
+        if not files:
+            raise InvalidFile(f"{self.folder}: expected recordings, got none any more")
+        newest = max(files, key=lambda file: (file.stat().st_mtime, file.name))
+        self._look_at_another(files, newest)
+        running = is_held(self.folder)
+        told = "each recording is written when it is whole: the one under way is not in the folder yet"
+        recording = self._recording
+        blocks = [facts("Recordings", self._facts(files, newest))]
+        found: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
+        if recording is not None:
+            raster, found = _raster(recording, to_s, span_s)
+            blocks += [raster, _rates(recording)]
+        blocks += [_shares(self._shares, len(files)), *_inspected(self._inspection)]
+        return {
+            "generation": 0,
+            "state": "running" if running else "ended",
+            "message": told if running else f"{len(files)} are there",
+            "damage": self._trouble,
+            **found,
+            "blocks": blocks,
+        }
+
+    def _facts(self, files: list[Path], newest: Path) -> list[tuple[str, Any]]:
+        rows: list[tuple[str, Any]] = [("there", len(files)), ("newest", newest.name)]
+        inspection = self._inspection
+        if inspection is not None:
+            rows += [
+                ("verdict", inspection.verdict),
+                ("stimuli", inspection.n_stimuli),
+                ("spikes", inspection.n_spikes),
+                ("channels", inspection.n_channels),
+                ("seconds", inspection.duration_s),
+                ("bursts", inspection.n_bursts),
+                ("presented", inspection.presentation or "not known"),
+            ]
+        return rows
+
+    def _read(self, file: Path) -> None:
+        """Read a file, if it is another one than before."""
+        status = file.stat()
+        key = file, status.st_mtime_ns, status.st_size
+        if key == self._key:
+            return
+        self._key, self._recording, self._inspection, self._trouble = key, None, None, ""
+        try:
+            self._recording, self._inspection = _inspection_of(file)
+        except AnimatError as error:
+            self._trouble = text(" ".join(str(error).split()))
+        self._keep(file, self._inspection)
+
+    def _look_at_another(self, files: list[Path], newest: Path) -> None:
+        """Read the newest, or one of the others that was not looked at yet: each takes a second or two."""
+        before = self._key
+        self._read(newest)
+        other = next((file for file in files if file not in self._shares), None)
+        if before != self._key or other is None:
+            return
+        try:
+            self._keep(other, _inspection_of(other)[1])
+        except AnimatError:
+            self._keep(other, None)
+
+    def _keep(self, file: Path, inspection: Inspection | None) -> None:
+        shares = {} if inspection is None else {text(c.label): c.share_above_median for c in inspection.conditions}
+        self._shares[file] = (float("nan") if inspection is None else inspection.start_min), shares
+
+
+def _inspection_of(file: Path) -> tuple[Recording, Inspection]:
+    from animat.recordings.reading import read_recording
+
+    if file.stat().st_size > _LARGEST:
+        raise InvalidFile(f"{file.name}: too large for a look: {file.stat().st_size:,} bytes")
+    recording = read_recording(file)
+    return recording, inspect_recording(recording, name=file.name)
+
+
+def _raster(recording: Recording, to_s: float | None, span_s: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    start_s, stop_s = recording.start_s, recording.stop_s
+    to_s = stop_s if to_s is None else min(max(to_s + start_s, start_s), stop_s)
+    from_s = max(to_s - span_s, start_s)
+    first, last = np.searchsorted(recording.spike_times_s, (from_s, to_s))
+    times_s, channels = recording.spike_times_s[first:last], recording.spike_channels[first:last]
+    spikes, _ = packed_spikes(times_s, channels, from_s, to_s, len(recording.channels))
+    pulses_s = recording.stimuli.time_s
+    pulses_s = pulses_s[(pulses_s >= from_s) & (pulses_s <= to_s)]
+    every = f"; each {spikes['every']}th is drawn" if spikes["every"] > 1 else ""
+    words = (
+        f"{spikes['n']:,} spikes on {len(recording.channels):,} channels{every}; {len(pulses_s):,} pulses, marked above"
+    )
+    block = {
+        "kind": "raster", "title": "Spikes by channel", "spikes": spikes, "from_s": from_s, "to_s": to_s,
+        "n_channels": len(recording.channels), "pulses_s": pulses_s[:4000].tolist(), "words": words,
+    }  # fmt: skip
+    return block, {"from_s": from_s - start_s, "to_s": to_s - start_s, "end_s": stop_s - start_s}
+
+
+def _rates(recording: Recording) -> dict[str, Any]:
+    counts = np.bincount(recording.spike_channels, minlength=len(recording.channels))
+    rates_hz = np.sort(counts / max(recording.duration_s, 1e-9))[::-1]
+    line = curve("", np.arange(1, len(rates_hz) + 1).tolist(), rates_hz.tolist(), "line", "blue")
+    median = float(np.median(rates_hz)) if len(rates_hz) else 0.0
+    words = f"Spikes a second, the most active channel first; median {median:.2f} Hz, {int((counts == 0).sum())} silent"
+    return chart("Rates of channels", "channels, by rate", "Hz", [line], words)
+
+
+def _shares(shares: dict[Path, tuple[float, dict[str, float]]], files: int) -> dict[str, Any]:
+    """How each condition was answered in each recording that was looked at."""
+    known = sorted(((minute, of) for minute, of in shares.values() if of), key=lambda each: each[0])
+    labels = list(dict.fromkeys(label for _, of in known for label in of))
+    rows = [[label, *(of.get(label) for _, of in known)] for label in labels]
+    words = (
+        "The share of the responses at or above the median of all: the more it differs between conditions, the better "
+        f"a robot can be driven. {len(shares)} of {files} recordings were looked at so far."
+    )
+    head = ["condition", *(f"{minute:g} min" for minute, _ in known)]
+    return table("P(x >= P50) of each condition", head, rows, words, width="two-thirds")
+
+
+def _inspected(inspection: Inspection | None) -> list[dict[str, Any]]:
+    if inspection is None:
+        return [table("Findings", ["severity", "what"], [], "the newest recording could not be inspected")]
+    conditions = [[c.label, c.n_responses, c.n_non_burst, c.median_rate_hz] for c in inspection.conditions]
+    findings = [[each.severity, each.message] for each in inspection.findings]
+    return [
+        table("Responses", ["condition", "responses", "no bursts", "median (Hz)"], conditions[:200], width="third"),
+        table("Findings", ["severity", "what"], findings, "" if findings else "none", width="whole"),
+    ]

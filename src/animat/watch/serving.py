@@ -1,0 +1,148 @@
+"""The server of the page: on the loopback interface alone, at an address that nobody can guess."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from animat.errors import AnimatError, InvalidArgument
+from animat.watch.found import find
+from animat.watch.guard import App, Receive, Scope, Send
+
+_NEEDS = ("starlette", "uvicorn")
+_START_S = 60.0
+"""How long a server may take to say its address."""
+_LINGER_S = 60.0
+"""For how long after its command, and the last look at its page, a server stays."""
+
+
+def expect_installed() -> None:
+    """Refuse where what the page needs is not installed.
+
+    Raises:
+        AnimatError: saying how to install it.
+    """
+    if missing := [name for name in _NEEDS if find_spec(name) is None]:
+        raise AnimatError(f"the page needs {' and '.join(missing)}: pip install 'animat[watch]'")
+
+
+def serve(folder: Path, port: int, say: Callable[[str], None], *, beside: int | None = None) -> None:
+    """Serve the page of a folder until Ctrl-C.
+
+    Args:
+        folder: that is watched.
+        port: 0 for any that is free.
+        say: is given the address.
+        beside: a process: a minute after it ended and the page was last looked at, so does this.
+
+    Raises:
+        AnimatError: if what the page needs is not installed.
+        InvalidArgument: for a port that cannot be listened on.
+    """
+    expect_installed()
+    import uvicorn
+
+    from animat.watch.app import app_for
+
+    token = secrets.token_urlsafe(24)
+    expected = "--port: expected one from 1 to 65,535 that is free, or 0 for any that is"
+    if not 0 <= port < 2**16:
+        raise InvalidArgument(f"{expected}, got {port}")
+    try:
+        listening = socket.create_server(("127.0.0.1", port))
+    except OSError as error:
+        raise InvalidArgument(f"{expected}, got {port}: {error.strerror or error}") from error
+    with listening:
+        port = listening.getsockname()[1]
+        app = _Noted(app_for(folder, token, port))
+        settings: dict[str, Any] = {
+            "log_level": "critical", "access_log": False, "lifespan": "off", "ws": "none", "proxy_headers": False,
+        }  # fmt: skip
+        # What is refused is told in no header.
+        server = uvicorn.Server(uvicorn.Config(app, server_header=False, timeout_graceful_shutdown=1, **settings))
+        if beside is not None:
+            threading.Thread(target=_end_after, args=(beside, app, server), daemon=True).start()
+        say(f"http://127.0.0.1:{port}/{token}/")
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])
+
+
+class _Noted:
+    """An application that notes when it was last asked."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self.asked_s = time.monotonic()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self.asked_s = time.monotonic()
+        await self._app(scope, receive, send)
+
+
+def _end_after(process: int, app: _Noted, server: Any) -> None:
+    while _runs(process) or time.monotonic() - app.asked_s < _LINGER_S:
+        time.sleep(1.0)
+    server.should_exit = True
+
+
+def _runs(process: int) -> bool:
+    """Whether the process that started this one is still there: whoever loses it gets another parent."""
+    return os.getppid() == process
+
+
+@contextmanager
+def watching(folder: Path) -> Iterator[None]:
+    """Have the page of a folder served by a process of its own, which stays a minute for whoever looks.
+
+    Its address is printed. What is in the block knows nothing of it.
+
+    Raises:
+        AnimatError: if it needs what is not installed, or does not start.
+    """
+    expect_installed()
+    # A session of its own: Ctrl-C ends the command, and the page shows how.
+    server = subprocess.Popen(
+        [sys.executable, "-m", "animat.watch", str(folder.absolute()), str(os.getpid())],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    print(f"watch it at {_address(server)}", file=sys.stderr, flush=True)
+    try:
+        yield
+    except AnimatError:
+        if not find(folder):
+            # It was refused before anything began.
+            server.kill()
+            server.wait()
+        raise
+    finally:
+        # It goes on for whoever looks, and ends by itself: that it is not waited for is meant, and no leak.
+        assert server.stdout is not None
+        server.stdout.close()
+        server.returncode = server.poll() or 0
+
+
+def _address(server: subprocess.Popen[str]) -> str:
+    assert server.stdout is not None
+    late = threading.Timer(_START_S, server.kill)
+    late.start()
+    said = server.stdout.readline().strip()
+    late.cancel()
+    if not said.startswith("http://127.0.0.1:"):
+        server.kill()
+        server.communicate()
+        raise AnimatError("--watch: the page's server did not start; run animat watch to see why, or go without")
+    return said

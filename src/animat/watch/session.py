@@ -1,0 +1,327 @@
+"""The view of a closed-loop session: what happened in the seconds before a time, and what it all came to so far."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE, unanswered_pulses
+from animat.closed_loop.header import Header, read_header
+from animat.closed_loop.log import Record
+from animat.errors import InvalidArgument, InvalidFile
+from animat.watch.agents import by_agent
+from animat.watch.blocks import duration
+from animat.watch.held import is_held
+from animat.watch.picture import is_drawn
+from animat.watch.plain import listed, mapped, number, numbers, text, whole
+from animat.watch.spikes import packed
+from animat.watch.sums import Sums
+from animat.watch.tail import Tail
+
+MOST_SPAN_S = 60.0
+"""That is shown at once."""
+_MOST_RECORDS = 8000
+"""Of a view: at 80 Hz more than a minute and a half."""
+_GROW_S, _COUNT_S = 0.6, 0.15
+"""How long a view may look for new records, and count them; the next one goes on."""
+_AGENTS_S, _MANY = 0.5, 500
+"""Between times that returns are gathered by agent, of so many episodes or more."""
+_SILENT_S = 5.0
+"""Without a word a session no longer counts as running: it writes down whatever it asks of a culture."""
+_NO_TIME = 64
+"""Records in a row without a time, at most."""
+
+
+class SessionView:
+    """A session's folder, looked at again and again.
+
+    Args:
+        folder: with a log in it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.tail = Tail(folder / LOG_FILE)
+        self._generation = -1
+        self._agents: list[dict[str, Any]] = []
+        self._agents_at = -1, -1
+        self._agents_until_s, self._done = 0.0, 0
+
+    def close(self) -> None:
+        """Let go of its log."""
+        self.tail.close()
+
+    def about(self) -> dict[str, Any]:
+        """What does not change while it goes on."""
+        self._look()
+        header, words = self._header, self._words
+        loop, channels = mapped(words.get("loop")), header.channels
+        return {
+            "generation": self.tail.generation,
+            "title": f"{text(mapped(loop.get('robot')).get('name', 'robot'))} on the {text(words.get('culture', ''))} "
+            "culture",
+            "recorded_at": text(header.recorded_at),
+            "conditions": [text(each) for each in header.conditions],
+            "agents": [
+                {"name": text(each.get("name")), "meaning": text(each.get("meaning", ""))}
+                for each in map(mapped, listed(words.get("agents")))
+            ],
+            "observed": [text(each) for each in header.observed],
+            "readouts": [text(each) for each in header.readouts],
+            "mapping": text(mapped(loop.get("mapping")).get("name", loop.get("mapping"))),
+            "thresholds": _thresholds(loop.get("mapping")),
+            "adaptive": bool(loop.get("adaptive")),
+            "burst_threshold": number(loop.get("burst_threshold")),
+            "percentiles_hz": _first_readout(loop.get("percentiles")),
+            "planned": len(listed(words.get("turns"))),
+            "limits": {text(name): number(value) for name, value in mapped(words.get("limits")).items()},
+            "account": {text(name): number(value) for name, value in mapped(words.get("account")).items()},
+            "is_drawn": is_drawn(loop),
+            "channels": {
+                "x_um": [number(x) for x in channels.x_um.tolist()],
+                "y_um": [number(y) for y in channels.y_um.tolist()],
+                "electrode": [whole(each) for each in channels.electrode.tolist()],
+            },
+        }
+
+    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """The seconds before a time.
+
+        Args:
+            to_s: on the session's clock; None: now, or its end.
+            span_s: how many.
+
+        Raises:
+            InvalidFile: if there is no session any more.
+            InvalidArgument: for a span that cannot be.
+        """
+        if not 0 < span_s <= MOST_SPAN_S:
+            raise InvalidArgument(f"span: expected above 0 and at most {MOST_SPAN_S:g} s, got {span_s:g}")
+        is_whole = self._look()
+        self._sums.go_on(_COUNT_S)
+        end_s = self._end_s()
+        to_s = end_s if to_s is None else min(to_s, end_s)
+        from_s = to_s - span_s
+        shown = self._between(from_s, to_s)
+        ticks = [(at, tick) for at, record in shown if (tick := self._tick(at, record)) is not None]
+        ticks = [(at, tick) for at, tick in ticks if (tick["time_s"] or 0.0) <= to_s]
+        spikes, counts = packed([record for _, record in shown], from_s, to_s, len(self._header.channels))
+        return {
+            "generation": self.tail.generation,
+            "end_s": end_s,
+            "from_s": from_s,
+            "to_s": to_s,
+            "ticks": {name: [tick[name] for _, tick in ticks] for name in _COLUMNS},
+            "spikes": spikes,
+            "counts": counts,
+            "pulsed": listed(ticks[-1][1]["electrodes"]) if ticks else [],
+            # Where the robot of the last tick stood last.
+            "picture": next((at for at, tick in ticks[::-1] if tick["observation"]), None),
+            "bytes": self.tail.n_bytes,
+            "is_found": is_whole,
+            **self._so_far(),
+        }
+
+    def tick_at(self, at: int) -> tuple[Record, list[list[float | None]]] | None:
+        """The record of a tick, and the observations of the same episode before it, for a picture; None without."""
+        self._look()
+        record = self.tail.record(at)
+        tick = None if record is None else record.words.get("tick")
+        if record is None or not isinstance(tick, dict):
+            return None
+        earlier: list[list[float | None]] = []
+        for before in range(at - 1, max(-1, at - _TRAIL), -1):
+            found = self.tail.record(before)
+            past = None if found is None else found.words.get("tick")
+            if isinstance(past, dict) and past.get("episode") != tick.get("episode"):
+                break
+            if isinstance(past, dict) and past.get("observation"):
+                earlier.append(numbers(past["observation"]))
+        return record, earlier[::-1]
+
+    @property
+    def robot_data(self) -> dict[str, Any]:
+        """What the header has of the robot and its goal."""
+        self._look()
+        return mapped(self._words.get("loop"))
+
+    def _look(self) -> bool:
+        """Find what was added to the log; False where there is more than could be found by now."""
+        is_whole = self.tail.grow(_GROW_S)
+        if self._generation != self.tail.generation or not hasattr(self, "_words"):
+            first = self.tail.record(0)
+            if first is None:
+                raise InvalidFile(f"{self.tail.path}: expected a log of a session, got one without a whole beginning")
+            self._header: Header = read_header(self.tail.path, first.words)
+            self._words = first.words
+            self._sums = Sums(self.tail, self._header.presentation.pulses)
+            self._generation = self.tail.generation
+        return is_whole
+
+    def _so_far(self) -> dict[str, Any]:
+        sums = self._sums
+        outline = sums.outline
+        fullest = sums.on_electrode.most_common(1)
+        # Of thousands of episodes not each time.
+        is_due = self._done < _MANY or time.monotonic() > self._agents_until_s
+        if self._agents_at != (outline.ticks, self._generation) and is_due:
+            self._agents_at = outline.ticks, self._generation
+            episodes = outline.episodes
+            self._done = sum(episode.is_whole for episode in episodes)
+            self._agents = by_agent(episodes, self.folder)
+            self._agents_until_s = time.monotonic() + _AGENTS_S
+        done = self._done
+        last = self._last_tick()
+        planned, wall_s = len(listed(self._words.get("turns"))), number(mapped(last).get("wall_s"))
+        left_s = None if not done or wall_s is None else wall_s * (planned - done) / done
+        return {
+            **self._state(),
+            "summed": sums.share,
+            "strange": sums.strange,
+            "n_ticks": outline.ticks,
+            "pulses": outline.pulses,
+            "fullest": [text(fullest[0][0]), fullest[0][1]] if fullest else None,
+            "bursts": outline.bursts,
+            "late": outline.late,
+            "latest_s": number(outline.latest_s),
+            "unanswered": _unanswered(outline),
+            "faults": sums.faults,
+            "n_faults": sums.n_faults,
+            "percentiles": _thinned(sums.percentiles),
+            "episodes_done": done,
+            "left_s": number(left_s),
+            "wall_s": wall_s,
+            "agents": self._agents,
+        }
+
+    def _state(self) -> dict[str, Any]:
+        """Whether it goes on, in words."""
+        silent_s = max(0.0, time.time() - self.tail.path.stat().st_mtime)
+        stop = (self.folder / STOP_FILE).exists()
+        last = {} if not len(self.tail) else (self.tail.peek(len(self.tail) - 1) or {})
+        damage = self.tail.damage
+        if last.get("kind") == "end":
+            told = {"state": "ended", "message": f"{text(last.get('by'))}: {text(last.get('message'))}"}
+        elif silent_s < _SILENT_S + (number(mapped(self._words.get("loop")).get("pause_s")) or 0.0):
+            # A record that is just being written looks as one that is cut off.
+            told, damage = {"state": "running", "message": "stopping" if stop else ""}, ""
+        elif is_held(self.folder):
+            message = (
+                f"nothing was written for {duration(silent_s)}, but its program has not ended: it waits, or it hangs"
+            )
+            told = {"state": "running", "message": message}
+        else:
+            message = f"nothing was written for {duration(silent_s)}, and no end: it was killed, or it hangs"
+            told = {"state": "silent", "message": message}
+        return {**told, "damage": damage, "silent_s": silent_s, "stop": stop}
+
+    def _end_s(self) -> float:
+        at = self._before(len(self.tail) - 1)
+        return 0.0 if at is None else at[1]
+
+    def _last_tick(self) -> dict[str, Any] | None:
+        for at in range(len(self.tail) - 1, max(0, len(self.tail) - _NO_TIME), -1):
+            tick = (self.tail.peek(at) or {}).get("tick")
+            if isinstance(tick, dict):
+                return tick
+        return None
+
+    def _before(self, at: int) -> tuple[float, float] | None:
+        """From when to when the last record up to `at` goes that has a time."""
+        for number_ in range(at, max(0, at - _NO_TIME), -1):
+            span = _span(self.tail.peek(number_) or {})
+            if span is not None:
+                return span
+        return None
+
+    def _between(self, from_s: float, to_s: float) -> list[tuple[int, Record]]:
+        """Records that have to do with a span, found by halving: they are in the order of time."""
+        low, high = 1, len(self.tail)
+        while low < high:
+            middle = (low + high) // 2
+            span = self._before(middle)
+            if span is not None and span[0] > to_s:
+                high = middle
+            else:
+                low = middle + 1
+        found: list[tuple[int, Record]] = []
+        for at in range(low - 1, 0, -1):
+            record = self.tail.record(at)
+            if record is None:
+                continue
+            span = _span(record.words)
+            if (span is not None and span[1] < from_s) or len(found) >= _MOST_RECORDS:
+                break
+            found.append((at, record))
+        return found[::-1]
+
+    def _tick(self, at: int, record: Record) -> dict[str, Any] | None:
+        tick = record.words.get("tick")
+        if not isinstance(tick, dict):
+            return None
+        totals = self._sums.totals
+        chosen = [row[3] for row in listed(record.words.get("stimuli")) if isinstance(row, list) and len(row) == 4]
+        named = {name: _plain(tick.get(name)) for name in _NUMBERS}
+        return {
+            **named,
+            "time_s": number(tick.get("read_after_s")),
+            "agent": text(tick.get("agent", "")),
+            "handled": text(tick.get("handled", "")),
+            "pulse_time_s": numbers(tick.get("pulse_time_s")),
+            "command": numbers(tick.get("command")),
+            "observation": numbers(tick.get("observation")),
+            "readout_hz": numbers(tick.get("readout_hz")),
+            "total": number(totals[at]) if at < len(totals) else None,
+            "electrodes": [whole(each) for each in listed(chosen[-1])] if chosen else [],
+        }
+
+
+_TRAIL = 400
+"""Ticks that are looked back at for a robot's trail."""
+_NUMBERS = (
+    "number", "episode", "iteration", "chosen", "delivered", "frequency_hz", "spikes", "rate_hz", "active_ratio",
+    "reward", "late_s", "decided_s", "wall_s", "is_burst", "terminated", "truncated",
+)  # fmt: skip
+_COLUMNS = (
+    *_NUMBERS, "time_s", "agent", "handled", "pulse_time_s", "command", "observation", "readout_hz", "total",
+)  # fmt: skip
+
+
+def _plain(value: Any) -> float | bool | None:
+    return value if isinstance(value, bool) else number(value)
+
+
+def _span(words: dict[str, Any]) -> tuple[float, float] | None:
+    start, duration = number(words.get("start_s")), number(words.get("duration_s"))
+    if words.get("kind") != "seen" or start is None or duration is None or number(start + duration) is None:
+        return None
+    return start, start + duration
+
+
+def _first_readout(percentiles: Any) -> list[float | None]:
+    of = listed(percentiles)
+    return numbers(of[0] if of and isinstance(of[0], list) else of)
+
+
+def _thresholds(mapping: Any) -> list[int]:
+    """Which of the eleven percentiles a mapping compares responses with; both ends where that is not known."""
+    from animat.coding.mapping import Thresholds
+
+    name = mapping if isinstance(mapping, str) else mapped(mapping).get("name")
+    known = {each.name: list(each.percentile_indices) for each in (Thresholds(1), Thresholds(9))}
+    return known.get(str(name), [0, 10])
+
+
+def _unanswered(outline: Any) -> int | None:
+    try:
+        return unanswered_pulses(outline)
+    except (KeyError, TypeError, AttributeError):
+        return None
+
+
+def _thinned(rows: list[Any], most: int = 400) -> list[Any]:
+    """At most so many of them, evenly, the last one among them."""
+    step = max(1, math.ceil(len(rows) / most))
+    return [*rows[:-1:step], *rows[-1:]]

@@ -1,0 +1,147 @@
+"""The view of a study: its jobs, how many are done, what runs, what is left, and results as they come."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from animat.errors import AnimatError, InvalidFile
+from animat.plain_file import read_toml
+from animat.watch.blocks import Width, facts, table, time_left
+from animat.watch.files import json_of, mean_of_episodes, newest_s, told_by_jobs
+from animat.watch.held import state_of
+from animat.watch.plain import listed, mapped, text
+from animat.watch.speed import Speed
+
+_UNFINISHED = ".unfinished"
+_MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
+_FAILED = "A job that fails ends the study, and its command says which: the folder does not keep it."
+
+
+class StudyView:
+    """A study's folder, looked at again and again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._speed = Speed()
+        self._planned: list[tuple[str, float]] | None = None
+        self._why_not = ""
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+    def about(self) -> dict[str, Any]:
+        """What is studied."""
+        study = mapped(self._manifest().get("study"))
+        robots = ", ".join(text(mapped(each).get("name", "robot")) for each in listed(study.get("robots")))
+        return {"generation": 0, "title": f"study {f'of {robots}' if robots else ''}".strip()}
+
+    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """How far it is; a study has no clock of its own."""
+        self._manifest()
+        done = done_jobs(self.folder)
+        told = running_jobs(self.folder, done)
+        planned = self._plan(done)
+        names = set(done)
+        left = [] if planned is None else [(name, cost) for name, cost in planned if name not in names]
+        costs = dict(planned or ())
+        worked = sum(costs.get(name, 0.0) for name in done)
+        worked += sum(share * costs.get(name, 0.0) for name, (share, *_) in told.items())
+        self._speed.see(worked)
+        is_done = planned is not None and not left
+        changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / _UNFINISHED).glob("*/*.json")])
+        state = state_of(self.folder, changed_s, is_done=is_done)
+        is_running = state["state"] == "running"
+        total = sum(costs.values())
+        waiting = [name for name, _ in left if name not in told]
+        rows: list[tuple[str, Any]] = [
+            ("jobs done", len(done)),
+            ("running", len(told) if is_running else 0),
+            ("waiting", len(waiting) if planned is not None else f"not known: {self._why_not}"),
+            ("failed", "none" if is_running or is_done else "its command said which, if any"),
+            ("time left", time_left(self._speed.left_s(total - worked), state)),
+        ]
+        return {
+            "generation": 0,
+            **state,
+            "damage": "",
+            "blocks": [
+                facts("Jobs", rows, _FAILED),
+                running_table(told if is_running else {}),
+                results_table(self.folder),
+                table("Done", ["job", "files"], [[n, files] for n, files in list(done.items())[-_MOST_SHOWN:]]),
+                table("Waiting", ["job"], [[each] for each in waiting[:_MOST_SHOWN]]),
+            ],
+        }
+
+    def _manifest(self) -> dict[str, Any]:
+        found = json_of(self.folder / "study.json")
+        if not isinstance(found, dict):
+            raise InvalidFile(f"{self.folder / 'study.json'}: expected the description of a study, got none")
+        return found
+
+    def _plan(self, done: dict[str, int]) -> list[tuple[str, float]] | None:
+        """All jobs with what they cost, by the study's specification; None where that cannot be known."""
+        if self._planned is None and not self._why_not:
+            try:
+                self._planned = _jobs_of(self.folder)
+            except AnimatError as error:
+                self._why_not = text(str(error))
+            except Exception as error:
+                # Of another version, or damaged.
+                self._why_not = f"the specification cannot be read ({type(error).__name__})"
+        return self._planned
+
+
+def _jobs_of(folder: Path) -> list[tuple[str, float]]:
+    specification = folder / "study.toml"
+    words = read_toml(specification, 2**20)
+    named = [mapped(each) for name in ("robots", "arms") for each in listed(words.get(name))]
+    if any(":" in str(each.get(key, "")) for each in named for key in ("name", "kind", "mapping")):
+        # Reading it would import what it names.
+        raise InvalidFile("the study names code of one's own, which a page does not import")
+    from animat.studies.plan import plan_study
+    from animat.studies.toml import read_study
+
+    return [(job.name, job.cost_s) for job in plan_study(read_study(specification), folder)]
+
+
+def done_jobs(folder: Path) -> dict[str, int]:
+    """The jobs that have a receipt, the last one last, and how many files each left."""
+    receipts = []
+    for path in (folder / "jobs").glob("[!.]*.json"):
+        try:
+            receipts.append((path.stat().st_mtime, path))
+        except OSError:
+            continue
+    found = {}
+    for _, path in sorted(receipts)[:_MOST_RECEIPTS]:
+        words = mapped(json_of(path))
+        if isinstance(words.get("job"), str):
+            found[text(words["job"])] = len(mapped(words.get("outputs")))
+    return found
+
+
+def running_jobs(folder: Path, done: dict[str, int]) -> dict[str, tuple[float, str, float]]:
+    """What jobs without a receipt told last."""
+    told = told_by_jobs(folder / _UNFINISHED / ".told")
+    return {name: each for name, each in told.items() if name not in done and each[0] < 1}
+
+
+def running_table(told: dict[str, tuple[float, str, float]], width: Width = "two-thirds") -> dict[str, Any]:
+    """What runs."""
+    rows = [[name, f"{100 * share:.0f} %", note] for name, (share, note, _) in told.items()]
+    return table(
+        "Running", ["job", "done", "what it says"], rows, "" if rows else "nothing runs now", width="two-thirds"
+    )
+
+
+def results_table(folder: Path) -> dict[str, Any]:
+    """The mean return of each arm on each robot, as soon as its policies were evaluated."""
+    rows = []
+    for path in sorted(folder.glob("episodes/*/*/episodes.npz"))[:_MOST_SHOWN]:
+        found = mean_of_episodes(path)
+        if found is not None:
+            rows.append([path.parts[-3], path.parts[-2], *found])
+    words = "Over all policies, on the last recording; the report has their comparisons." if rows else "none yet"
+    return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, words, width="whole")

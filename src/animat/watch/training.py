@@ -1,0 +1,211 @@
+"""The view of a training: learning curves as far as they are in the folder, how fast it goes, what is in use."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.errors import InvalidFile
+from animat.plain_file import read_plain_text
+from animat.watch.blocks import chart, curve, facts, table, time_left
+from animat.watch.files import curve_of_checkpoint, curve_of_policy, json_of, newest_s, told_by_jobs
+from animat.watch.held import state_of
+from animat.watch.plain import mapped, number, numbers, short, text, whole
+from animat.watch.speed import Speed
+
+_UNFINISHED = ".unfinished"
+_MOST_POLICIES = 1000
+_NOT_KEPT = (
+    "The folder holds no returns of random actions, of the best coupling or of an optimum, and no entropy, alpha or "
+    "critic loss: animat evaluate has the former, nothing the latter."
+)
+
+
+class TrainingView:
+    """A training's folder, looked at again and again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._speed = Speed()
+        self._curves: dict[Path, tuple[float, Any]] = {}
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+    def about(self) -> dict[str, Any]:
+        """What is trained."""
+        training = self._training()
+        robot = text(mapped(training.get("robot")).get("name", "robot"))
+        return {"generation": 0, "title": f"training of {robot} policies"}
+
+    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """How far it is; a training has no clock of its own."""
+        training, simulators = self._training(), mapped(self._manifest().get("simulators"))
+        planned = min(whole(training.get("policies")) or 0, _MOST_POLICIES)
+        iterations = number(training.get("iterations")) or 0
+        curves, shares = self._learned(planned)
+        done = sum(shares.values())
+        self._speed.see(done * iterations)
+        left = (planned - done) * iterations
+        is_done = planned > 0 and done >= planned
+        told = told_by_jobs(self.folder / _UNFINISHED / ".told")
+        changed_s = max([newest_s([self.folder, self.folder / _UNFINISHED]), *(when for *_, when in told.values())])
+        state = state_of(self.folder, changed_s, is_done=is_done)
+        is_running = state["state"] == "running"
+        share = max(shares.values(), default=0.0)
+        rows: list[tuple[str, Any]] = [
+            ("policies", f"{planned:,}, of which {sum(each >= 1 for each in shares.values()):,} are done"),
+            ("iterations of each", iterations),
+            ("done", f"{100 * done / max(1, planned):.0f} % of all"),
+            ("iterations a second", _speed(self._speed) if is_running else "none now"),
+            ("time left", time_left(self._speed.left_s(left), state)),
+            ("mapping", training.get("mapping") or "none: without neurons"),
+            *_in_use(training, simulators, share),
+            ("algorithm", ", ".join(f"{text(k)} {short(v)}" for k, v in mapped(training.get("algorithm")).items())),
+        ]
+        return {
+            "generation": 0,
+            **state,
+            "damage": "",
+            "blocks": [
+                facts("So far", rows),
+                _curves_chart(curves, _swaps(training, simulators, iterations), iterations),
+                _table(planned, curves, shares, told, self._assessed(training)),
+            ],
+        }
+
+    def _manifest(self) -> dict[str, Any]:
+        found = json_of(self.folder / "training.json")
+        if not isinstance(found, dict):
+            raise InvalidFile(f"{self.folder / 'training.json'}: expected the description of a training, got none")
+        return found
+
+    def _training(self) -> dict[str, Any]:
+        return mapped(self._manifest().get("training"))
+
+    def _learned(self, planned: int) -> tuple[dict[int, Float64[np.ndarray, "chunks 3"]], dict[int, float]]:
+        """The learning curve of each policy by its number, and how much of its training is done."""
+        curves: dict[int, Any] = {}
+        shares = dict.fromkeys(range(planned), 0.0)
+        for path in self.folder.glob(f"{_UNFINISHED}/from-p*.npz"):
+            first = re.fullmatch(r"from-p(\d{1,6})", path.stem)
+            found = self._kept(path, curve_of_checkpoint)
+            if first is None or found is None:
+                continue
+            for i in range(found.shape[1]):
+                curves[int(first[1]) + i] = found[:, i]
+                shares[int(first[1]) + i] = min(1.0, len(found) / 60)
+        for name, (share, _, _) in told_by_jobs(self.folder / _UNFINISHED / ".told").items():
+            members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
+            if members is not None:
+                last = min(int(members[2] or members[1]), planned - 1)
+                shares |= {i: max(shares.get(i, 0.0), min(share, 1.0)) for i in range(int(members[1]), last + 1)}
+        for i in range(planned):
+            found = self._kept(self.folder / f"p{i}.safetensors", curve_of_policy)
+            if found is not None:
+                curves[i], shares[i] = found, 1.0
+        known = range(planned)
+        return {i: curves[i] for i in sorted(curves) if i in known}, {i: shares[i] for i in known}
+
+    def _kept(self, path: Path, read: Any) -> Any:
+        """What a file holds, read again only where it changed."""
+        try:
+            changed_s = path.stat().st_mtime
+        except OSError:
+            return None
+        if self._curves.get(path, (None,))[0] != changed_s:
+            self._curves[path] = changed_s, read(path)
+        return self._curves[path][1]
+
+    def _assessed(self, training: dict[str, Any]) -> dict[str, str]:
+        """The best assessment of each policy, in words."""
+        if not training.get("assess"):
+            return {}
+        try:
+            rows = csv.DictReader(read_plain_text(self.folder / "assessments.csv", 2**24).splitlines())
+            best = {row["policy"]: row for row in rows if row.get("best") == "1" and row.get("policy")}
+        except InvalidFile:
+            return {}
+        return {
+            text(name): f"{text(row.get('mean_return', ''))} after {text(row.get('iterations', ''))} iterations"
+            for name, row in best.items()
+        }
+
+
+def _speed(speed: Speed) -> str:
+    return "being measured" if speed.per_s is None else f"{speed.per_s:,.0f}, all policies together"
+
+
+def _in_use(training: dict[str, Any], simulators: dict[str, Any], share: float) -> list[tuple[str, Any]]:
+    minutes = [each for each in numbers(simulators.get("recorded_at_min")) if each is not None]
+    if not minutes:
+        return [("recordings", "none: it is trained without neurons")]
+    named = ", ".join(f"{each:g}" for each in minutes)
+    if training.get("shadowing") == "drawn":
+        return [("recordings", f"of minutes {named}; each episode draws one")]
+    clock = _minute(training, minutes, share)
+    used = max((each for each in minutes if each <= clock + 1e-9), default=minutes[0])
+    return [("recordings", f"of minutes {named}"), ("in use", f"that of minute {used:g}")]
+
+
+def _minute(training: dict[str, Any], minutes: list[float], share: float) -> float:
+    """Of the culture's clock, after a share of the training: that of the chunk that is trained."""
+    if not training.get("shadowing"):
+        return minutes[0]
+    return minutes[0] + (number(training.get("duration_min")) or 0.0) * min(int(60 * share), 59) / 60
+
+
+def _swaps(training: dict[str, Any], simulators: dict[str, Any], iterations: float) -> list[tuple[float, str]]:
+    """After how many iterations the simulators are refreshed."""
+    minutes = [each for each in numbers(simulators.get("recorded_at_min")) if each is not None]
+    lasts = number(training.get("duration_min")) or 0.0
+    if not minutes or training.get("shadowing") is not True or lasts <= 0:
+        return []
+    at = [((each - minutes[0]) / lasts, each) for each in minutes[1:]]
+    return [(share * iterations, f"minute {each:g}") for share, each in at if 0 < share < 1]
+
+
+def _curves_chart(
+    curves: dict[int, Float64[np.ndarray, "chunks 3"]], swaps: list[tuple[float, str]], iterations: float
+) -> dict[str, Any]:
+    series = [curve("", of[:, 0].tolist(), of[:, 2].tolist(), "thin", "grey") for of in curves.values()]
+    most = max((len(of) for of in curves.values()), default=0)
+    told = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."
+    if most:
+        returns = np.full((len(curves), most), np.nan)
+        at = np.full(most, np.nan)
+        for row, of in zip(returns, curves.values(), strict=True):
+            row[: len(of)] = of[:, 2]
+            at[: len(of)] = of[:, 0]
+        known = np.isfinite(returns)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.where(known, returns, 0.0).sum(axis=0) / known.sum(axis=0)
+        series.append(curve("mean of the policies", at.tolist(), mean.tolist(), "line", "blue"))
+        last = next((x for x in mean[::-1].tolist() if np.isfinite(x)), None)
+        told = f"Mean return of the episodes that ended last: {'none ended yet' if last is None else f'{last:.1f}'}. "
+        told += "Grey: each policy; blue: their mean, of those that are as far; a point a sixtieth of the training."
+    told += " Dashed: the simulators were refreshed with the recording of that minute." if swaps else ""
+    words = f"{told} {_NOT_KEPT}"
+    return chart("Learning curves", "iterations", "return", series, words, marks=swaps, until=iterations)
+
+
+def _table(
+    planned: int,
+    curves: dict[int, Float64[np.ndarray, "chunks 3"]],
+    shares: dict[int, float],
+    told: dict[str, tuple[float, str, float]],
+    assessed: dict[str, str],
+) -> dict[str, Any]:
+    rows = []
+    for i in range(planned):
+        of = curves.get(i)
+        ended = [] if of is None else [x for x in of[:, 2].tolist() if np.isfinite(x)]
+        last = ended[-1] if ended else "none yet"
+        rows.append([f"p{i}", f"{100 * shares[i]:.0f} %", last, assessed.get(f"p{i}", "none in the folder yet")])
+    words = "; ".join(f"{name}: {100 * share:.0f} % {note}" for name, (share, note, _) in told.items())
+    return table("Policies", ["policy", "done", "last return", "best assessment"], rows, words, width="whole")

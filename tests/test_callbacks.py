@@ -1,0 +1,113 @@
+"""What follows a training: rows of the learning curves as they come, and TensorBoard's files of them."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from animat import CurveRow, train
+from animat.cli import main
+from animat.training.policy import Policy
+from animat.training.specification import CHUNKS
+from test_training import SHORT, bits, timeline_of, trained
+
+FOUR = replace(SHORT, policies=4, iterations=1_000)
+"""In two groups of two, which are one program."""
+
+
+def assert_whole(rows: list[CurveRow], policies: dict[str, Policy]) -> None:
+    """Every row of every policy once, in its order."""
+    assert {row.policy for row in rows} == set(policies)
+    for name, policy in policies.items():
+        told = [[row.iterations, row.episodes, row.mean_return] for row in rows if row.policy == name]
+        assert len(told) == CHUNKS
+        np.testing.assert_array_equal(told, policy.learning_curve)
+
+
+def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path) -> None:
+    plain = trained(FOUR, timeline_of(), tmp_path / "plain")
+    rows: list[CurveRow] = []
+    unfinished: list[bool] = []
+
+    def on_row(row: CurveRow) -> None:
+        rows.append(row)
+        unfinished.append(not (tmp_path / "told" / f"{row.policy}.safetensors").exists())
+
+    told = trained(FOUR, timeline_of(), tmp_path / "told", callbacks=[on_row])
+    assert bits(tmp_path / "plain") == bits(tmp_path / "told")
+    assert_whole(rows, told)
+    assert any(unfinished)
+    # In memory, one by one; and of a folder that is finished.
+    in_memory: list[CurveRow] = []
+    alone = train(FOUR, timeline_of(), None, callbacks=[in_memory.append])
+    assert_whole(in_memory, alone)
+    for name, policy in plain.items():
+        np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
+    again: list[CurveRow] = []
+    assert_whole(again, trained(FOUR, timeline_of(), tmp_path / "told", callbacks=[again.append]))
+
+
+@pytest.mark.oracle
+def test_a_training_that_goes_on_tells_all_rows_again_from_the_first(tmp_path: Path) -> None:
+    trained(SHORT, timeline_of(), tmp_path / "whole")
+    rows: list[CurveRow] = []
+
+    def stop(row: CurveRow) -> None:
+        rows.append(row)
+        if len(rows) == 5:
+            raise RuntimeError("enough")
+
+    with pytest.raises(RuntimeError, match="enough"), ThreadPoolExecutor(1) as executor:
+        train(SHORT, timeline_of(), tmp_path / "stopped", executor=executor, checkpoint_s=0.0, callbacks=[stop])
+    rows.clear()
+    gone_on = trained(SHORT, timeline_of(), tmp_path / "stopped", callbacks=[rows.append])
+    assert bits(tmp_path / "whole") == bits(tmp_path / "stopped")
+    assert_whole(rows, gone_on)
+
+
+def test_tensorboard_has_every_row(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboardX", reason="tensorboardX is not installed (animat[tensorboard])")
+    from animat.report.tensorboard import TensorBoard
+
+    with TensorBoard(tmp_path / "runs") as board:
+        policies = trained(SHORT, timeline_of(), tmp_path / "policies", callbacks=[board])
+    for name, policy in policies.items():
+        curve = policy.learning_curve
+        written = scalars(next((tmp_path / "runs" / name).iterdir()))
+        assert written["episodes"] == [(int(i), n) for i, n, _ in curve]
+        known = curve[np.isfinite(curve[:, 2])]
+        assert written["return"] == [(int(i), float(np.float32(x))) for i, _, x in known]
+
+
+def test_without_tensorboard_x_the_extra_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What Python does with a module that is None is what it does where there is none.
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    out = tmp_path / "out"
+    words = ["train", "cartpole", "--mapping", "none", "--out", str(out), "--tensorboard", str(tmp_path / "runs")]
+    assert main(words) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pip install 'animat[tensorboard]'" in line
+    assert not out.exists() and not (tmp_path / "runs").exists()
+
+
+def scalars(file: Path) -> dict[str, list[tuple[int, float]]]:
+    """What an event file holds, by its format: length, checksum, message, checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    data, at = file.read_bytes(), 0
+    found: dict[str, list[tuple[int, float]]] = {}
+    while at < len(data):
+        (length,) = struct.unpack("<Q", data[at : at + 8])
+        event = Event.FromString(data[at + 12 : at + 12 + length])
+        for value in event.summary.value:
+            found.setdefault(value.tag, []).append((event.step, value.simple_value))
+        at += 16 + length
+    return found

@@ -1,0 +1,86 @@
+"""On a Dask cluster, SIGKILL at random moments: of workers, schedulers and clients; always the same bits in the end."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from animat.execution.local_cluster import local_cluster
+
+distributed = pytest.importorskip("distributed", reason="distributed, of the extra [cluster], is not installed")
+pytestmark = pytest.mark.long
+
+TINY = Path(__file__).parent / "tiny_study.toml"
+
+
+def started(out: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "animat", "study", str(TINY), "--out", str(out), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """What may not differ by a bit: all but recordings, which NWB gives dates, and what is drawn from tables."""
+    among = [*out.glob("tables/*"), *out.glob("policies/**/*"), *out.glob("jobs/*"), *out.glob("simulators/*")]
+    return {str(path.relative_to(out)): path.read_bytes() for path in among if path.is_file()}
+
+
+def workers(file: Path) -> list[int]:
+    with distributed.Client(scheduler_file=str(file), set_as_default=False) as client:
+        client.wait_for_workers(1, timeout=300)
+        return list(client.run(os.getpid, on_error="ignore").values())
+
+
+@pytest.mark.parametrize(
+    "moments",
+    [
+        pytest.param({"worker": 4, "scheduler": 2, "client": 2}, id="few"),
+        pytest.param({"worker": 20, "scheduler": 5, "client": 5}, id="many"),
+    ],
+)
+@pytest.mark.parametrize("shared", [True, False], ids=["shared", "apart"])
+def test_whoever_is_killed_when_a_study_is_the_same_bits(moments: dict[str, int], shared: bool, tmp_path: Path) -> None:
+    process = started(tmp_path / "without")
+    said, _ = process.communicate()
+    assert process.returncode == 0, said
+    expected = contents(tmp_path / "without")
+    rng, file = random.Random(5), tmp_path / "cluster.json"
+    kills = [of for of, times in moments.items() for _ in range(times)]
+    rng.shuffle(kills)
+    on = ("--cluster", str(file), *(() if shared else ("--no-shared-folder",)))
+    folders = [tmp_path / "study-0"]
+    with ExitStack() as running:
+        scheduler, _ = running.enter_context(local_cluster(2, file))
+        process = started(folders[-1], *on)
+        for of in kills:
+            time.sleep(rng.uniform(5, 30))
+            if of == "worker":
+                os.kill(rng.choice(workers(file)), signal.SIGKILL)
+            elif of == "client":
+                process.kill()
+            elif of == "scheduler":
+                scheduler.kill()
+            if of in ("client", "scheduler") or process.poll() is not None:
+                said, _ = process.communicate()
+                last = said.strip().splitlines()[-1] if said.strip() else ""
+                print(of, process.returncode, last)
+                # The second, before it was connected.
+                lines = ("has ended; start", "no scheduler answers")
+                assert process.returncode in (0, -signal.SIGKILL) or any(line in last for line in lines), said
+                if process.returncode == 0:
+                    assert contents(folders[-1]) == expected
+                    folders.append(tmp_path / f"study-{len(folders)}")
+                if of == "scheduler":
+                    running.close()
+                    scheduler, _ = running.enter_context(local_cluster(2, file))
+                process = started(folders[-1], *on)
+        said, _ = process.communicate()
+    assert process.returncode == 0, said
+    assert contents(folders[-1]) == expected

@@ -1,0 +1,109 @@
+"""The context study: what its page says of made-up numbers, and a small one from a culture to the page."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from animat.closed_loop.session import read_session
+from animat.errors import InvalidFile, Mismatch
+from animat.stimulation.protocol import CLOSED_LOOP
+from animat.studies.context import ContextRow, LostRow, RanContext, run_context_study
+from animat.studies.context_page import in_short, write_context_page
+from animat.studies.context_tasks import ContextStudy
+
+
+def row(culture: int, robot: str, **known: Any) -> ContextRow:
+    """A row with nothing else known; returns are 0."""
+    optional = {field.name: None for field in fields(ContextRow)}
+    returns = {"random": 0.0, "policies": 80.0, "predicted_policies": 80.0}
+    return ContextRow(**(optional | returns | {"culture": culture, "robot": robot} | known))
+
+
+def rows() -> tuple[ContextRow, ...]:
+    """One robot that needs context on one of two cultures, where policies have some, and one that needs none."""
+    interval = {"score_low_95": 0.7, "score_high_95": 1.1, "gap_low_95": 0.5, "gap_high_95": 0.9}
+    return (
+        row(1, "shuttle", gap=0.7, score=0.9, **interval),
+        row(2, "shuttle", gap=0.4, score=0.1, **(interval | {"score_low_95": -0.1})),
+        row(1, "cartpole", gap=0.0),
+        row(2, "cartpole", gap=0.01),
+    )
+
+
+def test_what_holds_is_counted_over_cultures() -> None:
+    needs, cartpole = in_short(rows()[:2]), in_short(rows()[2:])
+    assert needs == (
+        "A reflex leaves half of the task or more undone on 1 of 2 cultures (context gap 0.40 to 0.70). The policies "
+        "do significantly more than the best reflex on 1 of 2 (context score 0.10 to 0.90)."
+    )
+    assert cartpole == (
+        "A reflex leaves half of the task or more undone on 0 of 2 cultures (context gap 0.00 to 0.01). The policies "
+        "do significantly more than the best reflex on 0 of 2."
+    )
+
+
+def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: Path) -> None:
+    study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
+    lost = tuple(LostRow(c, r, "silent", 20.0, 60.0, 50.0, 70.0) for c in (1, 2) for r in study.robots)
+    page = write_context_page(study, RanContext(tmp_path, rows(), lost, {}))
+    text = page.read_text()
+    assert "0.900 (0.700 to 1.10)" in text and in_short(rows()[:2]) in text
+    # 60 of the 80 that the policies have over random stimuli.
+    assert re.search(r"silent</t[dh]>\s*<td[^>]*>0.750</td>\s*<td[^>]*>0.750</td>", text)
+    for name in ("context", "whose-work"):
+        assert all((tmp_path / f"{name}.{ending}").stat().st_size > 1000 for ending in ("png", "svg", "pdf"))
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InvalidFile, match="expected an empty folder or one of this study, got one with other files"):
+        run_context_study(ContextStudy(), tmp_path)
+    assert [each.name for each in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.oracle
+@pytest.mark.usefixtures("in_this_process", "few_bootstraps")
+def test_a_small_study_from_a_culture_to_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.stimulation.protocol.CLOSED_LOOP", replace(CLOSED_LOOP, trials=40))
+    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
+    study = ContextStudy(
+        cultures=(1,),
+        robots=("shuttle",),
+        policies=2,
+        iterations_share=0.01,
+        episodes=20,
+        episodes_measured=1,
+        optimum_resolution=0.2,
+    )
+    ran = run_context_study(study, tmp_path)
+    (only,) = ran.rows
+    session = read_session(tmp_path / "culture-1" / "shuttle" / "session")
+    measured = {
+        name: sum(tick.reward or 0.0 for tick in session.ticks if tick.agent == name)
+        for name in ("p0", "p1", "random", "coupling")
+    }
+    assert only.measured_policies == pytest.approx((measured["p0"] + measured["p1"]) / 2)
+    assert only.measured_random == pytest.approx(measured["random"])
+    assert only.measured_coupling == pytest.approx(measured["coupling"])
+    # (optimum - coupling) / (optimum - random), and bits of a choice between five stimuli.
+    assert only.gap == pytest.approx((only.optimum - only.coupling) / (only.optimum - only.random))
+    assert only.bits is not None and -0.5 < only.bits < 2.4
+    assert {each.intervention for each in ran.lost} >= {"silent", "shuffled", "yoked", "goal switched"}
+    assert pd.read_csv(tmp_path / "context.csv").measured_policies[0] == only.measured_policies
+
+    assert run_context_study(study, tmp_path).done_now == {}
+    before = (tmp_path / "culture-1" / "shuttle" / "measured.json").read_bytes()
+    (tmp_path / "culture-1" / "shuttle" / "measured.json").unlink()
+    again = run_context_study(study, tmp_path)
+    assert list(again.done_now) == ["measure/1/shuttle"] and again.rows == ran.rows
+    assert (tmp_path / "culture-1" / "shuttle" / "measured.json").read_bytes() == before
+    assert json.loads(before)["robot"] == "shuttle"
+    with pytest.raises(Mismatch, match=r"context study.policies: 2 there, 3 now"):
+        run_context_study(replace(study, policies=3), tmp_path)

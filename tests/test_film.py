@@ -1,0 +1,181 @@
+"""Films of sessions and of policies: what is in the log is what is shown, in real time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from animat.cli import main
+from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
+from animat.closed_loop.gathering import LOG_FILE
+from animat.closed_loop.loop import Loop
+from animat.closed_loop.running import run_session
+from animat.closed_loop.session import read_session
+from animat.coding.mapping import Thresholds
+from animat.neurons.timeline import fit_timeline
+from animat.recordings.reading import read_sources
+from animat.recordings.synthetic import write_synthetic_series
+from animat.report.film.frame import HEIGHT_PX, WIDTH_PX
+from animat.report.film.session import scene_of_session
+from animat.report.film.simulated import scene_of_policies
+from animat.report.film.writing import FRAMES_PER_S
+from animat.responses.condition import Condition
+from animat.responses.series import extract_series
+from animat.robots import Navigation
+from animat.training.policy import Policy, load_policies
+from fake_culture import CHANNELS, FakeCulture
+
+HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
+AGENTS = [Agent("random", "any", AnyCondition(5)), Agent("silent", "", OneCondition(0), "silent")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of four episodes of six iterations, some 8 s."""
+    loop = Loop(
+        robot=Navigation(episode_limit=6),
+        mapping=Thresholds(9),
+        conditions=tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ),
+        percentiles=np.linspace(0.0, 125.0, 11),
+        pause_s=0.1,
+        warm_up=1,
+    )
+    path = tmp_path_factory.mktemp("a session")
+    with FakeCulture(1) as culture:
+        assert run_session(culture, loop, AGENTS, path, episodes=2, seed=1).ending.by == "plan"
+    return path
+
+
+def film(*arguments: Any) -> int:
+    return main(["replay", *map(str, arguments)])
+
+
+def test_the_scene_of_a_session_is_its_log(folder: Path) -> None:
+    session, scene = read_session(folder), scene_of_session(folder)
+    moved = [moment for moment in scene.moments if moment.command is not None]
+    ticks = [tick for tick in session.ticks if tick.command is not None]
+    assert [m.observation for m in moved] == [t.observation for t in ticks]
+    assert [m.command for m in moved] == [t.command for t in ticks]
+    np.testing.assert_allclose([m.time_s for m in moved], [t.read_after_s + 0.01 for t in ticks])
+    last = {m.episode: m.total for m in scene.moments}
+    assert last == pytest.approx({e.number: e.total for e in session.episodes})
+    starts = [m.observation for m in scene.moments if m.turn == 0 and m.iteration == -1]
+    assert set(starts) == {session.episodes[0].start}
+    recording = session.recording()
+    np.testing.assert_array_equal(scene.spike_times_s, recording.spike_times_s)
+    np.testing.assert_array_equal(scene.pulse_times_s, recording.stimuli.time_s)
+    assert scene.n_channels == CHANNELS
+
+
+def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:
+    whole = scene_of_session(folder)
+    start_s, stop_s = 0.5 * whole.stop_s, 0.7 * whole.stop_s
+    scene = scene_of_session(folder, (start_s, stop_s))
+    assert (scene.start_s, scene.stop_s) == (start_s, stop_s)
+    shown = [m for m in scene.moments if start_s <= m.time_s < stop_s]
+    assert shown and shown == [m for m in whole.moments if start_s <= m.time_s < stop_s]
+    # The body of the first episode can be moved again from its start.
+    assert scene.moments[0].iteration == -1 and scene.moments[0].time_s <= start_s
+
+
+def test_a_gif_lasts_as_long_as_what_it_shows_and_moves(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "film.gif"
+    assert film(folder, "--out", out, "--span-s", 1, 3, "--json") == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation"}
+    durations_ms, pictures = [], []
+    with Image.open(out) as gif:
+        assert gif.size == (WIDTH_PX, HEIGHT_PX)
+        for number in range(gif.n_frames):
+            gif.seek(number)
+            durations_ms.append(gif.info["duration"])
+            pictures.append(np.array(gif.convert("RGB")))
+    assert sum(durations_ms) == 2000
+    left, right = np.s_[:, : WIDTH_PX // 2], np.s_[:, WIDTH_PX // 2 :]
+    for side in (left, right):
+        assert not np.array_equal(pictures[0][side], pictures[-1][side])
+
+
+# What counts the pictures forks.
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
+def test_an_mp4_has_as_many_pictures_as_it_should(folder: Path, tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "film.mp4"
+    assert film(folder, "--out", out, "--span-s", 1, 2) == 0
+    assert ffmpeg.count_frames_and_secs(str(out)) == (FRAMES_PER_S[".mp4"], 1.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_of_a_killed_session_what_is_there_is_shown(folder: Path, tmp_path: Path) -> None:
+    log = (folder / LOG_FILE).read_bytes()
+    (tmp_path / LOG_FILE).write_bytes(log[: len(log) // 2])
+    scene, whole = scene_of_session(tmp_path), scene_of_session(folder)
+    assert 0 < len(scene.moments) < len(whole.moments)
+    assert scene.moments == whole.moments[: len(scene.moments)]
+    assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0, 0.5) == 0
+
+
+def test_what_cannot_be_filmed_is_one_line_and_leaves_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (none := tmp_path / "none").mkdir()
+    (begun := tmp_path / "begun").mkdir()
+    log = read_session(folder).log
+    (begun / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes()[: log.records._places[0]])
+    out = tmp_path / "film.gif"
+    for said, *arguments in (
+        ("expected a session (session.log) or policies", none, "--out", out),
+        ("got no such file", tmp_path / "nowhere", "--out", out),
+        ("expected at least one episode, got none", begun, "--out", out),
+        ("expected a film's name to end in .mp4 or .gif, got '.avi'", folder, "--out", tmp_path / "film.avi"),
+        ("begins within the session's", folder, "--out", out, "--span-s", 1000, 1001),
+        ("expected a start from 0 s and a later end", folder, "--out", out, "--span-s", 2, 1),
+        ("expected none with a session", folder, "--out", out, "--recordings", folder),
+    ):
+        assert film(*arguments) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+    assert {path.name for path in tmp_path.iterdir()} == {"none", "begun"}
+
+
+def test_policies_on_the_simulator_move_as_their_robot_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_synthetic_series(1, tmp_path / "recordings", sessions=1, patterns=30, channels=32)
+    untrained(Navigation(episode_limit=8)).save(tmp_path / "p0.safetensors")
+    timeline = fit_timeline(extract_series(read_sources([tmp_path / "recordings"])))
+    policies = load_policies(tmp_path / "p0.safetensors")
+    scene = scene_of_policies(policies, timeline, seed=3)
+    assert scene.moments == scene_of_policies(policies, timeline, seed=3).moments
+    start, *moved = scene.moments
+    assert len(moved) == 8 and moved[-1].ended and start.time_s == 0.0
+    for before, after in zip(scene.moments, moved, strict=False):
+        assert after.time_s - before.time_s == pytest.approx(1 / float(after.delivered.split()[0]))
+        assert -1 <= after.command <= 1
+    # Navigation drives on at one speed: the same way in each iteration.
+    places = np.array([moment.observation[:2] for moment in scene.moments])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert (steps > 0).all()
+    out = tmp_path / "film.gif"
+    assert film(tmp_path / "p0.safetensors", "--recordings", tmp_path / "recordings", "--out", out) == 0
+    assert "navigation on the simulator" in capsys.readouterr().out
+    with Image.open(out) as gif:
+        assert gif.n_frames > 1
+
+
+def untrained(robot: Navigation) -> Policy:
+    """One of zeros, but for a preference among conditions."""
+    shapes = [(len(robot.observation_spec), 4), (4, 4), (4, 5)]
+    return Policy(
+        weights=tuple(np.zeros(shape, np.float32) for shape in shapes),
+        biases=(np.zeros(4, np.float32), np.zeros(4, np.float32), np.arange(5, dtype=np.float32)),
+        scales=np.ones(len(robot.observation_spec), np.float32),
+        robot=robot,
+        mapping=Thresholds(9),
+        conditions=tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ),
+    )

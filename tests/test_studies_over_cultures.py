@@ -1,0 +1,202 @@
+"""Studies over many cultures: each as if it were alone, one that fails stops no other, and what holds over all."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import bootstrap
+
+from animat.cli import main
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, UnusableData
+from animat.studies import cultures
+from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
+from animat.studies.places import results_file
+from animat.studies.results import ComparedReturns, Results, Score, write_typed
+from animat.studies.run import Ran, run_study
+from animat.studies.source import Source, read_seeds
+from animat.studies.specification import Study
+from animat.studies.tabulating import NONE, SECOND
+from animat.studies.toml import read_study, study_to_toml
+
+TINY = Path(__file__).parent / "tiny_study.toml"
+
+
+def compared(first: float, second: float, outcome: str) -> ComparedReturns:
+    given: dict[str, Any] = dict.fromkeys(ComparedReturns.__dataclass_fields__, 0.0)
+    for name in ("score_first", "score_second", "random_second", "paper_u", "paper_p", "as_in_paper"):
+        given[name] = None
+    names = {"comparison": "a and b", "robot": "cartpole", "first": "a", "second": "b", "n": 2, "episodes": 5}
+    return ComparedReturns(**given | names | {"mean_first": first, "mean_second": second, "outcome": outcome})
+
+
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 30)), min_size=1, max_size=6))
+def test_seeds_are_what_their_ranges_hold(ranges: list[tuple[int, int]]) -> None:
+    text = ", ".join(f"{first}-{first + more}" if more else f"{first}" for first, more in ranges)
+    expected = [seed for first, more in ranges for seed in range(first, first + more + 1)]
+    if len(set(expected)) < len(expected):
+        with pytest.raises(InvalidArgument, match="each culture once"):
+            read_seeds(text)
+    else:
+        assert read_seeds(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1;2", "1-2000", "1.5"])
+def test_what_is_no_range_of_seeds_is_refused(text: str) -> None:
+    with pytest.raises(InvalidArgument, match="seeds: expected"):
+        Source(seeds=text)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"seeds": "1-3", "seed": 2}, "seeds: expected seed or seeds"),
+        ({"kind": "files", "files": ("a",), "folders": ("b",)}, "folders: expected files of one culture"),
+        ({"folders": ("b",)}, "files, folders: expected some for kind = 'files' only, got 1 for 'virtual'"),
+        ({"kind": "files", "folders": ("b",), "seeds": "1-2"}, "seeds: expected only for a culture"),
+    ],
+)
+def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(InvalidArgument, match=told):
+        Source(**given)
+
+
+def test_each_culture_has_the_study_that_it_would_have_alone(tmp_path: Path) -> None:
+    study = replace(read_study(TINY), culture=replace(read_study(TINY).culture, seeds="2-3, 9"))
+    (file := tmp_path / "study.toml").write_text(study_to_toml(study))
+    study = read_study(file)
+    assert list(studies_of(study)) == ["culture-2", "culture-3", "culture-9"]
+    for seed, each in zip((2, 3, 9), studies_of(study).values(), strict=True):
+        alone = replace(study, culture=replace(read_study(TINY).culture, seed=seed))
+        assert each == alone and each.to_dict() == alone.to_dict()
+        assert "seeds" not in each.to_dict()["culture"], "studies of before have none, and go on"
+        assert studies_of(each) == {}
+    with pytest.raises(InvalidArgument, match="expected one culture, got many"):
+        run_study(study, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InvalidArgument, match="folders: expected different names, got 'rec' twice: rename one"):
+        Source(kind="files", folders=("day-1/rec", "day-2/rec"))
+
+
+def test_intervals_over_cultures_are_those_of_scipy() -> None:
+    values = np.random.default_rng(3).normal(5, 2, 12)
+    known = bootstrap((values,), np.mean, n_resamples=100_000, method="percentile", random_state=1).confidence_interval
+    assert bootstrap_interval(values) == pytest.approx((known.low, known.high), abs=0.05)
+
+
+def test_over_cultures_each_counts_the_same() -> None:
+    found = over_cultures([[compared(0, 10, SECOND)], [compared(5, 6, NONE)], [compared(1, 2, SECOND)]])
+    (row,) = found
+    assert (row.cultures, row.mean_first, row.mean_second, row.difference, row.holds_in) == (3, 2, 6, 4, 2)
+    assert row.low_95 is not None and 1 <= row.low_95 < 4 < (row.high_95 or 0) <= 10
+    (alone,) = over_cultures([[compared(0, 10, SECOND)]])
+    assert (alone.low_95, alone.high_95) == (None, None)
+
+
+def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ran(study: Study, folder: Path, **_: Any) -> Ran:
+        if study.culture.seed == 2:
+            raise UnusableData("recording 1: no responses")
+        results_file(folder).parent.mkdir(parents=True, exist_ok=True)
+        rows = (compared(0.0, float(study.culture.seed), SECOND),)
+        write_typed(results_file(folder), Results((), rows, (), (), (), ()))
+        return Ran(folder, folder / "report.html", 1, {})
+
+    monkeypatch.setattr(cultures, "run_study", ran)
+    study = replace(read_study(TINY), culture=Source(seeds="1-3"))
+    found = run_over_cultures(study, tmp_path)
+    assert list(found.ran) == ["culture-1", "culture-3"]
+    assert found.failed == {"culture-2": "recording 1: no responses"}
+    table = pd.read_csv(tmp_path / cultures.COMPARISONS)
+    assert table["culture"].tolist() == ["culture-1", "culture-3"]
+    assert table["mean_second"].tolist() == [1.0, 3.0]
+    assert pd.read_csv(tmp_path / cultures.SUMMARY)["difference"].tolist() == [2.0]
+    with pytest.raises(AnimatError, match="culture-2: recording 1: no responses"):
+        run_over_cultures(replace(study, culture=Source(seeds="2")), tmp_path)
+
+
+SCORED: dict[str, Any] = {
+    **dict.fromkeys(Score.__dataclass_fields__, 1.5),
+    "robot": "cartpole",
+    "arm": "1 threshold",
+    "mapping": "9-thresholds",
+    "policies": 2,
+    "episodes": 5,
+    "optimum": None,
+}
+
+
+def run_scored(folder: Path, monkeypatch: pytest.MonkeyPatch) -> RanCultures:
+    def ran(study: Study, folder: Path, **_: Any) -> Ran:
+        results_file(folder).parent.mkdir(parents=True, exist_ok=True)
+        scores = tuple(Score(**SCORED | {"mean_return": study.culture.seed + i / 3}) for i in range(2))
+        write_typed(results_file(folder), Results(scores, (), (), (), (), ()))
+        return Ran(folder, folder / "report.html", 1, {})
+
+    monkeypatch.setattr(cultures, "run_study", ran)
+    return run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-3")), folder)
+
+
+def test_without_fastparquet_there_is_csv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fastparquet", None)
+    assert run_scored(tmp_path, monkeypatch).parquet is None
+    assert len(pd.read_csv(tmp_path / cultures.SCORES)) == 6
+    assert not (tmp_path / "scores.parquet").exists()
+
+
+def test_scores_of_all_cultures_are_one_table_the_same_in_parquet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fastparquet = pytest.importorskip("fastparquet", reason="fastparquet, of the extra [parquet], is not installed")
+    found = run_scored(tmp_path, monkeypatch)
+    assert found.parquet == tmp_path / "scores.parquet"
+    with found.parquet.open("rb") as file:
+        table = fastparquet.ParquetFile(file).to_pandas()
+    assert table["culture"].tolist() == [f"culture-{seed}" for seed in (1, 1, 2, 2, 3, 3)]
+    assert table["mean_return"].tolist() == [seed + i / 3 for seed in (1, 2, 3) for i in range(2)]
+    assert table["optimum"].isna().all() and table["optimum"].dtype == np.float64
+    assert table["policies"].dtype == np.int64 and set(table["arm"]) == {"1 threshold"}
+    csv = pd.read_csv(tmp_path / cultures.SCORES, dtype=dict(table.dtypes))
+    pd.testing.assert_frame_equal(table, csv, check_exact=True)
+    before = found.parquet.read_bytes()
+    assert run_scored(tmp_path, monkeypatch).parquet == found.parquet and found.parquet.read_bytes() == before
+
+
+@pytest.mark.oracle
+def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "many.toml").write_text(TINY.read_text().replace("sessions = 2", 'sessions = 2\nseeds = "1-2"', 1))
+    assert main(["study", str(tmp_path / "many.toml"), "--out", str(tmp_path / "many"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["cultures"] == ["culture-1", "culture-2"]
+    assert {row["cultures"] for row in told["over_cultures"]} == {2}
+    alone = replace(read_study(TINY), culture=replace(read_study(TINY).culture, seed=2))
+    run_study(alone, tmp_path / "alone")
+    results = [results_file(folder).read_bytes() for folder in (tmp_path / "many" / "culture-2", tmp_path / "alone")]
+    assert results[0] == results[1]
+    page = (tmp_path / "many" / "report.html").read_text()
+    assert "better in" in page and "culture-1/report.html" in page
+    (tmp_path / "files.toml").write_text(
+        TINY.read_text().replace(
+            'kind = "synthetic"\nsessions = 2\ninterval_min = 140\ntrials = 40\nchannels = 32',
+            'kind = "files"\nfolders = ["many/culture-1/recordings", "missing"]',
+        )
+    )
+    assert main(["study", str(tmp_path / "files.toml"), "--out", str(tmp_path / "files")]) != 0
+    err = capsys.readouterr().err
+    assert "failed: culture-missing" in err and "1 of 2 cultures failed" in err
+
+
+def test_results_that_cannot_be_read_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cultures, "run_study", lambda study, folder, **_: Ran(folder, folder, 1, {}))
+    with pytest.raises(InvalidFile, match="results"):
+        run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1")), tmp_path)

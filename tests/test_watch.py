@@ -1,0 +1,236 @@
+"""The page's view of a session: its numbers are those of the log and of ticks.csv, while it grows and afterwards."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import itertools
+import json
+import math
+import os
+import time
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
+from animat.closed_loop.log import LogWriter, Record, read_log
+from animat.closed_loop.predicted import write_predicted
+from animat.closed_loop.session import read_session
+from animat.errors import InvalidArgument, InvalidFile
+from animat.watch.session import SessionView
+from animat.watch.stopping import stop_session
+from animat.watch.tail import Tail
+from watching import session_in
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("watched")
+    assert session_in(path).ending.by == "plan"
+    return path
+
+
+def whole(view: SessionView, **asked: Any) -> dict[str, Any]:
+    """A view once everything is counted."""
+    while True:
+        found = view.view(asked.get("to_s"), asked.get("span_s", 60.0))
+        if found["summed"] == 1 and found["is_found"]:
+            return found
+
+
+def test_the_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
+    view = SessionView(folder)
+    about, found = view.about(), whole(SessionView(folder))
+    ticks = found["ticks"]
+    with (folder / "ticks.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(ticks["number"]) == found["n_ticks"] > 20
+    for i, row in enumerate(rows):
+        assert ticks["number"][i] == int(row["tick"])
+        assert ticks["agent"][i] == row["agent"]
+        assert about["conditions"][ticks["delivered"][i]] == row["delivered"]
+        assert [float(each) for each in row["pulse_times_s"].split()] == ticks["pulse_time_s"][i]
+        for ours, theirs in (("time_s", "time_s"), ("rate_hz", "rate_hz"), ("late_s", "late_s"), ("wall_s", "wall_s")):
+            assert ticks[ours][i] == float(row[theirs])
+        assert ticks["command"][i] == ([float(row["command"])] if row["command"] else [])
+        assert ticks["reward"][i] == (float(row["reward"]) if row["reward"] else None)
+        observed = [row[name] for name in about["observed"]]
+        assert ticks["observation"][i] == ([float(each) for each in observed] if observed[0] else [])
+    assert found["state"] == "ended"
+
+
+def test_what_it_came_to_is_what_the_session_says(folder: Path) -> None:
+    found, session = whole(SessionView(folder)), read_session(folder)
+    outline = session.outline
+    assert (found["pulses"], found["bursts"], found["late"]) == (outline.pulses, outline.bursts, outline.late)
+    assert found["episodes_done"] == 4
+    for agent in found["agents"]:
+        returns = [each.total for each in session.episodes if each.agent == agent["name"]]
+        assert agent["returns"] == returns
+        assert agent["mean"] == pytest.approx(fmean(returns))
+        # Student's 97.5 % quantile with one degree of freedom.
+        assert agent["half"] == pytest.approx(12.7062 * np.std(returns, ddof=1) / math.sqrt(2), rel=1e-4)
+    spikes = sum(len(record.spike_times_s) for record in session.log.records)
+    assert found["spikes"]["n"] == sum(found["counts"]) == spikes
+    seen = [record.words for record in session.log.records if record.words["kind"] == "seen"]
+    on = [electrode for words in seen for row in words["stimuli"] for electrode in row[3]]
+    assert found["fullest"] == [found["fullest"][0], max(on.count(e) for e in on)]
+    assert on.count(int(found["fullest"][0])) == found["fullest"][1]
+
+
+def test_spikes_are_where_the_log_has_them(folder: Path) -> None:
+    recording = read_session(folder).recording()
+    to_s = 0.6 * recording.duration_s
+    found = SessionView(folder).view(to_s, 1.0)
+    times, channels = (np.frombuffer(base64.b64decode(found["spikes"][name]), "<u2") for name in ("times", "channels"))
+    within = (recording.spike_times_s >= found["from_s"]) & (recording.spike_times_s <= to_s)
+    there = sorted(zip(recording.spike_times_s[within], recording.spike_channels[within], strict=True))
+    ours = sorted(zip(found["from_s"] + times / 65535, channels.tolist(), strict=True))
+    assert len(there) == len(ours) > 10
+    np.testing.assert_allclose([t for t, _ in ours], [t for t, _ in there], atol=2e-5)
+    assert sorted(c for _, c in ours) == sorted(c for _, c in there)
+
+
+def test_a_span_in_the_past_has_the_ticks_of_that_time(folder: Path) -> None:
+    view = SessionView(folder)
+    every = whole(view)
+    times = every["ticks"]["time_s"]
+    for to_s in np.linspace(0.3, every["end_s"], 17).tolist():
+        found = view.view(to_s, 0.7)
+        # A tick is that of the stretch in which it was read; what it began before the span is in it, too.
+        expected = [n for n, t in zip(every["ticks"]["number"], times, strict=True) if to_s - 0.7 <= t <= to_s]
+        assert set(expected) <= set(found["ticks"]["number"])
+        assert all(each <= to_s for each in found["ticks"]["time_s"])
+
+
+def test_a_log_is_followed_while_it_grows(folder: Path, tmp_path: Path) -> None:
+    log = read_log(folder / LOG_FILE)
+    view = SessionView(tmp_path)
+    with pytest.raises(InvalidFile, match="cannot be read"):
+        view.about()
+    writer = LogWriter(tmp_path / LOG_FILE, log.header)
+    ticks = 0
+    for number, record in enumerate(log.records):
+        writer.append(record)
+        ticks += bool(record.words.get("tick"))
+        if number % 7 == 0:
+            found = whole(view)
+            assert found["n_ticks"] == ticks
+            assert not found["damage"]
+            assert found["state"] == ("running" if record.words["kind"] != "end" else "ended")
+    writer.close()
+    found, other = whole(view), whole(SessionView(folder))
+    for name in ("ticks", "counts", "agents", "percentiles", "pulses", "end_s"):
+        assert found[name] == other[name]
+
+
+def test_a_record_that_is_just_being_written_is_waited_for(folder: Path, tmp_path: Path) -> None:
+    log = (folder / LOG_FILE).read_bytes()
+    view, shown = SessionView(tmp_path), []
+    places = [0, *range(len(log) // 2, len(log) // 2 + 3000, 211)]
+    for first, last in itertools.pairwise(places):
+        with (tmp_path / LOG_FILE).open("ab") as file:
+            file.write(log[first:last])
+        found = whole(view)
+        shown.append(found["n_ticks"])
+        assert not found["damage"]
+    assert shown == sorted(shown)
+    assert shown[-1] > shown[0] > 0
+    assert view.tail.generation == 0
+
+
+def test_a_killed_session_is_said_to_be_one(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes()[:-400])
+    old_s = time.time() - 100
+    os.utime(tmp_path / LOG_FILE, (old_s, old_s))
+    found = whole(SessionView(tmp_path))
+    assert found["state"] == "silent"
+    assert "it was killed, or it hangs" in found["message"]
+    assert "cut off" in found["damage"]
+
+
+def test_what_follows_damage_is_not_shown(folder: Path, tmp_path: Path) -> None:
+    log = bytearray((folder / LOG_FILE).read_bytes())
+    log[len(log) // 2] ^= 0xFF
+    (tmp_path / LOG_FILE).write_bytes(log)
+    old_s = time.time() - 100
+    os.utime(tmp_path / LOG_FILE, (old_s, old_s))
+    view = SessionView(tmp_path)
+    found, left = whole(view), read_session(tmp_path)
+    assert found["n_ticks"] == left.outline.ticks == whole(view)["n_ticks"]
+    assert "damaged" in found["damage"]
+
+
+def test_another_log_in_its_place_is_begun_anew(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / LOG_FILE
+    path.write_bytes((folder / LOG_FILE).read_bytes())
+    view = SessionView(tmp_path)
+    first = whole(view)
+    path.unlink()
+    writer = LogWriter(path, {**read_log(folder / LOG_FILE).header, "culture": "another"})
+    writer.close()
+    second = whole(view)
+    assert (first["n_ticks"] > 0, second["n_ticks"]) == (True, 0)
+    assert second["generation"] == first["generation"] + 1
+    assert "another" in view.about()["title"]
+
+
+def test_returns_that_were_predicted_stand_beside(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes())
+    write_predicted(tmp_path, {"random": (1.5, 1.0, 2.25)})
+    found = {each["name"]: each["predicted"] for each in whole(SessionView(tmp_path))["agents"]}
+    assert found == {"random": [1.5, 1.0, 2.25], "silent": None}
+    (tmp_path / "predicted.json").write_text("[]")
+    assert {each["predicted"] for each in whole(SessionView(tmp_path))["agents"]} == {None}
+
+
+def test_stop_makes_the_file_that_the_loop_looks_for(folder: Path, tmp_path: Path) -> None:
+    log = read_log(folder / LOG_FILE)
+    LogWriter(tmp_path / LOG_FILE, log.header).close()
+    view = SessionView(tmp_path)
+    stop_session(tmp_path)
+    assert (tmp_path / STOP_FILE).is_file()
+    assert whole(view)["stop"]
+    with pytest.raises(InvalidArgument, match="has ended"):
+        stop_session(folder)
+    assert not (folder / STOP_FILE).exists()
+
+
+def test_stop_does_not_follow_a_link(folder: Path, tmp_path: Path) -> None:
+    LogWriter(tmp_path / "in" / LOG_FILE, read_log(folder / LOG_FILE).header).close()
+    (tmp_path / "in" / STOP_FILE).symlink_to(tmp_path / "outside")
+    with pytest.raises(InvalidFile, match="STOP: cannot be made"):
+        stop_session(tmp_path / "in")
+    assert not (tmp_path / "outside").exists()
+
+
+def test_a_log_that_is_a_link_is_not_followed(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / LOG_FILE).symlink_to(folder / LOG_FILE)
+    with pytest.raises(InvalidFile, match="cannot be read"):
+        SessionView(tmp_path).about()
+
+
+def test_what_is_there_is_found_a_slice_at_a_time(folder: Path, tmp_path: Path) -> None:
+    log = read_log(folder / LOG_FILE)
+    writer = LogWriter(tmp_path / LOG_FILE, log.header)
+    for _ in range(3000):
+        writer.append(Record({"kind": "nothing"}))
+    writer.close()
+    tail, looks = Tail(tmp_path / LOG_FILE), 1
+    while not tail.grow(0.0):
+        looks += 1
+    assert len(tail) == 3001
+    assert looks > 3
+    tail.close()
+
+
+def test_a_view_is_plain_finite_json(folder: Path) -> None:
+    view = SessionView(folder)
+    for found in (view.about(), whole(view), view.view(0.0, 1.0)):
+        json.dumps(found, allow_nan=False)
+    with pytest.raises(InvalidArgument, match="span"):
+        view.view(None, 1e6)

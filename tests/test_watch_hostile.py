@@ -1,0 +1,180 @@
+"""Whatever a log or a folder holds, the page shows it as plain text or says in a line why it cannot."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zlib
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from animat.closed_loop.gathering import LOG_FILE
+from animat.closed_loop.log import read_log
+from animat.errors import AnimatError
+from animat.watch.picture import picture_of
+from animat.watch.session import SessionView
+from animat.watch.study import StudyView
+from animat.watch.training import TrainingView
+from animat.watch.tuning import TuningView
+from watching import session_in
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    "</title><img src=x onerror=alert(1)>",
+    "\ud800\x00\u202e",
+    "../../etc/passwd",
+    "a" * 5000,
+)
+
+
+def anything(draw: Random) -> Any:
+    """What a damaged file may say in place of anything."""
+    number = draw.choice([0, -1, 3, 10**30, -(10**30), 1e300, 1e-320, 0.5, math.nan, math.inf, -math.inf])
+    return draw.choice(
+        [None, True, False, number, draw.choice(HOSTILE), [], {}, [number, None], {"a": number}, [[number]]]
+    )
+
+
+def seeds(n: int) -> Any:
+    """As many cases, each from its own random numbers."""
+    checks = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+
+    def with_seeds(test: Any) -> Any:
+        return settings(max_examples=n, deadline=None, suppress_health_check=checks)(
+            given(seed=st.integers(0, 2**32))(test)
+        )
+
+    return with_seeds
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("whole")
+    session_in(path, episodes=1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def records(folder: Path) -> list[Any]:
+    """The words of each record, the header's first, and its spikes."""
+    log = read_log(folder / LOG_FILE)
+    return [(log.header, b"", 0), *((r.words, _spikes(r), len(r.spike_times_s)) for r in log.records)]
+
+
+def _spikes(record: Any) -> bytes:
+    return record.spike_times_s.astype("<f8").tobytes() + record.spike_channels.astype("<i4").tobytes()
+
+
+def written(path: Path, records: list[Any]) -> None:
+    data = b"ANIMATL1"
+    for words, spikes, n in records:
+        body = json.dumps(words).encode() + spikes
+        data += struct.pack("<4sIII", b"REC1", len(body) - len(spikes), n, zlib.crc32(body)) + body
+    path.write_bytes(data)
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where something else could stand."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value[:3]) if isinstance(value, list) else ()
+    return [at, *(place for name, each in inner for place in places(each, (*at, name)))]
+
+
+def changed(value: Any, place: tuple[Any, ...], other: Any) -> Any:
+    if not place:
+        return other
+    value = dict(value) if isinstance(value, dict) else list(value)
+    value[place[0]] = changed(value[place[0]], place[1:], other)
+    return value
+
+
+def looked_at(folder: Path) -> None:
+    """Every view of a session gives plain finite text, or a line that names the file."""
+    view = SessionView(folder)
+    try:
+        told = [view.about(), *(view.view(to_s, 30.0) for to_s in (None, 0.5, -1.0))]
+        json.dumps(told, allow_nan=False).encode()
+        picture = told[1]["picture"]
+        if picture is not None and (tick := view.tick_at(picture)) is not None:
+            drawn = picture_of(view.robot_data, *tick)
+            assert drawn is None or drawn.startswith(b"\x89PNG")
+    except AnimatError as error:
+        assert LOG_FILE in str(error)
+    finally:
+        view.close()
+
+
+@seeds(120)
+def test_records_that_say_anything(records: list[Any], tmp_path: Path, seed: int) -> None:
+    draw = Random(seed)
+    number = draw.choice([0, draw.randrange(len(records))])
+    words, spikes, n = records[number]
+    for _ in range(draw.randint(1, 3)):
+        words = changed(words, draw.choice(places(words)), anything(draw))
+    written(tmp_path / LOG_FILE, [*records[:number], (words, spikes, n), *records[number + 1 :]])
+    looked_at(tmp_path)
+
+
+@seeds(100)
+def test_logs_with_damaged_bytes(folder: Path, tmp_path: Path, seed: int) -> None:
+    draw = Random(seed)
+    log = bytearray((folder / LOG_FILE).read_bytes())
+    for _ in range(draw.randint(0, 4)):
+        log[draw.randrange(len(log))] = draw.randrange(256)
+    (tmp_path / LOG_FILE).write_bytes(log[: draw.randint(0, len(log))] + draw.randbytes(draw.choice([0, 7, 40])))
+    looked_at(tmp_path)
+
+
+@seeds(40)
+def test_spikes_that_cannot_be(records: list[Any], tmp_path: Path, seed: int) -> None:
+    draw = Random(seed)
+    number, n = draw.randrange(1, len(records)), draw.randint(0, 5)
+    spikes = draw.randbytes(12 * n)
+    written(tmp_path / LOG_FILE, [*records[:number], (records[number][0], spikes, n), *records[number + 1 :]])
+    looked_at(tmp_path)
+
+
+TRAINING = {
+    "training": {
+        "policies": 2, "iterations": 1000, "duration_min": 10.0, "shadowing": True, "mapping": "9-thresholds",
+        "robot": {"name": "cartpole"}, "algorithm": {"discount": 0.9}, "assess": 3,
+    },
+    "simulators": {"recorded_at_min": [0.0, 5.0]},
+}  # fmt: skip
+STUDY = {"study": {"robots": [{"name": "cartpole"}]}, "fingerprint": "x"}
+TUNING = {"tune": {"trials": 5}, "study": {"robots": [{"name": "cartpole"}]}}
+TRIAL = {"trial": 0, "settings": {"discount": 0.9}, "state": "complete", "chunks": [7], "returns": [[1.0, 2.0]]}
+
+
+@seeds(60)
+def test_folders_that_say_anything(tmp_path: Path, seed: int) -> None:
+    draw = Random(seed)
+    kind, name, words = draw.choice(
+        [(TrainingView, "training.json", TRAINING), (StudyView, "study.json", STUDY), (TuningView, "tune.json", TUNING)]
+    )
+    (tmp_path / name).write_text(json.dumps(changed(words, draw.choice(places(words)), anything(draw))))
+    trial = changed(TRIAL, draw.choice(places(TRIAL)), anything(draw))
+    (tmp_path / "journal.jsonl").write_text(json.dumps(trial) + "\nno JSON\n")
+    told = tmp_path / ".unfinished" / ".told"
+    told.mkdir(parents=True, exist_ok=True)
+    (told / "p0 to p1.json").write_text(json.dumps([anything(draw), anything(draw)]))
+    for file in (".unfinished/from-p0.npz", "p0.safetensors", "assessments.csv", "jobs/x.json"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_bytes(draw.randbytes(draw.choice([0, 9, 60])))
+    view = kind(tmp_path)
+    try:
+        json.dumps([view.about(), view.view(None, 8.0)], allow_nan=False).encode()
+    except AnimatError as error:
+        assert name in str(error)
+
+
+def test_a_study_that_names_code_imports_none_of_it(tmp_path: Path) -> None:
+    (tmp_path / "study.json").write_text(json.dumps(STUDY))
+    (tmp_path / "study.toml").write_text('[[robots]]\nname = "mine"\nkind = "not_to_be_imported:Rover"\n')
+    told = StudyView(tmp_path).view(None, 8.0)["blocks"][0]
+    assert dict(told["rows"])["waiting"].startswith("not known: the study names code of one's own")

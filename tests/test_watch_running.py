@@ -1,0 +1,187 @@
+"""The page beside what runs: Stop ends a session, and a server of its own shows it in a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib.util
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
+from animat.closed_loop.session import Session, read_session
+from animat.errors import AnimatError, InvalidArgument
+from animat.watch.serving import watching
+from watching import OWN, PORT, TOKEN, asked, session_in
+
+pytest.importorskip("starlette", reason="the extra [watch] is not installed")
+pytest.importorskip("uvicorn", reason="the extra [watch] is not installed")
+
+from animat.watch.app import app_for
+
+
+@contextlib.contextmanager
+def running(folder: Path) -> Iterator[list[Session]]:
+    """A session in real time in another thread; what it came to is in the list in the end."""
+    ended: list[Session] = []
+    loop = threading.Thread(target=lambda: ended.append(session_in(folder, episodes=500, real_time=True)))
+    loop.start()
+    try:
+        wait_for(lambda: (folder / LOG_FILE).exists() and (folder / LOG_FILE).stat().st_size > 2**14)
+        yield ended
+    finally:
+        (folder / STOP_FILE).touch()
+        loop.join()
+
+
+def wait_for(what: Any) -> Any:
+    """What is true at last."""
+    for _ in range(600):
+        if found := what():
+            return found
+        time.sleep(0.05)
+    pytest.fail("it never came")
+
+
+def test_stop_ends_a_session_before_the_next_pulse(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    app = app_for(tmp_path, TOKEN, PORT)
+    with running(folder) as ended:
+        seen = asked(app, "view", kind="session", **{"in": "session"}).json
+        assert (seen["state"], seen["stop"]) == ("running", False)
+        assert asked(app, "stop", method="POST", origin=OWN, **{"in": "session"}).status == 200
+        wait_for(lambda: ended)
+    session = read_session(folder)
+    assert session.ending.by == "person"
+    assert "the file STOP" in session.ending.message
+    after = asked(app, "view", kind="session", span=60, **{"in": "session"}).json
+    assert after["state"] == "ended"
+    assert after["pulses"] == session.outline.pulses
+
+
+def test_a_command_that_is_watched_serves_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session_in(tmp_path, episodes=1)
+    with watching(tmp_path):
+        address = re.search(r"http://127\.0\.0\.1:\d+/[\w-]+/", capsys.readouterr().err)
+        assert address is not None
+        with http(address[0] + "things") as answer:
+            assert b'"session"' in answer.read()
+        with pytest.raises(OSError, match="403"):
+            http(re.sub(r"/[\w-]+/$", "/wrong/", address[0]))
+    end_servers()
+
+
+def test_a_command_that_is_refused_leaves_no_server(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument), watching(tmp_path / "none"):
+        raise InvalidArgument("--seed: expected another")
+    assert not servers()
+
+
+def test_a_server_that_does_not_start_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+    with pytest.raises(AnimatError, match="the page's server did not start"), watching(tmp_path):
+        pass
+
+
+def http(address: str) -> Any:
+    from urllib.request import urlopen
+
+    return urlopen(address, timeout=30)
+
+
+def servers() -> list[int]:
+    """The page's servers that this process started, by their numbers."""
+    found = []
+    for each in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            words = each.read_bytes().split(b"\0")
+            if b"animat.watch" in words and str(os.getpid()).encode() in words:
+                found.append(int(each.parent.name))
+    return found
+
+
+def end_servers() -> None:
+    for number in servers():
+        os.kill(number, signal.SIGTERM)
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(number, 0)
+
+
+CHROMIUM, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
+HAS_BROWSER = CHROMIUM and DRIVER and importlib.util.find_spec("selenium")
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM or ""
+    for argument in ("--headless=new", "--no-sandbox", "--window-size=1400,1000", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+@pytest.mark.oracle
+@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium, chromedriver and selenium")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: Any) -> None:
+    folder = tmp_path / "<img src=x onerror=alert(1)>"
+
+    def said(css: str) -> str:
+        return str(browser.execute_script("return document.querySelector(arguments[0])?.textContent ?? ''", css))
+
+    with running(folder) as ended, served(tmp_path) as address:
+        browser.get(address)
+        wait_for(lambda: said("#state").startswith("● running"))
+        first = wait_for(lambda: said("#now dd"))
+        wait_for(lambda: said("#now dd") != first)
+        wait_for(lambda: browser.execute_script("return document.querySelector('img')?.naturalWidth > 0"))
+        browser.find_element("id", "pause").click()
+        wait_for(lambda: said("#pause") == "Follow")
+        browser.find_element("id", "stop").click()
+        wait_for(lambda: ended)
+        wait_for(lambda: said("#state").startswith("■ ended: person"))
+        browser.find_element("id", "pause").click()
+        with (folder / "ticks.csv").open(newline="") as file:
+            *_, row = csv.DictReader(file)
+        wait_for(lambda: said("#now dd").replace(",", "") == row["tick"])
+        told = browser.execute_script(
+            "return [...document.querySelectorAll('#now dd')].map((each) => each.textContent)"
+        )
+        numbers = [
+            float(each.replace("\u2212", "-").replace(",", "")) for each in (told[1][:-2], told[5].split(" ")[0])
+        ]
+        assert numbers == pytest.approx([float(row["time_s"]), float(row["rate_hz"])], rel=1e-5)
+        assert not [line for line in browser.get_log("browser") if "favicon" not in line["message"]]
+        assert not browser.execute_script("return document.querySelectorAll('option img, header img').length")
+
+
+@contextlib.contextmanager
+def served(folder: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "animat", "watch", str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        try:
+            yield server.stdout.readline().split()[0]
+        finally:
+            server.send_signal(signal.SIGINT)
+            server.communicate()
+    assert server.returncode == 0

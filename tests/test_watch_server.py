@@ -1,0 +1,194 @@
+"""The page's server answers this machine alone, by the address with the token, and nothing outside of the folder."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from animat.cli import main
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
+from animat.closed_loop.log import LogWriter, read_log
+from animat.studies.folder import MANIFEST as STUDY
+from animat.training.folder import MANIFEST as TRAINING
+from animat.tuning.folder import MANIFEST as TUNING
+from animat.watch.found import _MARKS, find
+from watching import OWN, PORT, TOKEN, asked, session_in
+
+pytest.importorskip("starlette", reason="the extra [watch] is not installed")
+
+from animat.watch.app import app_for
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("served")
+    session_in(path / "in" / "session")
+    session_in(path / "outside")
+    return path
+
+
+@pytest.fixture
+def app(folder: Path) -> Any:
+    return app_for(folder / "in", TOKEN, PORT)
+
+
+def test_the_page_and_its_files_come_from_here(app: Any) -> None:
+    page = asked(app, "")
+    assert page.status == 200
+    assert page.headers["content-type"].startswith("text/html")
+    text = page.body.decode()
+    for name in re.findall(r'(?:src|href)="([^"]+)"', text):
+        assert asked(app, name).status == 200
+    assert "<script>" not in text
+    assert not re.search(r"\bon\w+=|style=", text)
+    for name in ("page.js", "draw.js", "session.js", "style.css"):
+        words = asked(app, name).body.decode()
+        # Nothing is asked for elsewhere, and no text becomes markup.
+        assert not re.search(
+            r"https?://(?!www\.w3\.org)|innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(", words
+        )
+
+
+def test_every_answer_has_the_strict_policy(app: Any) -> None:
+    for answer in (asked(app, ""), asked(app, "things"), asked(app, "nowhere"), asked(app, "", token="wrong")):
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["referrer-policy"] == "no-referrer"
+        assert "access-control-allow-origin" not in answer.headers
+
+
+def test_a_session_is_seen(app: Any) -> None:
+    (thing,) = asked(app, "things").json["things"]
+    assert (thing["kind"], thing["place"]) == ("session", "session")
+    about = asked(app, "about", kind="session", **{"in": "session"}).json
+    assert about["title"].startswith("navigation on the ")
+    view = asked(app, "view", kind="session", span=20, **{"in": "session"}).json
+    assert view["n_ticks"] > 0
+    picture = asked(app, "robot.png", at=view["picture"], **{"in": "session"})
+    assert (picture.status, picture.headers["content-type"]) == (200, "image/png")
+    assert picture.body.startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"token": "wrong"},
+        {"token": TOKEN[:-1]},
+        {"token": TOKEN + "x"},
+        {"token": ""},
+        {"raw": "/"},
+        {"raw": f"/{TOKEN}"},
+        {"raw": f"//{TOKEN}/"},
+        {"host": "rebound.example"},
+        {"host": f"rebound.example:{PORT}"},
+        {"host": "127.0.0.1"},
+        {"host": f"127.0.0.1:{PORT + 1}"},
+        {"host": f"127.0.0.1.example:{PORT}"},
+        {"host": None},
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": f"https://127.0.0.1:{PORT}"},
+        {"origin": f"http://127.0.0.1:{PORT + 1}"},
+        {"origin": f"http://127.0.0.1:{PORT}.evil.example"},
+    ],
+    ids=str,
+)
+def test_whoever_else_asks_is_refused(app: Any, folder: Path, wrong: dict[str, Any]) -> None:
+    for path, method in (("", "GET"), ("things", "GET"), ("stop?in=session", "POST")):
+        answer = asked(app, path, method=method, **{"origin": OWN if method == "POST" else None, **wrong})
+        assert answer.status == 403
+        assert b"animat" not in answer.body
+    assert not (folder / "in" / "session" / STOP_FILE).exists()
+
+
+def test_a_websocket_is_refused(app: Any) -> None:
+    sent = []
+
+    async def receive() -> Any:
+        return {"type": "websocket.connect"}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    headers = [(b"host", f"127.0.0.1:{PORT}".encode()), (b"origin", OWN.encode())]
+    asyncio.run(app({"type": "websocket", "path": f"/{TOKEN}/", "headers": headers}, receive, send))
+    assert sent == [{"type": "websocket.close", "code": 1008}]
+
+
+@pytest.mark.parametrize("place", ["../outside", "..", "/etc", "session/../../outside", "a\0b", "linked"])
+def test_a_path_outside_of_the_folder_is_refused(app: Any, folder: Path, place: str) -> None:
+    linked = folder / "in" / "linked"
+    if not linked.is_symlink():
+        linked.symlink_to(folder / "outside")
+    for path in ("about", "view"):
+        answer = asked(app, path, kind="session", **{"in": place})
+        assert answer.status == 409
+        assert "expected a folder below the one that is watched" in answer.json["error"]
+    assert asked(app, "stop", method="POST", origin=OWN, **{"in": place}).status == 409
+    assert not (folder / "outside" / STOP_FILE).exists()
+    assert [each.place for each in find(folder / "in")] == ["session"]
+
+
+@pytest.mark.parametrize("path", ["../app.py", "%2e%2e/app.py", "page/index.html", "session.log", "guard.py"])
+def test_no_other_file_is_served(app: Any, path: str) -> None:
+    assert asked(app, path).status == 404
+
+
+def test_stop_is_posted_from_the_page_alone(folder: Path, tmp_path: Path) -> None:
+    header = read_log(folder / "outside" / LOG_FILE).header
+    LogWriter(tmp_path / LOG_FILE, header).close()
+    app = app_for(tmp_path, TOKEN, PORT)
+    assert asked(app, "stop").status == 405
+    assert asked(app, "stop", method="POST").status == 403
+    assert not (tmp_path / STOP_FILE).exists()
+    assert asked(app, "stop", method="POST", origin=OWN, **{"in": ""}).json == {"stopped": True}
+    assert (tmp_path / STOP_FILE).exists()
+
+
+def test_nothing_but_stop_changes_anything(app: Any, folder: Path) -> None:
+    def state() -> dict[str, Any]:
+        return {str(f): (f.stat().st_mtime_ns, f.stat().st_size) for f in folder.rglob("*")}
+
+    before = state()
+    for path in ("", "things", "about", "view", "robot.png"):
+        for method in ("GET", "HEAD", "POST", "PUT", "DELETE"):
+            asked(app, path, method=method, origin=OWN, kind="session", **{"in": "session"})
+    assert asked(app, "stop", method="POST", origin=OWN, **{"in": "session"}).status == 409
+    assert state() == before
+
+
+def test_what_is_asked_for_wrongly_is_said(app: Any) -> None:
+    for query in ({"span": "x"}, {"span": "nan"}, {"span": "1e9"}, {"to": "1e99"}, {"kind": "other"}):
+        answer = asked(app, "view", **{"kind": "session", "in": "session", **query})
+        assert answer.status == 409
+        assert "expected" in answer.json["error"]
+    assert asked(app, "robot.png", at="-5", **{"in": "session"}).status == 409
+
+
+def test_an_empty_folder_says_so_and_is_looked_at_again(tmp_path: Path) -> None:
+    app = app_for(tmp_path / "to come", TOKEN, PORT)
+    assert asked(app, "things").json == {"folder": "to come", "things": []}
+    session_in(tmp_path / "to come", episodes=1)
+    assert [each["place"] for each in asked(app, "things").json["things"]] == [""]
+
+
+def test_folders_are_known_by_the_files_that_are_written() -> None:
+    assert dict(_MARKS) == {"session": LOG_FILE, "training": TRAINING, "tuning": TUNING, "study": STUDY}
+
+
+def test_the_command_says_what_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["watch", str(tmp_path / "none")]) == 1
+    assert "expected a folder to watch, got none" in capsys.readouterr().err
+    assert main(["watch", str(tmp_path), "--port", "70000"]) == 1
+    assert "--port: expected one from 1 to 65,535 that is free" in capsys.readouterr().err
+    monkeypatch.setattr("animat.watch.serving.find_spec", lambda name: None)
+    assert main(["watch", str(tmp_path)]) == 1
+    assert "pip install 'animat[watch]'" in capsys.readouterr().err

@@ -1,0 +1,151 @@
+"""What the page shows of trainings, studies, tunings and recordings is what their folders hold."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from animat.errors import InvalidFile
+from animat.execution.receipts import Receipt
+from animat.recordings.reading import read_recording
+from animat.recordings.synthetic import write_synthetic_series
+from animat.responses.inspection import inspect_recording
+from animat.studies.plan import plan_study
+from animat.studies.toml import read_study
+from animat.watch.held import is_held
+from animat.watch.recording import RecordingView
+from animat.watch.speed import Speed
+from animat.watch.study import StudyView
+from animat.watch.training import TrainingView
+from animat.watch.tuning import TuningView
+from animat.writing import exclusive_lock
+
+TINY = Path(__file__).parent / "tiny_study.toml"
+
+
+def block(view: dict[str, Any], title: str, kind: str = "") -> dict[str, Any]:
+    (found,) = [each for each in view["blocks"] if each["title"] == title and kind in ("", each["kind"])]
+    return found
+
+
+def facts(view: dict[str, Any], title: str) -> dict[str, Any]:
+    return dict(block(view, title, "facts")["rows"])
+
+
+def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> None:
+    training = {
+        "policies": 3, "iterations": 6000, "duration_min": 20.0, "shadowing": True, "mapping": "9-thresholds",
+        "robot": {"name": "cartpole"}, "algorithm": {"discount": 0.99},
+    }  # fmt: skip
+    manifest = {"training": training, "simulators": {"recorded_at_min": [0.0, 10.0, 15.0]}}
+    (tmp_path / "training.json").write_text(json.dumps(manifest))
+    told = tmp_path / ".unfinished" / ".told"
+    told.mkdir(parents=True)
+    curve = np.zeros((30, 2, 3))
+    curve[:, :, 0] = 100.0 * np.arange(1, 31)[:, None]
+    curve[:, :, 2] = np.arange(30)[:, None] + [0.0, 10.0]
+    curve[:3, :, 2] = np.nan
+    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve, done=np.array(30))
+    (told / "p0 to p1.json").write_text(json.dumps([0.55, "return 31.0"]))
+    with exclusive_lock(tmp_path):
+        found = TrainingView(tmp_path).view(None, 8.0)
+        assert found["state"] == "running"
+    assert facts(found, "So far")["done"] == "37 % of all"
+    # 55 % of 20 minutes are 11: the second recording.
+    assert facts(found, "So far")["in use"] == "that of minute 10"
+    chart = block(found, "Learning curves")
+    assert chart["marks"] == [[3000.0, "minute 10"], [4500.0, "minute 15"]]
+    *policies, mean = chart["series"]
+    assert [each["y"] for each in policies] == [[None] * 3 + list(np.arange(3.0, 30) + more) for more in (0, 10)]
+    assert mean["y"][3:] == list(np.arange(3.0, 30) + 5)
+    assert [row[:3] for row in block(found, "Policies")["rows"]] == [
+        ["p0", "55 %", 29.0],
+        ["p1", "55 %", 39.0],
+        ["p2", "0 %", "none yet"],
+    ]
+    stopped = TrainingView(tmp_path).view(None, 8.0)
+    assert stopped["state"] == "silent"
+    assert "started again it goes on" in stopped["message"]
+
+
+def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(TINY.read_text())
+    (tmp_path / "study.json").write_text(json.dumps({"study": {"robots": [{"name": "navigation"}]}}))
+    jobs = [job.name for job in plan_study(read_study(TINY), tmp_path)]
+    for job in jobs[:2]:
+        Receipt(job, "x", {}, {"a": "b", "c": "d"}).save(tmp_path / "jobs")
+    told = tmp_path / ".unfinished" / ".told"
+    told.mkdir(parents=True)
+    (told / f"{jobs[2].replace('/', '+')}.json").write_text('[0.25, "a remark"]')
+    # Of a job that is done by now.
+    (told / f"{jobs[0].replace('/', '+')}.json").write_text('[1.0, ""]')
+    with exclusive_lock(tmp_path):
+        found = StudyView(tmp_path).view(None, 8.0)
+    rows = facts(found, "Jobs")
+    assert (rows["jobs done"], rows["running"], rows["waiting"]) == (2, 1, len(jobs) - 3)
+    assert block(found, "Running")["rows"] == [[jobs[2], "25 %", "a remark"]]
+    assert sorted(block(found, "Done")["rows"]) == sorted([job, 2] for job in jobs[:2])
+    assert [job for (job,) in block(found, "Waiting")["rows"]] == jobs[3:]
+
+
+def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
+    (tmp_path / "tune.json").write_text(json.dumps({"tune": {"trials": 5}, "study": {"robots": [{"name": "arm"}]}}))
+    told = [
+        {"trial": 0, "settings": {"discount": 0.98765}, "state": "complete", "returns": [[1.0, 2.0], [3.0, 5.0]]},
+        {"trial": 1, "settings": {"discount": 0.9}, "state": "stopped", "returns": [[50.0, 60.0]]},
+        {"trial": 2, "settings": {"discount": 0.8}, "state": "diverged", "returns": []},
+    ]
+    (tmp_path / "journal.jsonl").write_text("".join(json.dumps(each) + "\n" for each in told))
+    found = TuningView(tmp_path).view(None, 8.0)
+    rows = facts(found, "Trials")
+    assert rows["trials told"] == "3 of 5"
+    assert [rows[name] for name in ("complete", "stopped early", "diverged")] == [1, 1, 1]
+    # One that came further counts before one that did well at the first rung.
+    assert rows["best so far"] == "trial 0, 4.0"
+    assert block(found, "Journal")["rows"][-1] == [0, "complete", 4.0, "discount 0.9877"]
+
+
+def test_recordings_are_inspected_one_after_the_other(tmp_path: Path) -> None:
+    view = RecordingView(tmp_path)
+    with pytest.raises(InvalidFile, match="expected recordings"):
+        view.view(None, 8.0)
+    files = write_synthetic_series(1, tmp_path, sessions=2, channels=32, patterns=20)
+    view.view(None, 8.0)
+    found = view.view(5.0, 2.0)
+    recording = read_recording(files[1])
+    inspected = [inspect_recording(read_recording(file)) for file in files]
+    rows = block(found, "P(x >= P50) of each condition")["rows"]
+    assert rows == [
+        [first.label, first.share_above_median, second.share_above_median]
+        for first, second in zip(*(each.conditions for each in inspected), strict=True)
+    ]
+    raster = block(found, "Spikes by channel")
+    within = (recording.spike_times_s >= 3.0) & (recording.spike_times_s <= 5.0)
+    assert raster["spikes"]["n"] == within.sum() > 10
+    channels = np.frombuffer(base64.b64decode(raster["spikes"]["channels"]), "<u2")
+    np.testing.assert_array_equal(channels, recording.spike_channels[within])
+    assert (found["from_s"], found["to_s"]) == (3.0, 5.0)
+    assert [row[1] for row in block(found, "Findings")["rows"]] == [each.message for each in inspected[1].findings]
+
+
+def test_a_folder_is_held_while_a_run_has_locked_it(tmp_path: Path) -> None:
+    assert not is_held(tmp_path)
+    with exclusive_lock(tmp_path):
+        assert is_held(tmp_path)
+    assert not is_held(tmp_path)
+
+
+def test_speed_is_that_of_the_last_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    speed, now_s = Speed(), [0.0]
+    monkeypatch.setattr("animat.watch.speed.time.monotonic", lambda: now_s[0])
+    assert speed.left_s(10) is None
+    for second in range(201):
+        now_s[0] = float(second)
+        speed.see(min(second, 100) * 1.0 + 3.0 * max(0, second - 100))
+    assert speed.per_s == pytest.approx(3.0)
+    assert speed.left_s(30.0) == pytest.approx(10.0)

@@ -1,0 +1,180 @@
+"""Interventions: each against what it must do to a robot whose rewards are known, and the table of all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from animat.coding.mapping import Linear, Thresholds
+from animat.environment import Animat, WithoutNeurons
+from animat.errors import InvalidArgument
+from animat.evaluation.commands import mean_commands
+from animat.evaluation.controls import interventions_of
+from animat.evaluation.rollouts import Actor, Networks, roll_out
+from animat.evaluation.traces import trace
+from animat.evaluation.whose_work import whose_work
+from animat.neurons.simulator import indifferent
+from animat.neurons.synthetic import synthetic_simulator
+from animat.robots import Cartpole, Quantity, Robot, Wheels
+from animat.training.networks import Layer
+from animat.wrappers import GoalSwitch, YokedDelivery
+
+
+class Aimed(NamedTuple):
+    sensed: jax.Array
+    goal: jax.Array
+
+
+@dataclass(frozen=True)
+class Aiming(Robot[Aimed]):
+    """A number is sensed, drawn anew in each iteration; its goal is -1 or 1, and the reward goal x sensed x u."""
+
+    episode_limit: int = 10
+    name = "aiming"
+    noise_size = 1
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return (Quantity("sensed", "1", 1.0), Quantity("goal", "1", 1.0, of_goal=True))
+
+    def reset(self, key: Any) -> Aimed:
+        one, other = jax.random.uniform(key, (2,))
+        return Aimed(jnp.sign(one - 0.5), jnp.sign(other - 0.5))
+
+    def advance(self, uniforms: Any, state: Aimed, u: Any) -> tuple[Aimed, Any, Any]:
+        sensed = jnp.sign(uniforms[0] - 0.5)
+        return Aimed(sensed, state.goal), (state.goal * state.sensed * u).astype(jnp.float32), jnp.bool_(False)
+
+    def observe(self, state: Aimed) -> Any:
+        return jnp.stack(state)
+
+    def with_goal_of(self, state: Aimed, other: Aimed) -> Aimed:
+        return state._replace(goal=other.goal)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Best(Actor):
+    """The last condition where goal and sensor agree, the first where they do not."""
+
+    number: Any
+
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return jnp.where(observation[:, 0] * observation[:, 1] > 0, environment.n_actions - 1, 0)
+
+
+SIMULATOR = synthetic_simulator()
+ENVIRONMENT = Animat(Aiming(), Thresholds(1), 5)
+BEST = Best(jnp.zeros(1))
+
+
+def episodes_of(environment: Any, simulator: Any = SIMULATOR, actor: Actor = BEST) -> np.ndarray:
+    return roll_out(environment, simulator, actor, 1, episodes=2000, seed=5).returns[0]
+
+
+def test_each_intervention_does_what_it_says() -> None:
+    usual = episodes_of(ENVIRONMENT)
+    found = {each.name: each for each in interventions_of(ENVIRONMENT, SIMULATOR, BEST, 1, switch_at=4)}  # type: ignore[arg-type]
+    returns = {name: episodes_of(each.environment, each.simulator) for name, each in found.items()}
+    assert [*found] == [
+        "ideal actuator", "random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched"
+    ]  # fmt: skip
+    _, means = mean_commands(ENVIRONMENT, SIMULATOR)
+    assert abs(usual.mean() - 10 * (means[-1] - means[0]) / 2) < 4 * usual.std() / np.sqrt(2000)
+    np.testing.assert_array_equal(returns["ideal actuator"], 10.0)
+    np.testing.assert_array_equal(returns["turned round"], -usual)
+    # Without a link between what is chosen and what is done, the goal is met as often as not.
+    for name in ("random spikes", "silent", "shuffled", "yoked"):
+        assert abs(returns[name].mean()) < 4 * returns[name].std() / np.sqrt(2000), name
+    # Who knows the goal is not bothered by another one.
+    assert abs(returns["goal switched"].mean() - usual.mean()) < 6 * usual.std() / np.sqrt(2000)
+
+
+def test_random_spikes_have_the_rates_of_the_culture_and_do_not_listen() -> None:
+    spikes = indifferent(SIMULATOR)
+    uniforms = (jnp.arange(4096) + 0.5) / 4096
+    conditions = jnp.arange(SIMULATOR.n_conditions)
+    own, of_all = (
+        np.asarray(jax.vmap(jax.vmap(each.quantile, (None, 0)), (0, None))(conditions, uniforms))
+        for each in (SIMULATOR, spikes)
+    )
+    np.testing.assert_array_equal(of_all, of_all[:1].repeat(len(of_all), axis=0))
+    shares = np.linspace(0.05, 0.95, 19)
+    np.testing.assert_allclose(np.quantile(of_all, shares), np.quantile(own, shares), rtol=0.01)
+
+
+def test_yoked_stimuli_are_those_of_the_episode_that_is_observed() -> None:
+    yoked = YokedDelivery(Animat(Aiming(), Linear(), 5))
+    traced = trace(yoked, SIMULATOR, BEST, 1, episodes=50, seed=2)
+    other = traced.states.info["other_episode"].robot
+    agree = np.asarray(other.goal * other.sensed)[:, :, :-1] > 0
+    np.testing.assert_array_equal(traced.actions == 4, agree)
+    # The two episodes have nothing to do with each other.
+    here = np.asarray(traced.states.robot.goal * traced.states.robot.sensed)[:, :, :-1] > 0
+    assert 0.4 < (here == agree).mean() < 0.6
+
+
+@pytest.mark.oracle
+def test_the_goal_is_switched_once_and_nothing_else() -> None:
+    plain = Animat(Wheels(), Thresholds(1), 5)
+    body, other = (Wheels().reset(jax.random.key(i)) for i in (1, 2))
+    switched = Wheels().with_goal_of(body, other)
+    assert switched[:3] == body[:3] and switched[3:] == other[3:]
+    assert plain.robot == GoalSwitch(plain, 3).robot
+    environment = GoalSwitch(ENVIRONMENT, 3)
+    once, usual = (trace(each, SIMULATOR, BEST, 1, episodes=40, seed=3) for each in (environment, ENVIRONMENT))
+    goals, sensed = (np.asarray(each) for each in (once.states.robot.goal, once.states.robot.sensed))
+    np.testing.assert_array_equal(sensed, usual.states.robot.sensed)
+    np.testing.assert_array_equal(goals[..., :3], np.asarray(usual.states.robot.goal)[..., :3])
+    np.testing.assert_array_equal(goals[..., 3:], goals[..., 3:4].repeat(8, axis=2))
+    changed = goals[..., 3] != goals[..., 2]
+    assert changed.all()
+    # Whoever knows the goal turns with the first action after it.
+    differs = once.actions != usual.actions
+    np.testing.assert_array_equal(differs[..., :3], False)
+    np.testing.assert_array_equal(differs[..., 3], changed)
+    with pytest.raises(InvalidArgument, match="cartpole has no method `with_goal_of`"):
+        GoalSwitch(Animat(Cartpole(), Thresholds(1), 5), 3)
+
+
+def linear_networks(*weights: np.ndarray) -> Networks:
+    """Policies of one layer, without a bias."""
+    stacked = np.stack(weights).astype(np.float32)
+    layer = Layer(jnp.asarray(stacked), jnp.zeros((len(weights), 1, stacked.shape[2])))
+    return Networks((layer,), jnp.ones((len(weights), stacked.shape[1])), greedy=True)
+
+
+@pytest.mark.oracle
+def test_the_table_tells_a_policy_that_knows_its_goal_from_one_that_does_not() -> None:
+    towards = np.array([[0.0] * 5, [-1.0, 0.0, 0.0, 0.0, 1.0]])
+    knows = whose_work(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), 2, episodes=50, seed=1)
+    told = {row["name"]: row for row in knows.to_dict()["rows"]}
+    # Of two goals that are equally likely each has its action: 1 bit, whether the culture listens or not.
+    for name in ("as they are", "silent", "shuffled"):
+        assert told[name]["goal_information"]["bits"]["value"] == pytest.approx(1.0, abs=0.05)
+    turning = knows.turning
+    assert turning is not None and (turning.at, turning.episodes, turning.after) == (5, 64, 1.0)
+    assert turning.turned == 1.0
+    blind = whose_work(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), 1, episodes=50, seed=1)
+    information = blind.rows[0].information
+    assert information is not None and (information.bits.value, information.p) == (0.0, 1.0)
+    assert blind.turning is not None and (blind.turning.turned, blind.turning.after) == (0.0, None)
+    text = knows.to_text()
+    assert "of 1.00 bits" in text and "the first time with action 1 after it" in text
+    usual, turned = (row.returns for row in (knows.rows[0], knows.rows[6]))
+    np.testing.assert_allclose(knows.rows[6].lost.value, (usual - turned).mean())
+
+
+@pytest.mark.oracle
+def test_one_goal_alone_and_no_neurons_are_said() -> None:
+    falling = linear_networks(np.zeros((4, 5)))
+    made = whose_work(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
+    assert made.turning is None and "the robot has one goal alone" in made.to_text()
+    assert [row.name for row in made.rows][-1] == "turned round"
+    with pytest.raises(InvalidArgument, match="expected policies that act through neurons"):
+        whose_work(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)
