@@ -140,6 +140,7 @@ def test_the_reward_is_by_how_far_the_tip_is_and_no_episode_ends() -> None:
         np.testing.assert_allclose(robot.observe(state)[8:], [(target - tip).real, (target - tip).imag], atol=1e-6)
 
 
+@pytest.mark.oracle
 def test_no_joint_passes_the_bound_of_its_speed() -> None:
     """Full torques that go with the movement, or against it in turns, at which speeds are largest."""
     for robot in (TwoLinkArm(), TwoLinkArm(damping_n_m_s=0.0), TwoLinkArm(torque_n_m=0.1), TwoLinkArm(**LINKS)):

@@ -81,6 +81,7 @@ def test_what_is_there_is_kept_and_nothing_is_done_again(
     assert [file.stat().st_mtime_ns for file in undisturbed] == times
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize(
     "lost",
     [
@@ -138,6 +139,7 @@ def test_a_complete_series_gets_its_selection_back_and_needs_no_state(undisturbe
     assert not (folder / STATE_FILE).exists()
 
 
+@pytest.mark.oracle
 def test_a_series_that_needs_its_state_is_recorded_again_to_have_it(undisturbed: list[Path], tmp_path: Path) -> None:
     folder = copied(undisturbed[:2], tmp_path / "series")
     state = (folder / STATE_FILE).read_bytes()

@@ -145,6 +145,7 @@ def test_what_cannot_be_filmed_is_one_line_and_leaves_nothing(
     assert {path.name for path in tmp_path.iterdir()} == {"none", "begun"}
 
 
+@pytest.mark.oracle
 def test_policies_on_the_simulator_move_as_their_robot_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_synthetic_series(1, tmp_path / "recordings", sessions=1, patterns=30, channels=32)
     untrained(Navigation(episode_limit=8)).save(tmp_path / "p0.safetensors")

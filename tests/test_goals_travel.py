@@ -122,6 +122,7 @@ def test_a_study_has_a_goal_in_its_file(tmp_path: Path) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.oracle
 def test_a_study_tabulates_how_far_each_objective_was_met(tmp_path: Path) -> None:
     goal = "avoid cart_position above 0.1 m; minimize cart_velocity below 0 m/s"
     specs = (RobotSpec("cartpole", goal=goal), RobotSpec("navigation"))

@@ -51,6 +51,7 @@ def varied(lesson: Lesson, robot: Robot[Any], rows: tuple[int, int] = (0, 0), **
     return Varied(environment, varying, ranges_of(lesson, varying, robot, rows))
 
 
+@pytest.mark.oracle
 def test_episodes_are_drawn_uniformly_from_their_ranges_each_on_its_own() -> None:
     environment = varied(LONG_POLES, Cartpole(), (2, 5))
     state = jax.vmap(environment.reset)(jax.random.split(jax.random.key(7), 4_000))

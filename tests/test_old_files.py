@@ -62,6 +62,7 @@ def test_recordings_are_what_they_were(
     assert capsys.readouterr().out.count("usable") == 2
 
 
+@pytest.mark.oracle
 def test_a_policy_acts_as_it_did_and_is_evaluated_and_run(
     old: Path, told: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -211,6 +211,7 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
@@ -634,6 +635,7 @@ def test_policies_that_do_not_belong_together_are_refused(tmp_path: Path, series
     assert gap.loop.pulses == 5
 
 
+@pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
 def test_a_budget_that_ends_early_leaves_what_was_measured(tmp_path: Path, series: list[Responses]) -> None:
     gap, _ = run(tmp_path, series, account=Account(Budget(pulses=60)), with_controls=False)

@@ -131,6 +131,7 @@ def test_a_reason_is_named_with_its_number_where_the_session_has_it(name: str) -
     assert len(others) <= binom.isf(1e-4, 20, len(CHECKS) * LEVEL)
 
 
+@pytest.mark.oracle
 def test_where_there_is_no_reason_hardly_one_is_named() -> None:
     sessions = 400
     named = [found.name for seed in range(sessions) for found in reasons(session(seed))]

@@ -295,6 +295,7 @@ write_nwb(synthetic_recording(4), sys.argv[1])
 """
 
 
+@pytest.mark.oracle
 def test_a_cache_that_another_process_is_writing_is_not_read(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYNWB_NO_CACHE_DIR"}
     environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")

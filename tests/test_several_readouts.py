@@ -168,6 +168,7 @@ def test_each_command_is_the_mapping_s_of_its_readout(mapping: Mapping) -> None:
     assert decoded(mapping, x[0, 0], percentiles[0]) == mapping.command(x[0, 0], percentiles[0])
 
 
+@pytest.mark.oracle
 def test_mean_commands_are_those_of_many_draws() -> None:
     simulator = fit_simulator(of_halves(), kind="histogram")
     actions, means = mean_commands(Animat(Wheels(), Thresholds(9), 3), simulator)

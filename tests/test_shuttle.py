@@ -104,6 +104,7 @@ def test_a_goal_that_is_switched_is_another_one() -> None:
         assert float(state.info["other_goal"].cue) == -float(state.robot.cue)
 
 
+@pytest.mark.oracle
 def test_of_two_goals_there_is_a_bit_to_know() -> None:
     environment = WithoutNeurons(Shuttle(), (-1.0, -0.5, 0.0, 0.5, 1.0))
     found = goal_information(environment, None, heuristic_policy(environment, None), 1, draws=2)

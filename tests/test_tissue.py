@@ -587,6 +587,7 @@ def test_parameters_out_of_range_are_refused_by_name(name: str, value: object) -
         dataclasses.replace(TissueParameters(), **{name: value})  # type: ignore[arg-type]
 
 
+@pytest.mark.oracle
 def test_the_example_of_the_docs_runs() -> None:
     text = (Path(__file__).parents[1] / "docs" / "virtual-culture.md").read_text(encoding="utf-8")
     names: dict[str, object] = {}

@@ -80,6 +80,7 @@ def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_s
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
 
 
+@pytest.mark.oracle
 def test_policies_differ_from_each_other_and_from_those_of_another_seed(tmp_path: Path) -> None:
     weights = [
         policy.weights[0].tobytes()
@@ -205,6 +206,7 @@ def test_a_folder_of_another_training_is_refused_and_left_alone(tmp_path: Path) 
         train(short, timeline_of(), tmp_path)
 
 
+@pytest.mark.oracle
 def test_what_a_training_without_neurons_differs_in_is_told_by_name(tmp_path: Path) -> None:
     baseline = replace(SHORT, iterations=1_000, policies=1, mapping=None, commands=(-1.0, 1.0))
     trained(baseline, None, tmp_path)
@@ -300,6 +302,7 @@ def test_baselines_without_neurons_learn_their_task(
     assert policies["p0"].mapping is None
 
 
+@pytest.mark.oracle
 def test_a_learning_curve_counts_what_was_done(tmp_path: Path) -> None:
     curve = trained(SHORT, timeline_of(), tmp_path)["p1"].learning_curve
     assert curve.shape == (CHUNKS, 3)

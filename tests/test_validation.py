@@ -138,6 +138,7 @@ def test_a_chain_with_memory_is_told_from_one_without() -> None:
     assert forgetting.verdict.startswith("Cannot be trusted: to know the condition is worth")
 
 
+@pytest.mark.oracle
 def test_chance_alone_makes_distances_of_ranks_within_conditions() -> None:
     def transforms(rng: np.random.Generator) -> Any:
         return [stats.percentileofscore(rng.normal(size=100), rng.normal(size=100)) / 100 for _ in range(2)]
@@ -449,6 +450,7 @@ def test_the_organoid_by_hand(real_data: Path, window_ms: tuple[float, float], d
         assert abs(gain.value) < 0.01
 
 
+@pytest.mark.oracle
 def test_several_readouts_by_hand() -> None:
     """Each on its own, of simulators that answer for both; what they remember is of all channels."""
     rng = np.random.default_rng(4)

@@ -109,6 +109,7 @@ def looked_at(folder: Path) -> None:
         view.close()
 
 
+@pytest.mark.oracle
 @seeds(120)
 def test_records_that_say_anything(records: list[Any], tmp_path: Path, seed: int) -> None:
     draw = Random(seed)
@@ -120,6 +121,7 @@ def test_records_that_say_anything(records: list[Any], tmp_path: Path, seed: int
     looked_at(tmp_path)
 
 
+@pytest.mark.oracle
 @seeds(100)
 def test_logs_with_damaged_bytes(folder: Path, tmp_path: Path, seed: int) -> None:
     draw = Random(seed)

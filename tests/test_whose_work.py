@@ -77,6 +77,7 @@ def episodes_of(environment: Any, simulator: Any = SIMULATOR, actor: Actor = BES
     return roll_out(environment, simulator, actor, 1, episodes=2000, seed=5).returns[0]
 
 
+@pytest.mark.oracle
 def test_each_intervention_does_what_it_says() -> None:
     usual = episodes_of(ENVIRONMENT)
     found = {each.name: each for each in interventions_of(ENVIRONMENT, SIMULATOR, BEST, 1, switch_at=4)}  # type: ignore[arg-type]
