@@ -515,7 +515,7 @@ def test_policies_before_training_have_learned_nothing(finished: Path) -> None:
         Policy.load(finished / f"policies/navigation/{slug}/p0.safetensors")
         for slug in ("1-threshold", "before-training")
     )
-    assert before.learning_curve.shape == (0, 3)
+    assert before.learning_curve.shape == (0, 6)
     assert trained.learning_curve[-1, 0] >= 3000
     assert not np.array_equal(before.weights[0], trained.weights[0])
     # All but undecided.

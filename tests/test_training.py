@@ -302,7 +302,7 @@ def test_baselines_without_neurons_learn_their_task(
 
 def test_a_learning_curve_counts_what_was_done(tmp_path: Path) -> None:
     curve = trained(SHORT, timeline_of(), tmp_path)["p1"].learning_curve
-    assert curve.shape == (CHUNKS, 3)
+    assert curve.shape == (CHUNKS, 6)
     # 6,000 iterations in rounds of 8 are 750 rounds, hence exact.
     assert curve[-1, 0] == 6_000
     assert np.all(np.diff(curve[:, 0]) >= 0)

@@ -46,10 +46,12 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     (tmp_path / "training.json").write_text(json.dumps(manifest))
     told = tmp_path / ".unfinished" / ".told"
     told.mkdir(parents=True)
-    curve = np.zeros((30, 2, 3))
+    curve = np.zeros((30, 2, 6))
     curve[:, :, 0] = 100.0 * np.arange(1, 31)[:, None]
     curve[:, :, 2] = np.arange(30)[:, None] + [0.0, 10.0]
     curve[:3, :, 2] = np.nan
+    curve[:, :, 3] = 1.0 + np.arange(30)[:, None] + [0.0, 1.0]
+    curve[:, :, 4:] = [0.25, 0.5]
     np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve, done=np.array(30))
     (told / "p0 to p1.json").write_text(json.dumps([0.55, "return 31.0"]))
     with exclusive_lock(tmp_path):
@@ -63,11 +65,21 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     *policies, mean = chart["series"]
     assert [each["y"] for each in policies] == [[None] * 3 + list(np.arange(3.0, 30) + more) for more in (0, 10)]
     assert mean["y"][3:] == list(np.arange(3.0, 30) + 5)
+    for title, last, shown in (("Entropy", 30.5, "30.5 on"), ("Alpha", 0.25, "0.25"), ("Critic loss", 0.5, "0.5 on")):
+        chart = block(found, title)
+        assert len(chart["series"]) == 3
+        assert chart["series"][-1]["y"][-1] == last
+        assert chart["words"].startswith(shown)
     assert [row[:3] for row in block(found, "Policies")["rows"]] == [
         ["p0", "55 %", 29.0],
         ["p1", "55 %", 39.0],
         ["p2", "0 %", "none yet"],
     ]
+    # As a checkpoint of before has it.
+    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve[:, :, :3], done=np.array(30))
+    before = TrainingView(tmp_path).view(None, 8.0)
+    assert block(before, "Learning curves")["series"] == [*policies, mean]
+    assert block(before, "Entropy")["words"].startswith("Not in these files")
     stopped = TrainingView(tmp_path).view(None, 8.0)
     assert stopped["state"] == "silent"
     assert "started again it goes on" in stopped["message"]
