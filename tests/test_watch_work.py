@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from animat.execution.receipts import Receipt
 from animat.recordings.reading import read_recording
 from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.inspection import inspect_recording
+from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
 from animat.watch.held import is_held
@@ -103,6 +105,27 @@ def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
     assert block(found, "Running")["rows"] == [[jobs[2], "25 %", "a remark"]]
     assert sorted(block(found, "Done")["rows"]) == sorted([job, 2] for job in jobs[:2])
     assert [job for (job,) in block(found, "Waiting")["rows"]] == jobs[3:]
+
+
+def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -> None:
+    study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
+    words = json.dumps({"context study": asdict(study), "versions": {}, "fingerprint": "x"})
+    (tmp_path / "study.json").write_text(words)
+    Receipt("record/2", "x", {}, {"a": "b"}).save(tmp_path / "jobs")
+    row = {"name": "policies", "mean_return": 61.5, "actors": 4, "episodes": 400}
+    found_out = tmp_path / "culture-2" / "shuttle" / "simulated.json"
+    found_out.parent.mkdir(parents=True)
+    found_out.write_text(json.dumps({"rows": [row, row | {"name": "random", "mean_return": 1.0}]}))
+    view = StudyView(tmp_path)
+    assert view.about()["title"] == "context study of shuttle, cartpole"
+    found = view.view(None, 8.0)
+    # Of each culture a recording, and of each robot on it a training, a judgement and a measurement.
+    assert (facts(found, "Jobs")["jobs done"], facts(found, "Jobs")["waiting"]) == (1, 2 * (1 + 2 * 3) - 1)
+    assert ["measure/1/cartpole"] in block(found, "Waiting")["rows"]
+    assert block(found, "Results")["rows"] == [["shuttle", "policies, culture-2", 61.5, 4, 400]]
+    # No code is imported that a file names.
+    (tmp_path / "study.json").write_text(words.replace("shuttle", "nobodys_module:Robot"))
+    assert "code of one's own" in facts(StudyView(tmp_path).view(None, 8.0), "Jobs")["waiting"]
 
 
 def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
