@@ -67,6 +67,20 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     *policies, mean = chart["series"]
     assert [each["y"] for each in policies] == [[None] * 3 + list(np.arange(3.0, 30) + more) for more in (0, 10)]
     assert mean["y"][3:] == list(np.arange(3.0, 30) + 5)
+    assert "Not known: random actions, best coupling, optimal return. animat evaluate" in chart["words"]
+    told = {"rows": [{"name": "random", "mean_return": -2.5}], "optimum": {"value": 50.0}, "recorded_at_min": 15.0}
+    (tmp_path / "evaluation.json").write_text(json.dumps(told))
+    with_lines = block(TrainingView(tmp_path).view(None, 8.0), "Learning curves")
+    assert [(each["name"], each["x"], each["y"]) for each in with_lines["series"] if each["style"] == "dashed"] == [
+        ("random actions", [0.0, 6000.0], [-2.5, -2.5]),
+        ("optimal return", [0.0, 6000.0], [50.0, 50.0]),
+    ]
+    assert "on the simulator of minute 15" in with_lines["words"]
+    assert "Not known: best coupling." in with_lines["words"]
+    # What is no evaluation is none.
+    (tmp_path / "evaluation.json").write_text('[1, {"rows": 3}]')
+    assert block(TrainingView(tmp_path).view(None, 8.0), "Learning curves") == chart
+    (tmp_path / "evaluation.json").unlink()
     for title, last, shown in (("Entropy", 30.5, "30.5 on"), ("Alpha", 0.25, "0.25"), ("Critic loss", 0.5, "0.5 on")):
         chart = block(found, title)
         assert len(chart["series"]) == 3

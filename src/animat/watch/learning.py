@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from animat.training.policy import CURVE
 from animat.watch.blocks import chart, curve
+from animat.watch.plain import listed, mapped, number
 
 _LEARNER = (
     ("entropy", "Entropy", "nats", "Of the actions: high while they are all but random, low once the policy is sure."),
@@ -18,10 +19,43 @@ _LEARNER = (
 )
 
 
+_COLOURS = {"random actions": "grey", "best coupling": "green", "optimal return": "orange"}
+"""Of the lines that returns are compared with."""
+
+
+def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tuple[list[tuple[str, float]], str]:
+    """Returns to compare with, by name; and in words where they come from and which are not known.
+
+    Args:
+        manifest: the description of the training.
+        evaluation: of its policies (`animat.evaluation.table.Evaluation.to_dict`); empty where there is none.
+    """
+    rows = {str(row.get("name")): number(row.get("mean_return")) for row in map(mapped, listed(evaluation.get("rows")))}
+    optimum = mapped(evaluation.get("optimum")).get("value")
+    known = {
+        "random actions": rows.get("random", number(manifest.get("random_return"))),
+        "best coupling": rows.get("coupling"),
+        "optimal return": number(optimum),
+    }
+    words = [f"{name} {value:.4g}" for name, value in known.items() if value is not None]
+    told = f"Lines: {', '.join(words)}." if words else ""
+    minute = number(evaluation.get("recorded_at_min"))
+    if rows and minute is not None:
+        told += f" They are on the simulator of minute {minute:g}, by evaluation.json."
+    elif words and not rows:
+        told += " It is on the first simulator."
+    if missing := [name for name, value in known.items() if value is None]:
+        told += f" Not known: {', '.join(missing)}. animat evaluate --optimum --out evaluation.json, with the file in "
+        told += "this folder, has them shown."
+    return [(name, value) for name, value in known.items() if value is not None], told.strip()
+
+
 def learning_charts(
     curves: Mapping[int, Float64[np.ndarray, "chunks columns"]],
     swaps: Sequence[tuple[float, str]],
     iterations: float,
+    levels: Sequence[tuple[str, float]] = (),
+    missing: str = "",
 ) -> list[dict[str, Any]]:
     """The learning curves, and entropy, alpha and critic loss over the same iterations.
 
@@ -29,6 +63,8 @@ def learning_charts(
         curves: of the policies that have some, by number; columns as `CURVE`.
         swaps: after how many iterations simulators are refreshed, and what with.
         iterations: of the whole training.
+        levels: returns to compare with, each a name and a line.
+        missing: which of them are not known, and what computes them.
     """
     series, last = _series(curves, "mean_return")
     told = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."
@@ -36,7 +72,8 @@ def learning_charts(
         told = f"Mean return of the episodes that ended last: {'none ended yet' if last is None else f'{last:.1f}'}. "
         told += "Grey: each policy; blue: their mean, of those that are as far; a point a sixtieth of the training."
     told += " Dashed: the simulators were refreshed with the recording of that minute." if swaps else ""
-    told += " The folder holds no returns of random actions, the best coupling or an optimum: animat evaluate has them."
+    told = f"{told} {missing}".strip()
+    series += [curve(name, [0.0, iterations], [level] * 2, "dashed", _COLOURS[name]) for name, level in levels]
     charts = [chart("Learning curves", "iterations", "return", series, told, marks=swaps, until=iterations)]
     for column, title, unit, meaning in _LEARNER:
         series, last = _series(curves, column)

@@ -15,7 +15,7 @@ from animat.plain_file import read_plain_text
 from animat.watch.blocks import facts, table, time_left
 from animat.watch.files import curve_of_checkpoint, curve_of_policy, json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
-from animat.watch.learning import learning_charts
+from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
 from animat.watch.speed import Speed
 
@@ -55,6 +55,7 @@ class TrainingView:
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
         share = max(shares.values(), default=0.0)
+        levels, missing = levels_of(self._manifest(), mapped(json_of(self.folder / "evaluation.json")))
         rows: list[tuple[str, Any]] = [
             ("policies", f"{planned:,}, of which {sum(each >= 1 for each in shares.values()):,} are done"),
             ("iterations of each", iterations),
@@ -71,7 +72,7 @@ class TrainingView:
             "damage": "",
             "blocks": [
                 facts("So far", rows),
-                *learning_charts(curves, _swaps(training, simulators, iterations), iterations),
+                *learning_charts(curves, _swaps(training, simulators, iterations), iterations, levels, missing),
                 _table(planned, curves, shares, told, self._assessed(training)),
             ],
         }
