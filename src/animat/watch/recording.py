@@ -44,20 +44,22 @@ class RecordingView:
         """The newest recording, and the seconds of it before a time."""
         if not 0 < span_s <= _MOST_SPAN_S:
             raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
+        # Before the files are looked at: whoever lets go of the folder has removed what was under way.
+        running = is_held(self.folder)
         whole = recordings_in(self.folder)
         times = {file: when for file in (*whole, self.folder / UNDER_WAY) if (when := changed(file)) is not None}
         if not times:
             raise InvalidFile(f"{self.folder}: expected recordings, got none any more")
         newest = max(times, key=lambda file: (times[file], file.name))
         self._look_at_another([*times], newest)
-        running, recording = is_held(self.folder), self._recording
+        recording = self._recording
         blocks = [facts("Recordings", self._facts(len(whole), newest))]
         found: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
         if recording is not None:
             raster, found = _raster(recording, to_s, span_s)
             blocks += [raster, _rates(recording)]
         blocks += [_shares(self._shares, len(times)), *_inspected(self._inspection)]
-        is_broken = not running and self.folder / UNDER_WAY in times
+        is_broken = running is False and self.folder / UNDER_WAY in times
         return {
             "generation": 0,
             "state": "running" if running else "silent" if is_broken else "ended",
