@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from threading import Event
 
@@ -27,7 +27,7 @@ def assert_whole(rows: list[CurveRow], policies: dict[str, Policy]) -> None:
     """Every row of every policy once, in its order."""
     assert {row.policy for row in rows} == set(policies)
     for name, policy in policies.items():
-        told = [[row.iterations, row.episodes, row.mean_return] for row in rows if row.policy == name]
+        told = [astuple(row)[1:] for row in rows if row.policy == name]
         assert len(told) == CHUNKS
         np.testing.assert_array_equal(told, policy.learning_curve)
 
@@ -88,9 +88,9 @@ def test_tensorboard_has_every_row(tmp_path: Path) -> None:
     for name, policy in policies.items():
         curve = policy.learning_curve
         written = scalars(next((tmp_path / "runs" / name).iterdir()))
-        assert written["episodes"] == [(int(i), n) for i, n, _ in curve]
-        known = curve[np.isfinite(curve[:, 2])]
-        assert written["return"] == [(int(i), float(np.float32(x))) for i, _, x in known]
+        for column, tag in enumerate(("episodes", "return", "entropy", "alpha", "critic_loss"), 1):
+            known = curve[np.isfinite(curve[:, column])]
+            assert written[tag] == [(int(row[0]), float(np.float32(row[column]))) for row in known]
 
 
 def test_without_tensorboard_x_the_extra_is_named(

@@ -34,6 +34,7 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from animat.training.policy import Policy
 from animat.training.settings import SAC
+from animat.watch.training import TrainingView
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -75,6 +76,44 @@ def test_what_training_reports_is_what_the_deployed_policies_get(
     assert reported["random"] == evaluated["rows"][1]["mean_return"]  # type: ignore[index]
     assert reported["recorded_at_min"] == evaluated["recorded_at_min"] == 10.0
     assert f"1 policy in {tmp_path}; mean return on the simulator at 10 min: {reported['returns']['p0']:.1f}" in printed  # type: ignore[index]
+
+
+@pytest.mark.oracle
+def test_the_live_page_has_what_returns_are_compared_with(
+    recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "policies"
+    shutil.copytree(policies, folder)
+    manifest = json.loads((folder / "training.json").read_text())
+    (shown,) = levels_in(folder)
+    assert shown == ("random actions", manifest["random_return"])
+    out = folder / "evaluation.json"
+    evaluate = ["evaluate", str(folder), "--recordings", str(recordings), "--at-min", "0", "--optimum", "--json"]
+    assert main([*evaluate, "--out", str(out)]) == 0
+    evaluated = last_json(capsys.readouterr().out)
+    assert json.loads(out.read_text()) == evaluated
+    returns = {row["name"]: row["mean_return"] for row in evaluated["rows"]}  # type: ignore[attr-defined]
+    # The random actions of 100 episodes on the first simulator are those that training told.
+    assert returns["random"] == manifest["random_return"]
+    assert levels_in(folder) == [
+        ("random actions", returns["random"]),
+        ("best coupling", returns["coupling"]),
+        ("optimal return", evaluated["optimum"]["value"]),  # type: ignore[index]
+    ]
+    # A training that goes on tells it as before.
+    assert main(["train", "cartpole", "--recordings", str(recordings), *QUICK, "--out", str(folder)]) == 0
+    assert json.loads((folder / "training.json").read_text()) == manifest
+    capsys.readouterr()
+    assert main([*evaluate, "--out", str(folder / "training.json" / "x.json")]) == 1
+    assert "training.json" in capsys.readouterr().err
+
+
+def levels_in(folder: Path) -> list[tuple[str, float]]:
+    """The horizontal lines of the learning curves on the live page."""
+    chart = next(each for each in TrainingView(folder).view(None, 8.0)["blocks"] if each["title"] == "Learning curves")
+    lines = [each for each in chart["series"] if each["style"] == "dashed"]
+    assert all(each["y"][0] == each["y"][1] for each in lines)
+    return [(each["name"], each["y"][0]) for each in lines]
 
 
 @pytest.mark.oracle

@@ -188,6 +188,23 @@ def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path)
         assert account.pulses == 3 * 80
 
 
+def test_of_a_block_in_stretches_that_stops_half_way_all_pulses_are_spent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeCulture, "stretch_s", 1.0)
+    account = Account(Budget())
+    blocked = Protocol((80.0, 5.0), pulses=1, patterns=8, trials=160, setup_s=0.1)
+
+    class Stop:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if 1 < done < 2:
+                culture.stop()
+
+    with FakeCulture() as culture:
+        with pytest.raises(UnsafeStimulus):
+            record_within(account, culture, blocked, 1, Stop())
+        # Of the second block a stretch was delivered: the block is spent, which is no less than what came.
+        assert 160 < culture.delivered < account.pulses == 2 * 160
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_what_others_deliver_meanwhile_is_not_spent(fails: bool) -> None:
     """The culture counts all deliveries of a session, an account only those of its own recordings."""

@@ -60,7 +60,7 @@ def through_neurons(seed: int = 0, hidden: int = 64) -> Policy:
         window_ms=(2.0, 10.0),
         presentation=Presentation("mixed", 5),
         provenance={"fingerprint": "abc", "training": {"seed": 3, "µ": [1.5, None]}},
-        learning_curve=np.array([[100.0, 0.0, np.nan], [200.0, 3.0, -80.25]]),
+        learning_curve=np.array([[100.0, 0.0, np.nan, 1.6, 0.1, 2.5], [200.0, 3.0, -80.25, 1.5, 0.09, 1.25]]),
     )
 
 

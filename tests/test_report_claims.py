@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Group, Pair, draw_comparisons
 from animat.report.controls import Controls, draw_controls
 from animat.report.headline import ArmReturns, draw_headline
+from animat.report.html import Picture, Section, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.minus import with_minus
 from animat.report.over_time import Course, Courses, draw_over_time
+from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.differences import came_out_otherwise, decisions, explain
 from animat.studies.learned import beside_the_optimum, known_of, learned_of
@@ -327,6 +330,32 @@ def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
         assert left <= min(line.get_xdata()) <= max(line.get_xdata()) <= right
     said = {"random actions", "optimal return", "95 % interval", "each policy", "their interquartile mean"}
     assert legend(figure) == said
+
+
+def test_on_a_telephone_the_headline_fits_its_width(tmp_path: Path) -> None:
+    rows = [
+        ArmReturns(robot, arm, 5.0, 4.0, 6.0, 0.0, 10.0, (3.0, 7.0))
+        for robot in ("cartpole", "navigation", "swing-up")
+        for arm in ("1-threshold", "before training")
+    ]
+    wide, narrow = (
+        save_figure(draw_headline(rows, narrow=is_narrow), tmp_path / f"{is_narrow}.png") for is_narrow in (False, True)
+    )
+    # Of 400 pixels 20 on either side are the page's; a figure has a hundred pixels an inch.
+    assert Picture(narrow, "", "").width_px <= 400 - 2 * 20 < Picture(wide, "", "").width_px
+    figure = draw_headline(rows, narrow=True)
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["cartpole", "navigation", "swing-up"]
+    figure.canvas.draw()
+    edge_px = figure.bbox.width
+    drawn = [axes.get_tightbbox() for axes in figure.axes] + [figure.legends[0].get_window_extent()]
+    assert all(0 <= box.x0 < box.x1 <= edge_px for box in drawn)
+    page = write_page(
+        tmp_path / "page.html", "t", "l", [Section("s", pictures=(Picture(wide, "a", "b", (), narrow),))], []
+    ).read_text()
+    assert re.search(r'<picture><source media="[^"]*max-width[^"]*" srcset="data:image/png', page)
+    assert page.count("<picture>") == page.count("</picture>") == 1
+    alone = write_page(tmp_path / "one.html", "t", "l", [Section("s", pictures=(Picture(wide, "a", "b"),))], [])
+    assert "<picture>" not in alone.read_text()
 
 
 def test_there_is_one_kind_of_minus() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -78,6 +79,17 @@ def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_s
     alone = train(six, timeline_of(), None)
     for name, policy in lent.items():
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
+
+
+def test_what_is_told_beside_changes_no_policy_and_no_folder(tmp_path: Path) -> None:
+    short = replace(SHORT, policies=1, iterations=500)
+    told = trained(short, timeline_of(), tmp_path / "told", sources=["a.nwb"], random_return=-12.5)
+    untold = trained(short, timeline_of(), tmp_path / "untold")
+    assert bits(tmp_path / "told") == bits(tmp_path / "untold")
+    assert json.loads((tmp_path / "told" / "training.json").read_text())["random_return"] == -12.5
+    # Asked for again without it, it is the same training.
+    assert trained(short, timeline_of(), tmp_path / "told")["p0"].provenance == told["p0"].provenance
+    assert untold["p0"].provenance == told["p0"].provenance
 
 
 @pytest.mark.oracle
@@ -305,7 +317,7 @@ def test_baselines_without_neurons_learn_their_task(
 @pytest.mark.oracle
 def test_a_learning_curve_counts_what_was_done(tmp_path: Path) -> None:
     curve = trained(SHORT, timeline_of(), tmp_path)["p1"].learning_curve
-    assert curve.shape == (CHUNKS, 3)
+    assert curve.shape == (CHUNKS, 6)
     # 6,000 iterations in rounds of 8 are 750 rounds, hence exact.
     assert curve[-1, 0] == 6_000
     assert np.all(np.diff(curve[:, 0]) >= 0)

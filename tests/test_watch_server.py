@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from animat.cli import main
+from animat.cli import COMMANDS, main
 from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.log import LogWriter, read_log
 from animat.studies.folder import MANIFEST as STUDY
@@ -180,6 +181,21 @@ def test_an_empty_folder_says_so_and_is_looked_at_again(tmp_path: Path) -> None:
 
 def test_folders_are_known_by_the_files_that_are_written() -> None:
     assert dict(_MARKS) == {"session": LOG_FILE, "training": TRAINING, "tuning": TUNING, "study": STUDY}
+
+
+def test_each_command_that_takes_watch_has_its_folder_served(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = {"record": [], "reproduce": [], "train": [], "live": [], "run": ["x"], "study": ["x"], "tune": ["x"]}
+    assert {name for name, command in COMMANDS.items() if "watch" in command.__dataclass_fields__} == set(given)
+    served: list[Path] = []
+    monkeypatch.setattr("animat.watch.serving.watching", lambda folder: nullcontext(served.append(folder)))
+    for name, words in given.items():
+        monkeypatch.setattr(COMMANDS[name], "run", lambda self: {})
+        for asked_for, expected in (([], []), (["--watch"], [tmp_path])):
+            served.clear()
+            assert main([name, *words, "--out", str(tmp_path), *asked_for]) == 0, capsys.readouterr().err
+            assert served == expected
 
 
 def test_the_command_says_what_is_wrong(

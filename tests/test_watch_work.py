@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from animat.execution.receipts import Receipt
 from animat.recordings.reading import read_recording
 from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.inspection import inspect_recording
+from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
 from animat.watch.held import is_held
@@ -46,10 +48,12 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     (tmp_path / "training.json").write_text(json.dumps(manifest))
     told = tmp_path / ".unfinished" / ".told"
     told.mkdir(parents=True)
-    curve = np.zeros((30, 2, 3))
+    curve = np.zeros((30, 2, 6))
     curve[:, :, 0] = 100.0 * np.arange(1, 31)[:, None]
     curve[:, :, 2] = np.arange(30)[:, None] + [0.0, 10.0]
     curve[:3, :, 2] = np.nan
+    curve[:, :, 3] = 1.0 + np.arange(30)[:, None] + [0.0, 1.0]
+    curve[:, :, 4:] = [0.25, 0.5]
     np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve, done=np.array(30))
     (told / "p0 to p1.json").write_text(json.dumps([0.55, "return 31.0"]))
     with exclusive_lock(tmp_path):
@@ -63,11 +67,35 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     *policies, mean = chart["series"]
     assert [each["y"] for each in policies] == [[None] * 3 + list(np.arange(3.0, 30) + more) for more in (0, 10)]
     assert mean["y"][3:] == list(np.arange(3.0, 30) + 5)
+    assert "Not known: random actions, best coupling, optimal return. animat evaluate" in chart["words"]
+    told = {"rows": [{"name": "random", "mean_return": -2.5}], "optimum": {"value": 50.0}, "recorded_at_min": 15.0}
+    (tmp_path / "evaluation.json").write_text(json.dumps(told))
+    with_lines = block(TrainingView(tmp_path).view(None, 8.0), "Learning curves")
+    assert [(each["name"], each["x"], each["y"]) for each in with_lines["series"] if each["style"] == "dashed"] == [
+        ("random actions", [0.0, 6000.0], [-2.5, -2.5]),
+        ("optimal return", [0.0, 6000.0], [50.0, 50.0]),
+    ]
+    assert "on the simulator of minute 15" in with_lines["words"]
+    assert "Not known: best coupling." in with_lines["words"]
+    # What is no evaluation is none.
+    (tmp_path / "evaluation.json").write_text('[1, {"rows": 3}]')
+    assert block(TrainingView(tmp_path).view(None, 8.0), "Learning curves") == chart
+    (tmp_path / "evaluation.json").unlink()
+    for title, last, shown in (("Entropy", 30.5, "30.5 on"), ("Alpha", 0.25, "0.25"), ("Critic loss", 0.5, "0.5 on")):
+        chart = block(found, title)
+        assert len(chart["series"]) == 3
+        assert chart["series"][-1]["y"][-1] == last
+        assert chart["words"].startswith(shown)
     assert [row[:3] for row in block(found, "Policies")["rows"]] == [
         ["p0", "55 %", 29.0],
         ["p1", "55 %", 39.0],
         ["p2", "0 %", "none yet"],
     ]
+    # As a checkpoint of before has it.
+    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve[:, :, :3], done=np.array(30))
+    before = TrainingView(tmp_path).view(None, 8.0)
+    assert block(before, "Learning curves")["series"] == [*policies, mean]
+    assert block(before, "Entropy")["words"].startswith("Not in these files")
     stopped = TrainingView(tmp_path).view(None, 8.0)
     assert stopped["state"] == "silent"
     assert "started again it goes on" in stopped["message"]
@@ -91,6 +119,27 @@ def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
     assert block(found, "Running")["rows"] == [[jobs[2], "25 %", "a remark"]]
     assert sorted(block(found, "Done")["rows"]) == sorted([job, 2] for job in jobs[:2])
     assert [job for (job,) in block(found, "Waiting")["rows"]] == jobs[3:]
+
+
+def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -> None:
+    study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
+    words = json.dumps({"context study": asdict(study), "versions": {}, "fingerprint": "x"})
+    (tmp_path / "study.json").write_text(words)
+    Receipt("record/2", "x", {}, {"a": "b"}).save(tmp_path / "jobs")
+    row = {"name": "policies", "mean_return": 61.5, "actors": 4, "episodes": 400}
+    found_out = tmp_path / "culture-2" / "shuttle" / "simulated.json"
+    found_out.parent.mkdir(parents=True)
+    found_out.write_text(json.dumps({"rows": [row, row | {"name": "random", "mean_return": 1.0}]}))
+    view = StudyView(tmp_path)
+    assert view.about()["title"] == "context study of shuttle, cartpole"
+    found = view.view(None, 8.0)
+    # Of each culture a recording, and of each robot on it a training, a judgement and a measurement.
+    assert (facts(found, "Jobs")["jobs done"], facts(found, "Jobs")["waiting"]) == (1, 2 * (1 + 2 * 3) - 1)
+    assert ["measure/1/cartpole"] in block(found, "Waiting")["rows"]
+    assert block(found, "Results")["rows"] == [["shuttle", "policies, culture-2", 61.5, 4, 400]]
+    # No code is imported that a file names.
+    (tmp_path / "study.json").write_text(words.replace("shuttle", "nobodys_module:Robot"))
+    assert "code of one's own" in facts(StudyView(tmp_path).view(None, 8.0), "Jobs")["waiting"]
 
 
 def test_a_tuning_is_its_journal(tmp_path: Path) -> None:

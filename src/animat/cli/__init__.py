@@ -150,7 +150,7 @@ def _run(given: list[str]) -> int:
 
 def _watched(command: Command) -> contextlib.AbstractContextManager[None]:
     """The page of a command that is asked for one (`--watch`), for as long as it runs and is looked at."""
-    if not isinstance(command, Record | Train | Run | Live | StudyFile | TuneFile) or not command.watch:
+    if not isinstance(command, Record | Train | Run | Live | Reproduce | StudyFile | TuneFile) or not command.watch:
         return contextlib.nullcontext()
     from animat.watch.serving import watching
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for, say_findings
+from animat.records import as_json
+from animat.writing import atomic_write, expect_writable
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Evaluate(Fitting):
     information in bits"""
     seed: int = 1
     """Decides every random draw"""
+    out: Path | None = None
+    """File for all of it as JSON; the live page of a training shows evaluation.json of the policies' folder"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -47,6 +52,8 @@ class Evaluate(Fitting):
         from animat.evaluation.rollouts import check_at_once
         from animat.progress import Bar
 
+        if self.out is not None:
+            expect_writable(self.out.parent)
         policies = policies_for(self.robot, self.mapping, self.policies)
         check_at_once("--episodes", self.episodes, len(policies))
         through_neurons = any(policy.mapping is not None for policy in policies.values())
@@ -71,4 +78,7 @@ class Evaluate(Fitting):
             )
         say_findings(evaluation.findings)
         print(evaluation.to_text())
+        if self.out is not None:
+            with atomic_write(self.out) as beside:
+                beside.write_text(json.dumps(as_json(evaluation.to_dict()), indent=1, sort_keys=True) + "\n")
         return evaluation.to_dict()

@@ -31,6 +31,8 @@ class Reproduce:
     """Whether its workers see --out at the same place; if not, files go through this process"""
     out: Path = Path("study")
     """Folder for everything; the report is report.html in it"""
+    watch: bool = False
+    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 

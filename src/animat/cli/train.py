@@ -20,6 +20,7 @@ from animat.writing import expect_writable
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
     from animat.training.policy import Policy
+    from animat.training.specification import Training
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ class Train(Fitting):
         from animat.execution.cluster import on_cluster
         from animat.execution.training import train
         from animat.report.tensorboard import TensorBoard
-        from animat.training.folder import expect_folder_for, expect_trainable, is_finished
+        from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
 
         board = nullcontext() if self.tensorboard is None else TensorBoard(self.tensorboard)
         expect_trainable(training, is_saved=True)
@@ -148,6 +149,8 @@ class Train(Fitting):
         was_finished = is_finished(training, self.out)
         if timeline is not None:
             print(_control(timeline))
+        # Of a training that goes on it was told before.
+        random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
         with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
             trained = train(
                 training,
@@ -157,6 +160,7 @@ class Train(Fitting):
                 executor=executor,
                 progress=progress,
                 sources=[str(path) for path in self.recordings],
+                random_return=random,
                 callbacks=() if on_row is None else (on_row,),
             )
         if was_finished:
@@ -167,11 +171,11 @@ class Train(Fitting):
         until = None if timeline is None else first.trained_until_min(float(timeline.start_min[0]))
         evaluation = evaluate(trained, timeline, at_min=until, controls=("random",))
         say_findings(evaluation.findings)
-        policies, random = (row.to_dict() for row in evaluation.rows)
+        policies, control = (row.to_dict() for row in evaluation.rows)
         on = "" if evaluation.recorded_at_min is None else f" on the simulator at {evaluation.recorded_at_min:g} min"
         error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
         counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
-        mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{random['mean_return']:.1f}"
+        mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{control['mean_return']:.1f}"
         print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
         assessed = {name: _assessed(policy, policy.best) for name, policy in trained.items() if policy.best is not None}
         for name, told in assessed.items():
@@ -179,7 +183,7 @@ class Train(Fitting):
         return {
             "policies": [str(self.out / f"{name}.safetensors") for name in trained],
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
-            "random": random["mean_return"],
+            "random": control["mean_return"],
             "recorded_at_min": evaluation.recorded_at_min,
             "findings": [finding.to_dict() for finding in evaluation.findings],
             **({"assessed": assessed} if assessed else {}),
@@ -191,6 +195,21 @@ _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50,
 _READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
 """By how many commands a robot takes."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
+
+
+def _random_return(training: Training, timeline: SimulatorTimeline | None) -> float | None:
+    """The mean return of random actions on the first simulator; None for a body that would have to be stepped."""
+    from animat.compilation import keep_compilations
+    from animat.evaluation.rollouts import Uniform, roll_out
+    from animat.robots.host import HostRobot
+
+    if isinstance(training.robot, HostRobot):
+        return None
+    keep_compilations()
+    environment = training.environment(0 if timeline is None else len(timeline.conditions))
+    simulator = None if timeline is None else timeline.at(float(timeline.start_min[0]))
+    # As many as are evaluated in the end: what is compiled here is there then.
+    return float(roll_out(environment, simulator, Uniform(), 1, episodes=100, seed=1).returns.mean())
 
 
 def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:

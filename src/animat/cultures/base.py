@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -22,7 +23,7 @@ from animat.stimulation.places import electrodes_of
 from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.pulse import Pulse
-from animat.stimulation.schedule import Schedule, make_schedule
+from animat.stimulation.schedule import Block, Schedule, make_schedule
 from animat.stimulation.stimulus import Stimulus, plain_stimuli
 from animat.tables import UNKNOWN
 
@@ -45,7 +46,7 @@ class Culture(Openable):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        refuse_overrides(cls, Culture, leaving=("__init__", "left_out", "device", "recorded_as"))
+        refuse_overrides(cls, Culture, leaving=("__init__", "left_out", "device", "recorded_as", "stretch_s"))
 
     # What a backend is: data. Valid once it is open.
 
@@ -78,6 +79,11 @@ class Culture(Openable):
     def left_out(self) -> dict[str, int]:
         """What the device reported, or should have, and no recording has, counted since `open`, by what it is."""
         return {}
+
+    @property
+    def stretch_s(self) -> float | None:
+        """How much of a block `record` asks for at once; None: all of it, where the clock goes on between two calls."""
+        return None
 
     # What a backend does.
 
@@ -205,7 +211,13 @@ class Culture(Openable):
         return make_schedule(protocol, self.patterns, seed, places=places)
 
     @final
-    def record(self, protocol: Protocol, seed: int = 0, progress: Progress | None = None) -> Recording:
+    def record(
+        self,
+        protocol: Protocol,
+        seed: int = 0,
+        progress: Progress | None = None,
+        follow: Callable[[Callable[[], Recording]], None] | None = None,
+    ) -> Recording:
         """Stimulate by a protocol and record.
 
         The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
@@ -214,7 +226,8 @@ class Culture(Openable):
         Args:
             protocol: what to do; it is kept with the recording.
             seed: decides the order of conditions and patterns.
-            progress: told after each block.
+            progress: told after each block, or stretch of one (`stretch_s`).
+            follow: then called with what gives the recording so far. What it takes comes off the next set-up time.
 
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
@@ -225,22 +238,35 @@ class Culture(Openable):
         self._rehearse(schedule)
         before = self.left_out
         start_min = self.now_s / 60
-        observed = []
+        parts: list[Block] = []
+        observed: list[Observed] = []
+
+        def so_far() -> Recording:
+            return assembled(
+                replace(schedule, blocks=tuple(parts)),
+                observed,
+                channels=self.channels,
+                sampling_rate_hz=self.sampling_rate_hz,
+                start_min=start_min,
+                provenance=provenance,
+                culture=self.recorded_as,
+            )
+
+        followed_s = 0.0
         for done, block in enumerate(schedule.blocks):
-            self.rest(block.setup_s)
-            observed.append(self.deliver(schedule.deliveries(block), block.duration_s))
-            progress.update(done + 1, len(schedule.blocks))
+            self.rest(max(0.0, block.setup_s - followed_s))
+            stretches = (block,) if self.stretch_s is None else block.stretches(self.stretch_s)
+            for i, stretch in enumerate(stretches, 1):
+                observed.append(self.deliver(schedule.deliveries(stretch), stretch.duration_s))
+                parts.append(stretch)
+                progress.update(done + i / len(stretches), len(schedule.blocks))
+                if follow is not None:
+                    seen_s = self.now_s
+                    follow(so_far)
+                    followed_s = self.now_s - seen_s
         if more := more_left_out(before, self.left_out):
             provenance["left_out"] = ", ".join(f"{count} {what}" for what, count in more.items())
-        return assembled(
-            schedule,
-            observed,
-            channels=self.channels,
-            sampling_rate_hz=self.sampling_rate_hz,
-            start_min=start_min,
-            provenance=provenance,
-            culture=self.recorded_as,
-        )
+        return so_far()
 
     def _rehearse(self, schedule: Schedule) -> None:
         """Put the whole schedule before the guard, blocks at their times, delivering nothing."""

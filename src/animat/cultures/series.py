@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from animat.cultures.base import Culture
+from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
@@ -140,7 +141,8 @@ def record_when_due(
         if culture.now_s < due_s + interval_s:
             culture.rest(max(0.0, due_s - culture.now_s))
             part = Part(progress, session, 1, len(files), files[session].name)
-            yield session, culture.record(protocol, _order(seed, session), part)
+            with UnderWay(files[session].parent) as follow:
+                yield session, culture.record(protocol, _order(seed, session), part, follow)
             progress.update(session + 1, len(files), files[session].name)
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Settings = TypeVar("Settings", bound="DataclassInstance")
 
 NS = 1_000_000_000
+_STRETCH_S = 10.0
 WARM_UP_S = 5.0
 """Passes before anything is measured: a fresh tissue is not in its stride."""
 
@@ -281,6 +282,11 @@ class VirtualCulture(Culture):
         self._is_seen = np.arange(self._n_seen_by.max(initial=0)) < self._n_seen_by[:, None]
         self._seen_by = np.zeros(self._is_seen.shape, dtype=np.int64)
         self._seen_by[self._is_seen] = pairs.electrode[order]
+
+    @property
+    def stretch_s(self) -> float:
+        """Its clock stands between two calls, and stretches of a block are the block."""
+        return _STRETCH_S
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         start_ns, tissue = self._now_ns, self.tissue

@@ -30,7 +30,7 @@ class CurveFile:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._path.write_text("")
 
-    def add(self, part: Float64[ndarray, "policies 3"]) -> None:
+    def add(self, part: Float64[ndarray, "policies columns"]) -> None:
         """Add a part of the training, a row a policy."""
         with self._path.open("a") as file:
             file.write(json.dumps(part.tolist()) + "\n")
@@ -79,15 +79,15 @@ class Curves:
                 for part in parts[self._told[member] :]:
                     self._tell(member, part[column])
 
-    def add(self, members: Sequence[int], part: Float64[ndarray, "policies 3"]) -> None:
+    def add(self, members: Sequence[int], part: Float64[ndarray, "policies columns"]) -> None:
         """Tell a part of a group that is trained in this process."""
         for member, row in zip(members, part.tolist(), strict=True):
             self._tell(member, row)
 
     def _tell(self, member: int, row: Sequence[float]) -> None:
         self._told[member] += 1
-        iterations, episodes, mean_return = row
-        told = CurveRow(f"p{member}", int(iterations), int(episodes), float(mean_return))
+        iterations, episodes, *numbers = row
+        told = CurveRow(f"p{member}", int(iterations), int(episodes), *numbers)
         for callback in self._callbacks:
             callback(told)
 

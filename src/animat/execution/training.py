@@ -46,6 +46,7 @@ def train(
     progress: Progress | None = None,
     checkpoint_s: float = CHECKPOINT_S,
     sources: Sequence[str] = (),
+    random_return: float | None = None,
     callbacks: Sequence[TrainingCallback] = (),
 ) -> dict[str, Policy]:
     """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which says what they are.
@@ -66,6 +67,7 @@ def train(
         progress: told how far it is.
         checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
         sources: names of the recordings, for the manifest.
+        random_return: mean return of random actions, for the manifest: a line of the live page's learning curves.
         callbacks: each called with every row of the learning curves as it comes; no bit of what is learned depends on
             them.
 
@@ -92,7 +94,7 @@ def train(
         expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
     training = training.over(timeline)
     rows_of(training, timeline)
-    manifest = describe(training, timeline, sources)
+    manifest = describe(training, timeline, sources, random_return)
     groups = groups_of(training, timeline, manifest, fewest=2)
     if folder is None:
         return _in_memory(groups, _phase_of(groups, progress), callbacks)

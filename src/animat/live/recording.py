@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.errors import AnimatError
@@ -28,19 +30,21 @@ def record_within(
     try:
         return culture.record(protocol, seed, blocks)
     except BaseException as error:
-        # Of the block under way only an error of the culture tells that it was refused.
-        blocks.handed_over += not isinstance(error, AnimatError) or error.is_admitted
+        # Of the block under way only an error of the culture tells that it was refused; not if some of it was over.
+        if not blocks.is_within_one:
+            blocks.handed_over += not isinstance(error, AnimatError) or error.is_admitted
         raise
     finally:
         account.spend([stimulus for stimuli in by_block[: blocks.handed_over] for stimulus in stimuli])
 
 
 class _Blocks:
-    """Counts the blocks of this recording alone: the culture's own count has those of every thread."""
+    """Counts the blocks of this recording alone that began: the culture's own count has those of every thread."""
 
     def __init__(self, progress: Progress) -> None:
-        self._progress, self.handed_over = progress, 0
+        self._progress, self.handed_over, self.is_within_one = progress, 0, False
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self.handed_over = int(done)
+        self.handed_over = math.ceil(done)
+        self.is_within_one = done != self.handed_over
         self._progress.update(done, total, note)

@@ -35,18 +35,21 @@ class ArmReturns:
     policies: tuple[float, ...] = ()
 
 
-def draw_headline(rows: Sequence[ArmReturns]) -> Figure:
+def draw_headline(rows: Sequence[ArmReturns], *, narrow: bool = False) -> Figure:
     """A panel a robot, a line an arm: the policies with their interval, random actions, the optimal return.
 
     The axis reaches as far as returns do; an interval that goes on beyond it ends in an arrow.
 
     Args:
         rows: at least one.
+        narrow: as wide as a telephone: the panels below each other.
     """
     robots = list(dict.fromkeys(row.robot for row in rows))
     most = max(sum(row.robot == robot for row in rows) for robot in robots)
-    figure = new_figure(4.6 * len(robots), 1.2 + 0.34 * most)
-    panels = figure.subplots(1, len(robots), squeeze=False)[0]
+    height_in = 1.2 + 0.34 * most
+    figure = new_figure(3.6, height_in * len(robots)) if narrow else new_figure(4.6 * len(robots), height_in)
+    shape = (len(robots), 1) if narrow else (1, len(robots))
+    panels = list(figure.subplots(*shape, squeeze=False).flat)
     for axes, robot in zip(panels, robots, strict=True):
         own = [row for row in rows if row.robot == robot]
         style_axes(axes, robot, "mean return of an episode", "")
@@ -70,7 +73,7 @@ def draw_headline(rows: Sequence[ArmReturns]) -> Figure:
         axes.set_yticks(range(len(own)), [row.arm for row in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
-    add_common_legend(figure, panels, columns=5)
+    add_common_legend(figure, panels, columns=2 if narrow else 5)
     return figure
 
 

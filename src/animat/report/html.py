@@ -28,30 +28,31 @@ class Picture:
         title: in a few words; also the text for those who cannot see it.
         caption: what is to be seen in it.
         beside: names of the same figure in other formats, and of its numbers, relative to the page.
+        narrow: the PNG for a telephone, which fits its width; None: the same, which scrolls there.
     """
 
     file: Path
     title: str
     caption: str
     beside: tuple[str, ...] = ()
+    narrow: Path | None = None
 
     @property
     def data(self) -> str:
         """The PNG as a data address."""
-        return "data:image/png;base64," + base64.b64encode(self._bytes()).decode()
+        return _address(_bytes(self.file))
+
+    @property
+    def narrow_data(self) -> str | None:
+        """The PNG for a telephone as a data address, where there is one of its own."""
+        return None if self.narrow is None else _address(_bytes(self.narrow))
 
     @property
     def width_px(self) -> int:
         """Width on the page: a hundred pixels an inch, so that text in figures is as large as text around them."""
         # The first chunk of a PNG starts with the width.
-        (width,) = struct.unpack(">I", self._bytes()[16:20])
+        (width,) = struct.unpack(">I", _bytes(self.file)[16:20])
         return int(width * 100 // PNG_DPI)
-
-    def _bytes(self) -> bytes:
-        try:
-            return self.file.read_bytes()
-        except OSError as error:
-            raise InvalidFile(f"{self.file}: expected a figure, got none: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,17 @@ def write_page(
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
     return path
+
+
+def _bytes(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise InvalidFile(f"{file}: expected a figure, got none: {error.strerror or error}") from error
+
+
+def _address(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
 def cell(value: Any) -> str:

@@ -13,7 +13,7 @@ from animat.training.callbacks import CurveRow
 
 
 class TensorBoard:
-    """A callback of `train` that writes each policy's curve as a run of its own: `return` and `episodes`.
+    """A callback of `train` that writes each policy's curve as a run of its own, a scalar each of `CurveRow`'s numbers.
 
         with TensorBoard("runs") as board:
             train(training, timeline, "policies", callbacks=[board])
@@ -39,14 +39,16 @@ class TensorBoard:
         return self
 
     def __call__(self, row: CurveRow) -> None:
-        """Write a row; a return that is not known is left out."""
+        """Write a row; what is not known is left out."""
         try:
             if row.policy not in self._writers:
                 self._writers[row.policy] = self._make(str(self._folder / row.policy))
             writer = self._writers[row.policy]
-            writer.add_scalar("episodes", row.episodes, row.iterations)
-            if not math.isnan(row.mean_return):
-                writer.add_scalar("return", row.mean_return, row.iterations)
+            told = {"episodes": row.episodes, "return": row.mean_return}
+            told |= {"entropy": row.entropy, "alpha": row.alpha, "critic_loss": row.critic_loss}
+            for name, number in told.items():
+                if not math.isnan(number):
+                    writer.add_scalar(name, number, row.iterations)
         except OSError as error:
             raise InvalidFile(f"{self._folder}: cannot be written: {error.strerror or error}") from error
 

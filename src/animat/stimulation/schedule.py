@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -15,6 +16,8 @@ from animat.tables import UNKNOWN
 
 TICK_S = 50e-6
 """Stimuli start on a grid of 50 us, a sample at 20 kHz: what stimulation hardware can time exactly."""
+_GAP_S = 0.005
+"""Between two pulses at least, for a block to be cut there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,25 @@ class Block:
     setup_s: float
     duration_s: float
     stimuli: Stimuli
+
+    def stretches(self, least_s: float) -> tuple[Block, ...]:
+        """The block in stretches, without set-up, that come one right after the other; cut between presentations.
+
+        Args:
+            least_s: how long each is but for the last; it is cut in the next gap between pulses.
+        """
+        time_s, presentation = self.stimuli.time_s, self.stimuli.presentation
+        begins = 1 + np.flatnonzero((np.diff(presentation) != 0) & (np.diff(time_s) >= _GAP_S))
+        rows, ends_s = [0], [0.0]
+        for row, end_s in zip(begins.tolist(), on_ticks((time_s[begins - 1] + time_s[begins]) / 2), strict=True):
+            if end_s - ends_s[-1] >= least_s:
+                rows.append(row)
+                ends_s.append(float(end_s))
+        rows, ends_s = [*rows, len(time_s)], [*ends_s, self.duration_s]
+        return tuple(
+            Block(0.0, end_s - start_s, _between(self.stimuli, first, last, start_s))
+            for (first, last), (start_s, end_s) in zip(pairwise(rows), pairwise(ends_s), strict=True)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +84,18 @@ class Schedule:
     def deliveries(self, block: Block) -> list[Stimulus]:
         """The stimuli of a block as they are delivered."""
         return stimuli_of(block.stimuli, self.protocol)
+
+
+def _between(stimuli: Stimuli, first: int, last: int, start_s: float) -> Stimuli:
+    """Rows of a table, their times counted from a start."""
+    rows = slice(first, last)
+    return Stimuli(
+        time_s=on_ticks(stimuli.time_s[rows] - start_s),
+        frequency_hz=stimuli.frequency_hz[rows],
+        pattern=stimuli.pattern[rows],
+        electrodes=stimuli.electrodes[rows],
+        presentation=stimuli.presentation[rows],
+    )
 
 
 def make_schedule(

@@ -139,7 +139,7 @@ def run_context_study(
     with exclusive_lock(folder):
         if not is_ours:
             write_json(folder / MANIFEST, manifest)
-        left = Jobs(_plan(study), folder, folder / RECEIPTS, manifest["fingerprint"])
+        left = Jobs(plan_context_study(study), folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s = {}
         if left.waiting:
             took_s = left.run(workers=workers, executor=executor, progress=progress or Silent())
@@ -177,7 +177,8 @@ def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     return True
 
 
-def _plan(study: ContextStudy) -> list[Job]:
+def plan_context_study(study: ContextStudy) -> list[Job]:
+    """All jobs of the study."""
     jobs = []
     for culture in study.cultures:
         recorded = f"record/{culture}"

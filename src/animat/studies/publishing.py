@@ -60,7 +60,8 @@ class Publish(StudyTask):
         headline = _headline(study, results, all_episodes(study, folder, study.robots))
         figure = draw_headline(headline)
         drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
-        sections = [_short(study, results, headline, drawn)]
+        narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
+        sections = [_short(study, results, headline, drawn, narrow)]
         for spec in study.robots:
             pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT, _facts_of_robot(study, spec))
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
@@ -80,7 +81,7 @@ class Publish(StudyTask):
             "versions and machine has the same results, bit for bit.",
             f"Study {manifest['fingerprint']}",
         ]
-        return [*drawn, write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
+        return [*drawn, narrow, write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
 
 
 def _lead(study: Study) -> str:
@@ -105,7 +106,9 @@ def _headline(study: Study, results: Results, table: DataFrame) -> list[ArmRetur
     return told
 
 
-def _short(study: Study, results: Results, headline: Sequence[ArmReturns], drawn: Sequence[Path]) -> Section:
+def _short(
+    study: Study, results: Results, headline: Sequence[ArmReturns], drawn: Sequence[Path], narrow: Path
+) -> Section:
     """How the best arm does on each robot, what comes of it without the culture, and how many comparisons hold."""
     chosen = {arm.name for arm in study.arms if arm.trained and arm.through_neurons and arm.delivery == "chosen"}
     sentences = []
@@ -133,6 +136,7 @@ def _short(study: Study, results: Results, headline: Sequence[ArmReturns], drawn
         "Every arm on every robot",
         HEADLINE.format(policies=study.policies),
         (*(f"figures/{file.name}" for file in drawn[1:]), "tables/scores.csv"),
+        narrow,
     )
     return Section("Results in short", tuple(sentences), pictures=(picture,))
 

@@ -337,9 +337,9 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
 
 
 def learning_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Float64[np.ndarray, "policies parts 3"]:
-    """The learning curves of an arm's policies, as in `Policy.learning_curve`."""
+    """The learning curves of an arm's policies: iterations, episodes and mean return, as in `Policy.learning_curve`."""
     out = policies_folder(folder, spec, arm)
-    curves = [Policy.load(out / f"p{i}.safetensors").learning_curve for i in range(study.policies)]
+    curves = [Policy.load(out / f"p{i}.safetensors").learning_curve[:, :3] for i in range(study.policies)]
     return np.stack(curves).astype(np.float64)
 
 

@@ -15,12 +15,19 @@ class CurveRow:
         iterations: done at the end of the part.
         episodes: that ended in the part.
         mean_return: of these; NaN for none.
+        entropy: of its actions at the end of the part, nats, over transitions drawn from its replay.
+        alpha: the weight of the entropy bonus then.
+        critic_loss: then, over the same transitions. These three are NaN where no file has them, as of policies that
+            were trained before they were kept.
     """
 
     policy: str
     iterations: int
     episodes: int
     mean_return: float
+    entropy: float
+    alpha: float
+    critic_loss: float
 
 
 class TrainingCallback(Protocol):

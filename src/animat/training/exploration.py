@@ -109,3 +109,11 @@ def is_worth_it(exploration: Exploration) -> Bool[Array, ""]:
     alone, with_held = exploration.returns / exploration.episodes
     is_better: Bool[Array, ""] = alone > with_held
     return ~is_better
+
+
+def paid_for_entropy(exploration: Exploration) -> Float[Array, ""]:
+    """1 where the critics' target has entropy in it, 0 as long as nothing is known to pay.
+
+    Values would be of entropy alone then, and hide the first rewards for long.
+    """
+    return jnp.where(is_worth_it(exploration), 0.0, 1.0)

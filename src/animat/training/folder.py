@@ -32,7 +32,9 @@ from animat.writing import atomic_write
 
 MANIFEST = "training.json"
 TABLE = "assessments.csv"
-_NOT_TOLD = ("fingerprint", "sources", "burst_thresholds")
+_BESIDE = ("sources", "random_return")
+"""What a description tells beside what decides how policies come out."""
+_NOT_TOLD = ("fingerprint", *_BESIDE, "burst_thresholds")
 """Where a folder is another training's: they differ with the responses."""
 
 
@@ -72,8 +74,13 @@ def _expect_whole_episodes(training: Training) -> None:
         )
 
 
-def describe(training: Training, timeline: SimulatorTimeline | None, sources: Sequence[str] = ()) -> dict[str, Any]:
-    """What decides how policies come out, as plain data, with a fingerprint over all of it."""
+def describe(
+    training: Training,
+    timeline: SimulatorTimeline | None,
+    sources: Sequence[str] = (),
+    random_return: float | None = None,
+) -> dict[str, Any]:
+    """What decides how policies come out, as plain data, with a fingerprint over all of it; and what is told beside."""
     versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
     if isinstance(training.robot, HostRobot):
         versions |= training.robot.versions
@@ -89,7 +96,8 @@ def describe(training: Training, timeline: SimulatorTimeline | None, sources: Se
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
     fingerprint = fingerprint_of(former, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # Names of files are told but do not decide: the same recordings in another place are the same.
-    return manifest | {"sources": list(sources), "fingerprint": fingerprint}
+    beside = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
+    return manifest | beside | {"fingerprint": fingerprint}
 
 
 def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
@@ -113,7 +121,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
     """
     if (found := _description_in(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
-        unknown = ("simulators", "sources", "fingerprint", *(("duration_min",) if as_long_as_recordings else ()))
+        unknown = ("simulators", *_BESIDE, "fingerprint", *(("duration_min",) if as_long_as_recordings else ()))
         if difference := _first_difference(found, describe(training, None), unknown):
             raise of_another(folder, "training", difference)
 
@@ -189,7 +197,7 @@ def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring:
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
     """What of a training's description its policies carry: all that decides how they come out."""
-    return {key: value for key, value in manifest.items() if key != "sources"}
+    return {key: value for key, value in manifest.items() if key not in _BESIDE}
 
 
 def groups_of(

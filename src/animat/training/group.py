@@ -24,9 +24,10 @@ from animat.progress import Progress
 from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
 from animat.training.course import Course
+from animat.training.diagnosis import diagnosing
 from animat.training.host import programs_on_host
 from animat.training.networks import Network
-from animat.training.policy import Policy
+from animat.training.policy import CURVE, Policy, whole_curve
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
@@ -39,8 +40,8 @@ CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
 
 
-AddPart: TypeAlias = Callable[[Float64[np.ndarray, "policies 3"]], None]
-"""What is given a part of the learning curves, a row a policy."""
+AddPart: TypeAlias = Callable[[Float64[np.ndarray, "policies columns"]], None]
+"""What is given a part of the learning curves, a row a policy; columns as `CURVE`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,12 +161,13 @@ class SideBySide:
         else:
             made = programs_on_host if isinstance(training.robot, HostRobot) else programs
             beginning, self._chunk = made(self._environment, training.algorithm)
+        self._diagnose = diagnosing(self._environment, training.algorithm)
         keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
         self._learners = beginning(keys)
         self._curve: list[np.ndarray] = []
 
     @property
-    def curve(self) -> Sequence[Float64[np.ndarray, "policies 3"]]:
+    def curve(self) -> Sequence[Float64[np.ndarray, "policies columns"]]:
         """The learning curves so far: of each part, a row a policy."""
         return self._curve
 
@@ -178,9 +180,10 @@ class SideBySide:
             UnusableData: if what was learned is no longer a finite number.
         """
         first, last = self._group.training.chunk(index)
+        algorithm = self._group.training.algorithm
         self._learners, finished = self._chunk(self._learners, simulator, jnp.int32(first), jnp.int32(last))
         episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
-        iterations = np.full(len(episodes), last * self._group.training.algorithm.environments)
+        iterations = np.full(len(episodes), last * algorithm.environments)
         # Before a checkpoint is written, from which no training would recover.
         robot, deployed = self._group.training.robot, jax.tree.leaves(self._learners.deployed)
         if not all(np.isfinite(leaf).all() for leaf in deployed):
@@ -188,8 +191,10 @@ class SideBySide:
                 f"{robot.name}: expected finite rewards and observations, got NaN or infinite ones "
                 f"within {iterations[0]:,} iterations"
             )
+        available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
+        diagnosis = map(np.asarray, self._diagnose(self._learners, available))
         with np.errstate(invalid="ignore"):
-            self._curve.append(np.stack([iterations, episodes, returns / episodes], axis=1))
+            self._curve.append(np.stack([iterations, episodes, returns / episodes, *diagnosis], axis=1))
         if self._course is not None:
             self._course.assess(index, self._learners.deployed, simulator)
         return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")
@@ -204,7 +209,7 @@ class SideBySide:
 
     def _policy(self, i: int) -> Policy:
         done = len(self._curve)
-        curve = np.stack(self._curve)[:, i] if done else np.zeros((0, 3))
+        curve = np.stack(self._curve)[:, i] if done else np.zeros((0, len(CURVE)))
         now = self._as_policy(i, self._learners.deployed, curve)
         if self._course is None or not done or not self._group.training.episodes_assessed:
             return now
@@ -281,7 +286,9 @@ def _read_checkpoint(
             kept = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]
             done, curve = int(file["done"]), file["curve"]
             forms = [[(a.shape, a.dtype) for a in arrays] for arrays in (kept, leaves)]
-            if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, len(leaves[0]), 3):
+            # Checkpoints of before have three columns of the curve.
+            curve = whole_curve(curve)
+            if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, len(leaves[0]), len(CURVE)):
                 raise InvalidFile(
                     f"{path}: expected a checkpoint as this animat writes it, of {len(leaves[0])} policies together, "
                     f"got another's (a former version grouped 2 to 5 otherwise); to begin these anew: rm '{path}'"

@@ -38,6 +38,9 @@ from animat.writing import atomic_write
 FORMAT = "animat-policy-1"
 HIDDEN_ACTIVATION = "relu"
 """Of both hidden layers, max(0, x); said in every file, for whoever runs the network without this package."""
+CURVE = ("iterations", "episodes", "mean_return", "entropy", "alpha", "critic_loss")
+"""The columns of a learning curve, a row a part of the training: what was done at its end, the episodes that ended in
+it and their mean return, and how the learner stood then (`animat.training.diagnosis`); NaN: not known."""
 _LAYERS = 3
 _ARRAYS = ("scales", "learning_curve", *(f"layer{i}.{part}" for i in range(_LAYERS) for part in ("weight", "bias")))
 _MOST_BYTES = 2**28
@@ -67,7 +70,7 @@ class Policy:
         window_ms: the response window, for a policy that acts through neurons.
         presentation: how stimuli were presented when the neurons were recorded; None where it is not known.
         provenance: what it was trained on and how, as plain data.
-        learning_curve: iterations, episodes ended and their mean return, a row a chunk of training, shape (chunks, 3).
+        learning_curve: how it went, a row a chunk of training, columns as `CURVE`, shape (chunks, 6).
         readouts: what is read of the neurons, by the electrodes of each command.
         neural_observation: whether it sees what the neurons remember, too (`animat.wrappers.NeuralObservation`).
         assessments: iterations, minute of the simulators, lesson (from 1), share of successes (NaN where the robot does
@@ -87,7 +90,7 @@ class Policy:
     window_ms: tuple[float, float] | None = None
     presentation: Presentation | None = None
     provenance: Dict[str, Any] = field(default_factory=dict)
-    learning_curve: Float[np.ndarray, "chunks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    learning_curve: Float[np.ndarray, "chunks 6"] = field(default_factory=lambda: np.zeros((0, len(CURVE))))
     readouts: Readouts = ALL
     neural_observation: bool = False
     assessments: Float[np.ndarray, "assessments 5"] = field(default_factory=lambda: np.zeros((0, 5)))
@@ -100,8 +103,8 @@ class Policy:
         if self.commands is not None:
             read_record(tuple[Command, ...], self.commands, "commands")
             expect_one_command(self.robot.name, self.robot.n_commands)
-        if self.learning_curve.ndim != 2 or self.learning_curve.shape[1] != 3 or self.learning_curve.dtype.kind != "f":
-            raise InvalidArgument(f"learning_curve: expected rows of three, got shape {self.learning_curve.shape}")
+        if self.learning_curve.shape[1:] != (len(CURVE),) or self.learning_curve.dtype.kind != "f":
+            raise InvalidArgument(f"learning_curve: expected rows of six, got shape {self.learning_curve.shape}")
         if self.assessments.ndim != 2 or self.assessments.shape[1] != 5 or self.assessments.dtype.kind != "f":
             raise InvalidArgument(f"assessments: expected rows of five, got shape {self.assessments.shape}")
         expect_provenance(self.provenance)
@@ -287,7 +290,7 @@ class Policy:
                 window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
                 provenance=described["provenance"],
-                learning_curve=arrays["learning_curve"],
+                learning_curve=whole_curve(arrays["learning_curve"]),
                 assessments=arrays.get("assessments", np.zeros((0, 5))),
                 # Files of before read all channels as one, and their policies saw the robot alone.
                 readouts=Readouts.from_dict(described.get("readouts")),
@@ -296,6 +299,13 @@ class Policy:
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             said = f"nothing called {error}" if isinstance(error, KeyError) else error
             raise InvalidFile(f"{path}: expected a whole policy, got one that does not fit together: {said}") from error
+
+
+def whole_curve(curve: Float[np.ndarray, "*_ columns"]) -> Float[np.ndarray, "*_ columns"]:
+    """Learning curves with all columns: those that were kept before had the first three."""
+    if curve.shape[-1:] != (3,):
+        return curve
+    return np.concatenate([curve, np.full((*curve.shape[:-1], len(CURVE) - 3), np.nan, curve.dtype)], axis=-1)
 
 
 def _commanded(z: Float64[np.ndarray, " commands"]) -> float | Float64[np.ndarray, " commands"]:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Robot
-from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
+from animat.training.exploration import Exploration, ended_episodes, explore, n_uniforms, nothing_held, paid_for_entropy
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit
@@ -340,11 +340,8 @@ def learn(
 ) -> Learner:
     """`settings.gradient_steps` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
-    n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
-    is_continuous = environment.n_actions is None
-
-    # Where nothing is known to pay, values would be of entropy alone, and hide the first rewards for long.
-    paid = jnp.where(is_worth_it(learner.exploration), 0.0, 1.0)
+    n_drawn, is_continuous = environment.n_drawn, environment.n_actions is None
+    paid = paid_for_entropy(learner.exploration)
 
     def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
         if is_continuous:
@@ -353,9 +350,7 @@ def learn(
 
     def update(carry: tuple[Trained, Network, Any], uniforms: Float[Array, "blocks batch"]) -> tuple[Any, None]:
         trained, targets, optimiser = carry
-        rows = learner.replay[(uniforms[0] * available).astype(jnp.int32)]
-        action = rows[:, 2 * n : 2 * n + n_drawn] if is_continuous else rows[:, 2 * n]
-        batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, -2], rows[:, -1])
+        batch = batch_of(environment, learner.replay, available, uniforms[0])
         noise = uniforms[1:].reshape(-1, n_drawn, settings.batch).swapaxes(1, 2)
         gradient = jax.grad(losses)(trained, targets, batch, noise)
         steps, optimiser = adam.update(gradient, optimiser)
@@ -367,6 +362,19 @@ def learn(
         update, (learner.trained, learner.targets, learner.optimiser), uniforms
     )
     return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
+
+
+def batch_of(
+    environment: Environment[Any],
+    replay: Float[Array, "transitions row"],
+    available: Int[Array, ""],
+    uniforms: Float[Array, " batch"],
+) -> Batch:
+    """Transitions drawn from the first `available` ones of a replay."""
+    n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
+    rows = replay[(uniforms * available).astype(jnp.int32)]
+    action = rows[:, 2 * n : 2 * n + n_drawn] if environment.n_actions is None else rows[:, 2 * n]
+    return Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, -2], rows[:, -1])
 
 
 def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:

@@ -21,6 +21,7 @@ def chart(
     *,
     marks: Sequence[tuple[float, str]] = (),
     until: float | None = None,
+    width: Width = "two-thirds",
 ) -> dict[str, Any]:
     """Curves over one axis.
 
@@ -31,11 +32,12 @@ def chart(
         words: how to read it, with its main numbers.
         marks: places on the x axis with what is there.
         until: where the x axis ends at least.
+        width: on the page.
     """
     told = [[number(at), text(what)] for at, what in marks]
     return {
         "kind": "chart", "title": title, "x": x, "y": y, "series": list(series), "words": text(words, 2000),
-        "marks": told, "until": number(until),
+        "marks": told, "until": number(until), "width": width,
     }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
+from animat.training.policy import CURVE, whole_curve
 from animat.watch.plain import listed, number, text
 
 _MOST_BYTES = 2**24
@@ -54,9 +55,7 @@ def curve_of_checkpoint(path: Path) -> Float64[np.ndarray, "chunks policies colu
         curve = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
     except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive
         return None
-    return (
-        np.asarray(curve, np.float64) if curve.ndim == 3 and curve.shape[2] == 3 and curve.dtype.kind == "f" else None
-    )
+    return _whole(curve) if curve.ndim == 3 else None
 
 
 def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
@@ -68,7 +67,13 @@ def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
             curve = file.get_tensor("learning_curve")
     except (OSError, SafetensorError, ValueError, TypeError):
         return None
-    return np.asarray(curve, np.float64) if curve.ndim == 2 and curve.shape[1] == 3 else None
+    return _whole(curve) if curve.ndim == 2 else None
+
+
+def _whole(curve: np.ndarray) -> Float64[np.ndarray, "*_ columns"] | None:
+    """Learning curves with the columns of `CURVE`; None for anything else."""
+    whole = whole_curve(curve)
+    return np.asarray(whole, np.float64) if whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f" else None
 
 
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from animat.closed_loop.gathering import LOG_FILE
+from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
 
 Kind = Literal["session", "training", "study", "tuning", "recording"]
@@ -97,9 +98,17 @@ def _in_folder(root: Path, folder: Path) -> Iterator[Found]:
                 yield Found(kind, place, newest_s)
         except OSError:
             continue
-    files = recordings_in(folder)
-    if files:
-        yield Found("recording", place, max(file.stat().st_mtime for file in files))
+    changed_s = [when for when in map(changed, (*recordings_in(folder), folder / UNDER_WAY)) if when is not None]
+    if changed_s:
+        yield Found("recording", place, max(changed_s))
+
+
+def changed(file: Path) -> float | None:
+    """When a file changed last; None where none is there, or a link."""
+    try:
+        return None if file.is_symlink() else file.stat().st_mtime
+    except OSError:
+        return None
 
 
 def recordings_in(folder: Path) -> list[Path]:

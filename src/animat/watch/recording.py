@@ -1,4 +1,4 @@
-"""The view of recordings: which are there, and of the newest its raster, rates, responses and findings."""
+"""The view of recordings: of the one under way or the newest its raster, rates, responses and findings."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from animat.cultures.under_way import UNDER_WAY
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording
 from animat.watch.blocks import chart, curve, facts, table
-from animat.watch.found import recordings_in
+from animat.watch.found import changed, recordings_in
 from animat.watch.held import is_held
 from animat.watch.plain import text
 from animat.watch.spikes import packed_spikes
@@ -22,7 +23,7 @@ _LARGEST = 2**31
 
 
 class RecordingView:
-    """A folder of recordings, looked at again and again; the newest is read once it is there."""
+    """A folder of recordings, looked at again and again; what changed last is read anew."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -43,31 +44,34 @@ class RecordingView:
         """The newest recording, and the seconds of it before a time."""
         if not 0 < span_s <= _MOST_SPAN_S:
             raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
-        files = recordings_in(self.folder)
-        if not files:
-            raise InvalidFile(f"{self.folder}: expected recordings, got none any more")
-        newest = max(files, key=lambda file: (file.stat().st_mtime, file.name))
-        self._look_at_another(files, newest)
+        # Before the files are looked at: whoever lets go of the folder has removed what was under way.
         running = is_held(self.folder)
-        told = "each recording is written when it is whole: the one under way is not in the folder yet"
+        whole = recordings_in(self.folder)
+        times = {file: when for file in (*whole, self.folder / UNDER_WAY) if (when := changed(file)) is not None}
+        if not times:
+            raise InvalidFile(f"{self.folder}: expected recordings, got none any more")
+        newest = max(times, key=lambda file: (times[file], file.name))
+        self._look_at_another([*times], newest)
         recording = self._recording
-        blocks = [facts("Recordings", self._facts(files, newest))]
+        blocks = [facts("Recordings", self._facts(len(whole), newest))]
         found: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
         if recording is not None:
             raster, found = _raster(recording, to_s, span_s)
             blocks += [raster, _rates(recording)]
-        blocks += [_shares(self._shares, len(files)), *_inspected(self._inspection)]
+        blocks += [_shares(self._shares, len(times)), *_inspected(self._inspection)]
+        is_broken = running is False and self.folder / UNDER_WAY in times
         return {
             "generation": 0,
-            "state": "running" if running else "ended",
-            "message": told if running else f"{len(files)} are there",
+            "state": "running" if running else "silent" if is_broken else "ended",
+            "message": _message(len(whole), newest, recording, running=bool(running), is_broken=is_broken),
             "damage": self._trouble,
             **found,
             "blocks": blocks,
         }
 
-    def _facts(self, files: list[Path], newest: Path) -> list[tuple[str, Any]]:
-        rows: list[tuple[str, Any]] = [("there", len(files)), ("newest", newest.name)]
+    def _facts(self, whole: int, newest: Path) -> list[tuple[str, Any]]:
+        shown = "the one under way, as far as it is" if newest.name == UNDER_WAY else newest.name
+        rows: list[tuple[str, Any]] = [("whole ones", whole), ("shown", shown)]
         inspection = self._inspection
         if inspection is not None:
             rows += [
@@ -83,7 +87,11 @@ class RecordingView:
 
     def _read(self, file: Path) -> None:
         """Read a file, if it is another one than before."""
-        status = file.stat()
+        try:
+            status = file.stat()
+        except OSError:
+            # What is under way is gone when it is whole.
+            return
         key = file, status.st_mtime_ns, status.st_size
         if key == self._key:
             return
@@ -97,6 +105,7 @@ class RecordingView:
     def _look_at_another(self, files: list[Path], newest: Path) -> None:
         """Read the newest, or one of the others that was not looked at yet: each takes a second or two."""
         before = self._key
+        self._shares = {file: of for file, of in self._shares.items() if file in files}
         self._read(newest)
         other = next((file for file in files if file not in self._shares), None)
         if before != self._key or other is None:
@@ -109,6 +118,17 @@ class RecordingView:
     def _keep(self, file: Path, inspection: Inspection | None) -> None:
         shares = {} if inspection is None else {text(c.label): c.share_above_median for c in inspection.conditions}
         self._shares[file] = (float("nan") if inspection is None else inspection.start_min), shares
+
+
+def _message(whole: int, newest: Path, recording: Recording | None, *, running: bool, is_broken: bool) -> str:
+    """How it stands, in words."""
+    if is_broken:
+        return "the recording under way was broken off: what is there of it is shown, and is none of the recordings"
+    if not running:
+        return f"{whole} are there"
+    if newest.name != UNDER_WAY:
+        return "of the next recording nothing is known yet: stimulation is set up, or its first block is under way"
+    return "" if recording is None else f"{recording.duration_s:.0f} s of the one under way are shown"
 
 
 def _inspection_of(file: Path) -> tuple[Recording, Inspection]:

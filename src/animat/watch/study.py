@@ -10,11 +10,12 @@ from animat.plain_file import read_toml
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, mean_of_episodes, newest_s, told_by_jobs
 from animat.watch.held import state_of
-from animat.watch.plain import listed, mapped, text
+from animat.watch.plain import listed, mapped, number, text
 from animat.watch.speed import Speed
 
 _UNFINISHED = ".unfinished"
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
+_CONTEXT = "context study"
 _FAILED = "A job that fails ends the study, and its command says which: the folder does not keep it."
 
 
@@ -32,9 +33,11 @@ class StudyView:
 
     def about(self) -> dict[str, Any]:
         """What is studied."""
-        study = mapped(self._manifest().get("study"))
-        robots = ", ".join(text(mapped(each).get("name", "robot")) for each in listed(study.get("robots")))
-        return {"generation": 0, "title": f"study {f'of {robots}' if robots else ''}".strip()}
+        manifest = self._manifest()
+        names = [mapped(each).get("name", "robot") for each in listed(mapped(manifest.get("study")).get("robots"))]
+        names += listed(mapped(manifest.get(_CONTEXT)).get("robots"))
+        robots, kind = ", ".join(map(text, names)), _CONTEXT if _CONTEXT in manifest else "study"
+        return {"generation": 0, "title": f"{kind} {f'of {robots}' if robots else ''}".strip()}
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         """How far it is; a study has no clock of its own."""
@@ -94,6 +97,9 @@ class StudyView:
 
 
 def _jobs_of(folder: Path) -> list[tuple[str, float]]:
+    context = mapped(json_of(folder / "study.json")).get(_CONTEXT)
+    if context is not None:
+        return _jobs_of_context(mapped(context))
     specification = folder / "study.toml"
     words = read_toml(specification, 2**20)
     named = [mapped(each) for name in ("robots", "arms") for each in listed(words.get(name))]
@@ -104,6 +110,19 @@ def _jobs_of(folder: Path) -> list[tuple[str, float]]:
     from animat.studies.toml import read_study
 
     return [(job.name, job.cost_s) for job in plan_study(read_study(specification), folder)]
+
+
+def _jobs_of_context(words: dict[str, Any]) -> list[tuple[str, float]]:
+    robots, cultures = (tuple(listed(words.get(name))) for name in ("robots", "cultures"))
+    if any(":" in str(robot) for robot in robots):
+        raise InvalidFile("the study names code of one's own, which a page does not import")
+    if len(robots) * len(cultures) > _MOST_RECEIPTS:
+        raise InvalidFile("the study has more robots and cultures than a page looks through")
+    from animat.studies.context import plan_context_study
+    from animat.studies.context_tasks import ContextStudy
+
+    study = ContextStudy(**{**words, "robots": robots, "cultures": cultures})
+    return [(job.name, job.cost_s) for job in plan_context_study(study)]
 
 
 def done_jobs(folder: Path) -> dict[str, int]:
@@ -143,5 +162,9 @@ def results_table(folder: Path) -> dict[str, Any]:
         found = mean_of_episodes(path)
         if found is not None:
             rows.append([path.parts[-3], path.parts[-2], *found])
+    for path in sorted(folder.glob("culture-*/*/simulated.json"))[:_MOST_SHOWN]:
+        for row in listed(mapped(json_of(path)).get("rows"))[:1]:
+            told = [number(mapped(row).get(name)) for name in ("mean_return", "actors", "episodes")]
+            rows.append([path.parts[-2], f"policies, {path.parts[-3]}", *told])
     words = "Over all policies, on the last recording; the report has their comparisons." if rows else "none yet"
     return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, words, width="whole")

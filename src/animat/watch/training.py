@@ -12,18 +12,15 @@ from jaxtyping import Float64
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
-from animat.watch.blocks import chart, curve, facts, table, time_left
+from animat.watch.blocks import facts, table, time_left
 from animat.watch.files import curve_of_checkpoint, curve_of_policy, json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
+from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
 from animat.watch.speed import Speed
 
 _UNFINISHED = ".unfinished"
 _MOST_POLICIES = 1000
-_NOT_KEPT = (
-    "The folder holds no returns of random actions, of the best coupling or of an optimum, and no entropy, alpha or "
-    "critic loss: animat evaluate has the former, nothing the latter."
-)
 
 
 class TrainingView:
@@ -58,6 +55,7 @@ class TrainingView:
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
         share = max(shares.values(), default=0.0)
+        levels, missing = levels_of(self._manifest(), mapped(json_of(self.folder / "evaluation.json")))
         rows: list[tuple[str, Any]] = [
             ("policies", f"{planned:,}, of which {sum(each >= 1 for each in shares.values()):,} are done"),
             ("iterations of each", iterations),
@@ -74,7 +72,7 @@ class TrainingView:
             "damage": "",
             "blocks": [
                 facts("So far", rows),
-                _curves_chart(curves, _swaps(training, simulators, iterations), iterations),
+                *learning_charts(curves, _swaps(training, simulators, iterations), iterations, levels, missing),
                 _table(planned, curves, shares, told, self._assessed(training)),
             ],
         }
@@ -88,7 +86,7 @@ class TrainingView:
     def _training(self) -> dict[str, Any]:
         return mapped(self._manifest().get("training"))
 
-    def _learned(self, planned: int) -> tuple[dict[int, Float64[np.ndarray, "chunks 3"]], dict[int, float]]:
+    def _learned(self, planned: int) -> tuple[dict[int, Float64[np.ndarray, "chunks columns"]], dict[int, float]]:
         """The learning curve of each policy by its number, and how much of its training is done."""
         curves: dict[int, Any] = {}
         shares = dict.fromkeys(range(planned), 0.0)
@@ -170,33 +168,9 @@ def _swaps(training: dict[str, Any], simulators: dict[str, Any], iterations: flo
     return [(share * iterations, f"minute {each:g}") for share, each in at if 0 < share < 1]
 
 
-def _curves_chart(
-    curves: dict[int, Float64[np.ndarray, "chunks 3"]], swaps: list[tuple[float, str]], iterations: float
-) -> dict[str, Any]:
-    series = [curve("", of[:, 0].tolist(), of[:, 2].tolist(), "thin", "grey") for of in curves.values()]
-    most = max((len(of) for of in curves.values()), default=0)
-    told = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."
-    if most:
-        returns = np.full((len(curves), most), np.nan)
-        at = np.full(most, np.nan)
-        for row, of in zip(returns, curves.values(), strict=True):
-            row[: len(of)] = of[:, 2]
-            at[: len(of)] = of[:, 0]
-        known = np.isfinite(returns)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.where(known, returns, 0.0).sum(axis=0) / known.sum(axis=0)
-        series.append(curve("mean of the policies", at.tolist(), mean.tolist(), "line", "blue"))
-        last = next((x for x in mean[::-1].tolist() if np.isfinite(x)), None)
-        told = f"Mean return of the episodes that ended last: {'none ended yet' if last is None else f'{last:.1f}'}. "
-        told += "Grey: each policy; blue: their mean, of those that are as far; a point a sixtieth of the training."
-    told += " Dashed: the simulators were refreshed with the recording of that minute." if swaps else ""
-    words = f"{told} {_NOT_KEPT}"
-    return chart("Learning curves", "iterations", "return", series, words, marks=swaps, until=iterations)
-
-
 def _table(
     planned: int,
-    curves: dict[int, Float64[np.ndarray, "chunks 3"]],
+    curves: dict[int, Float64[np.ndarray, "chunks columns"]],
     shares: dict[int, float],
     told: dict[str, tuple[float, str, float]],
     assessed: dict[str, str],

@@ -101,8 +101,9 @@ async function things() {
       $("things").things = listed;
       if (thing) $("things").value = key(thing);
       // What came last is what goes on, unless somebody chose; what a study makes is part of it.
-      const fresh = found.things.find((each) => !before.has(key(each)));
-      if (thing && fresh && !picked && !["study", "tuning"].includes(thing.kind)) choose(fresh);
+      const isPart = (each) => ["study", "tuning"].includes(thing?.kind) && each.kind !== thing.kind;
+      const fresh = found.things.find((each) => !before.has(key(each)) && !isPart(each));
+      if (thing && fresh && !picked) choose(fresh);
     }
     $("choose").hidden = found.things.length < 2;
     if (!thing && found.things.length) choose(found.things[0]);

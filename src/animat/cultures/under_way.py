@@ -1,0 +1,79 @@
+"""The recording that is being made, as far as it is: a file beside the series, for whoever looks meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from animat.errors import InvalidFile
+from animat.recordings.recording import Recording
+from animat.writing import atomic_write, clear_away
+
+UNDER_WAY = ".under-way.npz"
+"""Its name in the folder of the recordings; hidden, so that no reader of a folder takes it for one of them."""
+EVERY_S = 3.0
+"""Seconds between two times that it is written."""
+
+
+class UnderWay:
+    """What `Culture.record` is followed by; use it as a context manager, which removes the file in the end.
+
+    Args:
+        folder: of the recordings.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / UNDER_WAY
+        self._written_s = -np.inf
+
+    def __enter__(self) -> Self:
+        self._remove()
+        return self
+
+    def __call__(self, so_far: Callable[[], Recording]) -> None:
+        """Write what was recorded so far, unless that was done just before."""
+        if time.monotonic() - self._written_s < EVERY_S:
+            return
+        # Where this cannot be written the recording cannot either, which says so.
+        with suppress(InvalidFile), atomic_write(self._path) as beside, beside.open("wb") as file:
+            np.savez(file, **_columns(so_far()))
+        self._written_s = time.monotonic()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._remove()
+
+    def _remove(self) -> None:
+        """Remove the file, and what a killed run left of it."""
+        for file in (self._path, *self._path.parent.glob(f".{UNDER_WAY}.*.partial*")):
+            clear_away(file)
+
+
+def _columns(recording: Recording) -> dict[str, Any]:
+    """A recording as `animat.recordings.columns.PlainColumns` names its parts."""
+    channels, stimuli, presentation = recording.channels, recording.stimuli, recording.presentation
+    return {
+        "spike_time_s": recording.spike_times_s,
+        "spike_channel": channels.label[recording.spike_channels],
+        "channel_label": channels.label,
+        "channel_electrode": channels.electrode,
+        "channel_xy_um": np.column_stack([channels.x_um, channels.y_um]),
+        "stimulus_time_s": stimuli.time_s,
+        "stimulus_frequency_hz": stimuli.frequency_hz,
+        "stimulus_pattern": stimuli.pattern,
+        "stimulus_electrodes": stimuli.electrodes,
+        "stimulus_presentation": stimuli.presentation,
+        "sampling_rate_hz": recording.sampling_rate_hz,
+        "start_min": recording.start_min,
+        "start_s": recording.start_s,
+        "duration_s": recording.duration_s,
+        **({} if presentation is None else {"presentation_order": presentation.order}),
+        **({} if presentation is None else {"presentation_pulses": presentation.pulses}),
+    }
