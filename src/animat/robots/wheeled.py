@@ -1,10 +1,10 @@
-"""Wheels: a small robot on two wheels finds a goal between obstacles by what it senses, without knowing where it is."""
+"""A small robot on two wheels among walls and obstacles: what tasks with its body share."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +14,6 @@ from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture
 from animat.robots.motion import cost_of_distance, within_half_a_turn
-from animat.robots.registry import register_robot
 from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Walls, places_within_reach
 
 if TYPE_CHECKING:
@@ -44,6 +43,9 @@ at the nearest place of the lattice of 0.4 / sqrt(2) less, 0.217. A wall is not 
 place has at most 0.2.
 """
 
+ARENA = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0))
+"""The walls of a square of 1 m."""
+
 
 class WheelsState(NamedTuple):
     """Where the robot is and looks, and where its goal is: seen from above, x to the right, y down.
@@ -58,11 +60,9 @@ class WheelsState(NamedTuple):
     goal_y_m: Float[Array, ""]
 
 
-@final
-@register_robot
 @record
-class Wheels(Robot[WheelsState]):
-    """Two wheels and eight proximity sensors on the way to a goal; 50 at the goal, -2 for a bump, else a small cost.
+class Wheeled(Robot[WheelsState]):
+    """Two wheels and eight proximity sensors on the way to a goal, in an arena.
 
         v = max_speed_m_per_s u,    forward = (v_left + v_right) / 2,    turning = (v_left - v_right) / wheel_distance_m
         reward = reward_goal if d <= R (and the episode ends), reward_bump where it bumped, else R / d - 1
@@ -95,8 +95,8 @@ class Wheels(Robot[WheelsState]):
     wheel_distance_m: Size = 0.053
     max_speed_m_per_s: Size = 0.13
     sensor_range_m: Size = 0.1
-    walls: Walls = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0))
-    obstacles: Obstacles = ((0.3, 0.3, 0.08), (0.72, 0.35, 0.06), (0.35, 0.72, 0.06), (0.7, 0.7, 0.08))
+    walls: Walls = ARENA
+    obstacles: Obstacles = ()
     start_x_m: Number = 0.5
     start_y_m: Number = 0.5
     goal_radius_m: Size = 0.05
@@ -105,7 +105,6 @@ class Wheels(Robot[WheelsState]):
     reward_bump: Number = -2.0
     episode_limit: Iterations = 100
 
-    name: ClassVar[str] = "wheels"
     n_commands: ClassVar[int] = 2
     noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 500_000
@@ -197,16 +196,6 @@ class Wheels(Robot[WheelsState]):
     def with_goal_of(self, state: WheelsState, other: WheelsState) -> WheelsState:
         """Where one is, on the way to the other's goal."""
         return state._replace(goal_x_m=other.goal_x_m, goal_y_m=other.goal_y_m)
-
-    def heuristic(self, observation: Any) -> Any:
-        """Turns to the goal and away from what its front sensors see, the more slowly ahead the more it turns."""
-        xp = observation.__array_namespace__()
-        bearing = observation[9]
-        right = 2 * observation[0] + 2 * observation[1] + observation[2]
-        left = 2 * observation[7] + 2 * observation[6] + observation[5]
-        turn = xp.clip(bearing, -1.0, 1.0) + left - right
-        ahead = xp.clip(1 - xp.abs(turn), 0.25, 1.0)
-        return xp.clip(xp.stack([ahead + turn, ahead - turn]), -1.0, 1.0)
 
     def draw(
         self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
