@@ -574,7 +574,7 @@ def test_inspect_refuses_its_options_before_the_files(
             ["train", "unicycle"],
             1,
             [
-                "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'unicycle'",
+                "robot: expected one of arm, cartpole, detour, navigation, shuttle, swing-up, wheels, got 'unicycle'",
                 "module:Class",
             ],
         ),

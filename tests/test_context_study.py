@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from animat.closed_loop.session import read_session
-from animat.errors import InvalidFile, Mismatch
-from animat.stimulation.protocol import CLOSED_LOOP
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
 from animat.studies.context import ContextRow, LostRow, RanContext, run_context_study
 from animat.studies.context_page import in_short, write_context_page
 from animat.studies.context_tasks import ContextStudy
@@ -59,6 +59,25 @@ def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: P
     assert re.search(r"silent</t[dh]>\s*<td[^>]*>0.750</td>\s*<td[^>]*>0.750</td>", text)
     for name in ("context", "whose-work"):
         assert all((tmp_path / f"{name}.{ending}").stat().st_size > 1000 for ending in ("png", "svg", "pdf"))
+
+
+def test_where_no_optimal_return_is_known_it_says_at_least(tmp_path: Path) -> None:
+    interval = {"score_low_95": 0.5, "score_high_95": 0.7, "gap_low_95": 0.7, "gap_high_95": 0.9}
+    known = {"random": -80.0, "policies": 10.0, "best_known": 20.0, "gap": 0.8, "score": 0.6}
+    of_robot = (row(1, "detour", **interval, **known), row(2, "detour", **interval, **known | {"gap": 0.75}))
+    assert in_short(of_robot) == (
+        "A reflex leaves half of the task or more undone on 2 of 2 cultures (context gap at least 0.75 to 0.80). The "
+        "policies do significantly more than the best reflex on 2 of 2 (context score at least 0.60)."
+    )
+    study = ContextStudy(cultures=(1, 2), robots=("detour",))
+    text = write_context_page(study, RanContext(tmp_path, of_robot, (), {})).read_text()
+    assert "≥ 20<" in text and "≥ 0.80" in text and "≥ 0.600 (0.500 to 0.700)" in text
+
+
+def test_robots_with_more_commands_than_two_are_refused() -> None:
+    assert ContextStudy(robots=("wheels", "detour", "arm"))
+    with pytest.raises(InvalidArgument, match="robots: expected ones in JAX with one or two commands, got 'gymnasium:"):
+        ContextStudy(robots=("gymnasium:Pendulum-v1",))
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -107,3 +126,24 @@ def test_a_small_study_from_a_culture_to_its_table(tmp_path: Path, monkeypatch: 
     assert json.loads(before)["robot"] == "shuttle"
     with pytest.raises(Mismatch, match=r"context study.policies: 2 there, 3 now"):
         run_context_study(replace(study, policies=3), tmp_path)
+
+
+@pytest.mark.oracle
+@pytest.mark.usefixtures("in_this_process", "few_bootstraps")
+def test_a_small_study_of_a_robot_with_two_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("animat.stimulation.protocol.TWO_COMMANDS", replace(TWO_COMMANDS, trials=40))
+    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
+    study = ContextStudy(
+        cultures=(1,), robots=("detour",), policies=2, iterations_share=0.01, episodes=40, episodes_measured=1
+    )
+    (only,) = run_context_study(study, tmp_path).rows
+    told = json.loads((tmp_path / "culture-1" / "detour" / "simulated.json").read_text())
+    rows = {each["name"]: each for each in told["rows"]}
+    assert only.optimum is None and only.is_least and only.best_known is not None
+    # That of the heuristic, or of a policy, in the second half of its episodes.
+    assert only.best_known >= rows["heuristic"]["mean_return"] - 20
+    expected = (only.best_known - only.coupling) / (only.best_known - only.random)
+    assert only.gap == pytest.approx(min(max(expected, 0.0), 1.0))
+    session = read_session(tmp_path / "culture-1" / "detour" / "session")
+    assert {len(tick.command) for tick in session.ticks if tick.agent == "coupling"} == {2}
+    assert only.measured_coupling is not None and only.bits is not None

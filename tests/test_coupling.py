@@ -15,7 +15,7 @@ from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation import coupling
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.coupling import ContextGap, Coupling, best_coupling, context_gap
+from animat.evaluation.coupling import ContextGap, Coupling, best_coupling, context_gap, least_context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import roll_out
 from animat.evaluation.statistics import Interval
@@ -183,3 +183,51 @@ def test_of_one_episode_there_is_no_gap() -> None:
     gap = context_gap(np.array([40.0]), np.array([-10.0]), optimum_of(90.0))
     assert gap.gap is None and not gap.needs_context and gap.to_dict()["coupling_standard_error"] is None
     assert gap.to_text() == "best coupling 40.0; no context gap of one episode"
+
+
+@pytest.mark.parametrize("coupling", [-60.0, -85.0])
+@pytest.mark.parametrize("optimum", [10.0, 20.0, 49.0])
+def test_where_the_optimum_is_not_known_gap_and_score_are_the_least_that_they_can_be(
+    coupling: float, optimum: float
+) -> None:
+    """Above and below random stimuli, which return -80; the best agent that is known returns 10."""
+    couplings, random, known = (np.full(4, each) for each in (coupling, -80.0, 10.0))
+    least = least_context_gap(couplings, random, np.stack([known - 5, known, known - 20]), highest=50.0)
+    assert least.is_least and least.best_known == 10 and least.gap is not None and least.needs_context
+    assert least.gap.value <= (optimum - coupling) / (optimum + 80) + 1e-12
+    assert least.gap.value == pytest.approx(min(1.0, (10 - coupling) / 90))
+    for policies in (-5.0, 8.0, coupling - 5):
+        score = least.score(np.array([policies, policies]), None)
+        assert score is not None and score.value <= (policies - coupling) / (optimum - coupling) + 1e-12
+        assert score.low == pytest.approx(score.value) and np.sign(score.low) == np.sign(policies - coupling)
+    told = least.to_text(least.score(np.array([8.0, 8.0]), None))
+    assert "context gap at least" in told and "context score at least" in told and "returns 10.0" in told
+
+
+def test_the_least_gaps_interval_is_that_of_a_bootstrap_of_episodes_with_the_same_starts() -> None:
+    rng, n = np.random.default_rng(1), 400
+    starts = rng.normal(0, 20, n)
+    couplings, random, known = (of + rng.normal(0, 10, n) for of in (-50 + starts, -80 + starts, 10 + 0 * starts))
+    found = least_context_gap(couplings, random, known[None])
+    pairs, others = rng.integers(n, size=(2, 4000, n))
+    means = known[others].mean(axis=1), couplings[pairs].mean(axis=1), random[pairs].mean(axis=1)
+    low, high = np.quantile((means[0] - means[1]) / (means[0] - means[2]), (0.025, 0.975))
+    assert found.gap is not None
+    assert (found.gap.low, found.gap.high) == pytest.approx((low, high), abs=0.1 * (high - low))
+
+
+def test_the_best_of_many_agents_is_not_flattered_by_the_episodes_that_it_was_chosen_in() -> None:
+    rng, nothing = np.random.default_rng(2), np.zeros(40)
+    found = [least_context_gap(nothing, nothing - 1, rng.normal(5, 10, (20, 40))).best_known for _ in range(500)]
+    assert np.mean(np.array(found, float)) == pytest.approx(5, abs=4 * 10 / np.sqrt(20 * 500))
+
+
+def test_where_no_agent_is_above_random_stimuli_or_the_coupling_nothing_is_known() -> None:
+    rng = np.random.default_rng(3)
+    couplings, random, known = (rng.normal(mean, 1, 50) for mean in (0.0, -80.0, -85.0))
+    below_random = least_context_gap(couplings, random, known[None])
+    assert below_random.gap is None and "the best agent known (-8" in below_random.to_text()
+    below_coupling = least_context_gap(couplings, random, known[None] + 60)
+    assert below_coupling.gap is not None and below_coupling.gap.value == 0 and not below_coupling.needs_context
+    assert below_coupling.to_text().endswith("whether this task needs more than a reflex is not known")
+    assert below_coupling.score(np.array([1.0, 2.0]), None) is None

@@ -95,7 +95,10 @@ def test_names_stand_for_robots_and_mappings() -> None:
     assert pickle.loads(pickle.dumps(named)) == named
     assert Training(Navigation(), None).mapping is None
     for arguments, words in (
-        (("cart", None), "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'cart'"),
+        (
+            ("cart", None),
+            "robot: expected one of arm, cartpole, detour, navigation, shuttle, swing-up, wheels, got 'cart'",
+        ),
         (("cartpole", "2-thresholds"), "mapping: expected one of 1-threshold"),
         ((7, None), "robot: expected a robot or the name of one, got 7"),
         ((Cartpole, None), "robot: expected a robot or the name of one, got <class"),

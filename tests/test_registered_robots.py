@@ -26,6 +26,7 @@ from animat.recordings.synthetic import write_synthetic_series
 from animat.robots import (
     ROBOTS,
     Cartpole,
+    Detour,
     Navigation,
     Robot,
     Shuttle,
@@ -65,7 +66,7 @@ def forgetting() -> Iterator[None]:
 
 def forget(known: dict[str, type[Robot[Any]]] | None = None) -> None:
     """As in a process that has imported nothing of the user's."""
-    ours = {kind.name: kind for kind in (TwoLinkArm, Cartpole, Navigation, Shuttle, SwingUp, Wheels)}
+    ours = {kind.name: kind for kind in (TwoLinkArm, Cartpole, Detour, Navigation, Shuttle, SwingUp, Wheels)}
     registry.REGISTRY._registered.clear()
     registry.REGISTRY._registered.update(known or ours)
     for name in ("my_package", "my_package.robots"):
@@ -223,7 +224,7 @@ def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: p
     monkeypatch.setattr("importlib.metadata.entry_points", found)
     with pytest.raises(
         InvalidArgument,
-        match="expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, rover, tank, got 'plane'",
+        match="expected one of arm, cartpole, detour, navigation, shuttle, swing-up, wheels, rover, tank, got 'plane'",
     ):
         robot_named("plane")
     assert robot_named("rover", gain_m=0.2) == robot_named(ROVER, gain_m=0.2)
@@ -244,7 +245,7 @@ def test_robots_are_listed_with_what_each_can_do(
     assert main(["robots", "--json"]) == 1
     said, _, line = capsys.readouterr().out.strip().rpartition("\n")
     told = json.loads(line)
-    assert list(told["robots"]) == ["arm", "cartpole", "navigation", "shuttle", "swing-up", "wheels", "rover"]
+    assert list(told["robots"]) == ["arm", "cartpole", "detour", "navigation", "shuttle", "swing-up", "wheels", "rover"]
     assert told["robots"]["cartpole"]["can"] == ["heuristic", "value_grid", "draw", "draw_paths"]
     assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
     assert "  no heuristic policy among the controls: rover has no method `heuristic`" in said

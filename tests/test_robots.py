@@ -151,7 +151,11 @@ def test_parameters_may_be_static_under_jit(robot: Robot) -> None:
 @pytest.mark.parametrize(
     ("name", "parameters", "message"),
     [
-        ("unicycle", {}, "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'unicycle'"),
+        (
+            "unicycle",
+            {},
+            "robot: expected one of arm, cartpole, detour, navigation, shuttle, swing-up, wheels, got 'unicycle'",
+        ),
         (3, {}, "robot: expected one of"),
         ("cartpole", {"mass": 1.0}, "cartpole: expected parameters among gravity_m_per_s2, .*, got 'mass'"),
         ("cartpole", {"pole_mass_kg": 0.0}, "cartpole: pole_mass_kg: expected at least 1e-09, got 0"),

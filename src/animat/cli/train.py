@@ -28,7 +28,7 @@ class Train(Fitting):
     """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, swing-up, shuttle, arm, wheels, one of your own, such as
+    """The robot to drive: cartpole, navigation, swing-up, shuttle, arm, wheels, detour, one of your own, such as
     my_package.robots:Rover, or any of Gymnasium's, gymnasium:Reacher-v5"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""

@@ -139,44 +139,63 @@ class ContextGap:
 
         gap = (optimum - best coupling) / (optimum - random)
 
+    Where no optimal return is known (`least_context_gap`), both the gap and the score are the least that they can be.
+
     Attributes:
         coupling: mean return of the best coupling.
         standard_error: of that.
         gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and the optimum's
-            grid. None where the optimum is not above random stimuli, or of one episode.
+            grid or the episodes of what is in its place. None where the optimum is not above random stimuli, or of one
+            episode.
+        best_known: mean return of the best agent that is known, in the optimum's place; None where the optimum is
+            known.
+        highest: where it is not, the highest return that any episode can have.
     """
 
     coupling: float
     standard_error: float
     gap: Interval | None
+    best_known: float | None = None
+    highest: float = np.inf
+
+    @property
+    def is_least(self) -> bool:
+        """Whether gap and score are the least that they can be, as the optimum is not known."""
+        return self.best_known is not None
 
     @property
     def needs_context(self) -> bool:
         """Whether the gap surely exceeds `REFLEX_GAP`."""
         return self.gap is not None and self.gap.low > REFLEX_GAP
 
-    def score(self, returns: Float64[np.ndarray, " policies"], optimum: Optimum) -> Interval | None:
+    def score(self, returns: Float64[np.ndarray, " policies"], optimum: Optimum | None) -> Interval | None:
         """The context score of policies, with its interval: 0 is what a coupling does, 1 the optimum.
 
             score = (mean return - best coupling) / (optimum - best coupling)
 
-        None where the task needs no context, or of one policy alone.
+        Where the optimum is not known, it is between the best agent that is known and the highest return of an episode.
+        The score is then at least what it is with the latter, and where policies are below the coupling with the
+        former. None where the task is not known to need context, or of one policy alone.
 
         Args:
             returns: mean return of each policy.
-            optimum: on the same simulator.
+            optimum: on the same simulator; None where it is not known.
         """
         if not self.needs_context or len(returns) < 2:
             return None
         mean, error = float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(len(returns)))
-        span = optimum.value - self.coupling
+        best, grid_error = (self.highest, 0.0) if optimum is None else (optimum.value, optimum.grid_error)
+        if not np.isfinite(best):
+            return None
+        span, over = best - self.coupling, mean - self.coupling
         # Of a ratio whose denominator is known much better than 0: the half widths of all parts, in quadrature. Few
         # policies have wide tails, so theirs is Student's.
-        value = (mean - self.coupling) / span
+        value = over / span
         of_policies = student_t.ppf((1 + CONFIDENCE) / 2, len(returns) - 1) * error
-        parts = [of_policies, _Z * (1 - value) * self.standard_error, value * optimum.grid_error]
-        spread = float(np.linalg.norm(parts) / span)
-        return Interval(value, value - spread, value + spread, CONFIDENCE)
+        spread = float(np.linalg.norm([of_policies, _Z * (1 - value) * self.standard_error, value * grid_error]))
+        below = span if self.best_known is None else self.best_known - self.coupling
+        value, low, high = (each / (span if each >= 0 else below) for each in (over, over - spread, over + spread))
+        return Interval(value, low, high, CONFIDENCE)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -185,6 +204,8 @@ class ContextGap:
             "coupling_standard_error": self.standard_error if np.isfinite(self.standard_error) else None,
             "context_gap": None if self.gap is None else self.gap.to_dict(),
             "needs_context": self.needs_context,
+            "is_least": self.is_least,
+            "best_known": self.best_known,
         }
 
     def to_text(self, score: Interval | None = None) -> str:
@@ -193,10 +214,18 @@ class ContextGap:
         if not np.isfinite(self.standard_error):
             return f"best coupling {self.coupling:.1f}; no context gap of one episode"
         if self.gap is None:
-            return f"{told}; no context gap, as the optimal return is not above that of random stimuli"
-        gap = f"context gap {self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
+            best = "the optimal return" if self.best_known is None else f"the best agent known ({self.best_known:.1f})"
+            return f"{told}; no context gap, as {best} is not above that of random stimuli"
+        least = "at least " if self.is_least else ""
+        gap = f"context gap {least}{self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
+        if self.best_known is not None:
+            gap += f", as the best agent known returns {self.best_known:.1f}"
         needs = "" if self.needs_context else ": this task needs no more than a reflex"
-        scored = "" if score is None else f"; context score {score.value:.2f} ({score.low:.2f} to {score.high:.2f})"
+        if self.is_least and not self.needs_context:
+            needs = ": whether this task needs more than a reflex is not known"
+        scored = ""
+        if score is not None:
+            scored = f"; context score {least}{score.value:.2f} ({score.low:.2f} to {score.high:.2f})"
         return f"{told}; {gap}{needs}{scored}"
 
 
@@ -218,6 +247,37 @@ def context_gap(
         spread = float(_Z * np.linalg.norm(parts) / span)
         gap = Interval(value, value - spread, value + spread, CONFIDENCE)
     return ContextGap(means[0], errors[0], gap)
+
+
+def least_context_gap(
+    coupling: Float64[np.ndarray, " episodes"],
+    random: Float64[np.ndarray, " episodes"],
+    known: Float64[np.ndarray, "agents episodes"],
+    highest: float = np.inf,
+) -> ContextGap:
+    """The least that the context gap of a task can be, where no optimal return is known.
+
+    The optimum is not below what any agent returns, nor below the coupling. Where the coupling is above random stimuli,
+    the gap grows with the optimum, so with an agent in its place it is the least; else it is at least 1. Which of
+    several agents that is, is chosen by the first half of their episodes; its return is that of the other half.
+
+    Args:
+        coupling, random: returns in the same episodes, with the same starts.
+        known: returns of agents of all kinds, policies and heuristics.
+        highest: return that any episode can have.
+    """
+    half = known.shape[1] // 2 if len(known) > 1 else 0
+    best = known[known[:, : max(half, 1)].mean(axis=1).argmax(), half:]
+    means = [float(each.mean()) for each in (best, coupling, random)]
+    error, span = _standard_error(best), means[0] - means[2]
+    gap = None
+    if span > 0 and np.isfinite([error, _standard_error(coupling)]).all():
+        value = (means[0] - means[1]) / span
+        # As above; coupling and random stimuli, which meet the same starts, pair by pair.
+        spread = _Z * float(np.hypot((1 - value) * error, _standard_error(value * random - coupling)) / span)
+        value, low, high = (float(np.clip(each, 0, 1)) for each in (value, value - spread, value + spread))
+        gap = Interval(value, low, high, CONFIDENCE)
+    return ContextGap(means[1], _standard_error(coupling), gap, means[0], highest)
 
 
 def _standard_error(returns: Float64[np.ndarray, " episodes"]) -> float:

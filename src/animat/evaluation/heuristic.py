@@ -34,8 +34,9 @@ class HeuristicPolicy(Actor):
         return nearest_action(self.actions, self.means, _wanted(environment, observation))
 
 
+# Not as a dataclass: of those without any field JAX takes one for another.
 @final
-@jax.tree_util.register_dataclass
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class Heuristic(Actor):
     """The very commands of the robot's `heuristic`, where any can be given: without neurons, continuous ones."""

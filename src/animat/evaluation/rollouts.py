@@ -63,8 +63,9 @@ class Networks(Actor):
         return likeliest_action(environment, self.network, observation)
 
 
+# Not as a dataclass: of those without any field JAX takes one for another.
 @final
-@jax.tree_util.register_dataclass
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class Uniform(Actor):
     """Every action equally likely, whatever is observed: the random control."""

@@ -14,7 +14,7 @@ from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of
-from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
+from animat.evaluation.coupling import ContextGap, best_coupling, context_gap, least_context_gap
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
@@ -91,7 +91,8 @@ class Evaluation:
         rows: the policies first, then the controls.
         findings: where the policies' training and this simulator differ, and where the optimum is not well known.
         optimum: the optimal return of any controller; None where it was not asked for, or is not known.
-        context: how much of that the best coupling leaves undone; None without an optimum of all conditions.
+        context: how much of that the best coupling leaves undone, or, where there is no optimum, the least that this
+            can be; None where some conditions are left out of the optimum.
         no_optimum: why it is not known, though it was asked for.
         fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
         objectives: of the robot's goal, as texts; none of a robot without one.
@@ -116,7 +117,7 @@ class Evaluation:
     @property
     def context_score(self) -> Interval | None:
         """The policies' context score (`ContextGap.score`)."""
-        if self.context is None or self.optimum is None or self.rows[0].changed:
+        if self.context is None or self.rows[0].changed:
             return None
         return self.context.score(self.rows[0].mean_returns, self.optimum)
 
@@ -207,7 +208,8 @@ class Evaluation:
 
     def _optimum_lines(self) -> list[str]:
         if self.no_optimum is not None:
-            return [f"  no optimal return: {self.no_optimum}"]
+            told = [] if self.context is None else [f"  {self.context.to_text(self.context_score)}"]
+            return [f"  no optimal return: {self.no_optimum}", *told]
         if self.optimum is None:
             return []
         if self.optimum.left_out:
@@ -329,8 +331,14 @@ def evaluate(
             no_optimum = str(error)
     context = None
     by_name = {each.name: each.episodes.returns[0] for each in rows}
-    if optimum is not None and not optimum.left_out and {"coupling", "random"} <= set(by_name):
-        context = context_gap(by_name["coupling"], by_name["random"], optimum)
+    if {"coupling", "random"} <= set(by_name):
+        beside = by_name["coupling"], by_name["random"]
+        if optimum is None:
+            agents = [row.episodes.returns for row in rows if row.name in ("policies", "heuristic") and not row.changed]
+            if agents:
+                context = least_context_gap(*beside, np.concatenate(agents), body.return_range[1])
+        elif not optimum.left_out:
+            context = context_gap(*beside, optimum)
     return Evaluation(
         body.name,
         None if first.mapping is None else first.mapping.name,

@@ -20,11 +20,16 @@ _APART = 0.11
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value on one culture, with its interval where it has one; None where it is not known."""
+    """A value on one culture, with its interval where it has one; None where it is not known.
+
+    Attributes:
+        is_least: whether the true one is that or more.
+    """
 
     value: float | None
     low: float | None = None
     high: float | None = None
+    is_least: bool = False
 
 
 def draw_context(
@@ -68,10 +73,10 @@ def _points(axes: Axes, found: Mapping[str, Sequence[Estimate]], colour: str, no
             axes.plot(
                 [each.value if each.value is not None else np.nan],
                 [place],
-                "o",
+                ">" if each.is_least else "o",
                 color=colour,
                 markersize=4,
-                label="a culture, 95 % interval",
+                label="at least" if each.is_least else "a culture, 95 % interval",
             )
 
 

@@ -3,18 +3,21 @@
 from animat.robots.arm import ArmState, TwoLinkArm
 from animat.robots.base import Quantity, Robot
 from animat.robots.cartpole import Cartpole, CartpoleState
+from animat.robots.detour import Detour
 from animat.robots.gymnasium import GymnasiumRobot
 from animat.robots.navigation import Navigation, NavigationState
 from animat.robots.registry import ROBOTS, register_robot, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.shuttle import Shuttle, ShuttleState
 from animat.robots.swing_up import SwingUp, SwingUpState
-from animat.robots.wheels import Wheels, WheelsState
+from animat.robots.wheeled import WheelsState
+from animat.robots.wheels import Wheels
 
 __all__ = [
     "ROBOTS",
     "ArmState",
     "Cartpole",
     "CartpoleState",
+    "Detour",
     "GymnasiumRobot",
     "Navigation",
     "NavigationState",

@@ -51,6 +51,39 @@ class Surroundings(NamedTuple):
             apart = xp.minimum(apart, xp.hypot(x_m - x, y_m - y) - radius)
         return apart
 
+    def on_ways_m(
+        self, start_m: tuple[float, float], ends_m: Float[np.ndarray, "ways 2"]
+    ) -> Float[np.ndarray, " ways"]:
+        """How near straight ways from a place come to a wall or an obstacle; 0 or less where one is met.
+
+        A way and a wall that do not cross are nearest at an end of one of them.
+
+        Args:
+            start_m: where all ways begin.
+            ends_m: where each one ends.
+        """
+        start, along = np.array(start_m), ends_m - start_m
+        squared = np.maximum((along**2).sum(axis=1), 1e-18)
+
+        def apart_m(point: tuple[float, float]) -> Float[np.ndarray, " ways"]:
+            nearest = np.clip((point - start) @ along.T / squared, 0.0, 1.0)
+            x_m, y_m = (start + nearest[:, None] * along - point).T
+            return np.hypot(x_m, y_m)  # type: ignore[no-any-return]
+
+        def side(of: Float[np.ndarray, "*any 2"], way: Float[np.ndarray, "*any 2"]) -> Float[np.ndarray, " *any"]:
+            return np.sign(way[..., 0] * of[..., 1] - way[..., 1] * of[..., 0])  # type: ignore[no-any-return]
+
+        near = np.minimum(self.clearance_m(*ends_m.T), self.clearance_m(*start[:, None]))
+        for wall in self.walls:
+            a, b = np.array(wall[:2]), np.array(wall[2:])
+            near = np.minimum(near, np.minimum(apart_m(wall[:2]), apart_m(wall[2:])))
+            crossed = side(a - start, along) * side(b - start, along) < 0
+            crossed &= side(start - a, b - a) * side(ends_m - a, b - a) < 0
+            near = np.where(crossed, 0.0, near)
+        for x, y, radius in self.obstacles:
+            near = np.minimum(near, apart_m((x, y)) - radius)
+        return near
+
     def along_rays_m(
         self, x_m: Float[Array, ""], y_m: Float[Array, ""], directions_rad: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:

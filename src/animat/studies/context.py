@@ -16,6 +16,7 @@ from animat.errors import InvalidFile
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
+from animat.robots.registry import robot_named
 from animat.studies.context_tasks import (
     MEASURED,
     SIMULATED,
@@ -43,7 +44,9 @@ class ContextRow:
     """A task on a culture: mean returns on the simulator and, measured, on the culture; None for what is not known.
 
     Attributes:
-        gap, score: the context gap of the task and the context score of the policies, on the simulator.
+        best_known: where there is no optimal return, that of the best of the policies and the heuristic.
+        gap, score: the context gap of the task and the context score of the policies, on the simulator; the least that
+            they can be where there is no optimal return.
         bits: goal information; None for a robot with one goal alone.
     """
 
@@ -54,6 +57,7 @@ class ContextRow:
     coupling: float | None
     policies: float
     optimum: float | None
+    best_known: float | None
     gap: float | None
     gap_low_95: float | None
     gap_high_95: float | None
@@ -66,6 +70,11 @@ class ContextRow:
     measured_coupling: float | None
     measured_policies: float | None
     predicted_policies: float
+
+    @property
+    def is_least(self) -> bool:
+        """Whether gap and score are the least that they can be."""
+        return self.best_known is not None
 
     @property
     def needs_context(self) -> bool:
@@ -181,9 +190,11 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
     """All jobs of the study."""
     jobs = []
     for culture in study.cultures:
-        recorded = f"record/{culture}"
-        jobs.append(Job(recorded, RecordCulture(study, culture), (), 60))
+        commands = {robot: robot_named(robot).n_commands for robot in study.robots}
+        records = {n: f"record/{culture}" + (f"/{n}-commands" if n > 1 else "") for n in sorted({*commands.values()})}
+        jobs += [Job(name, RecordCulture(study, culture, n), (), 60) for n, name in records.items()]
         for robot in study.robots:
+            recorded = records[commands[robot]]
             trained = f"train/{culture}/{robot}"
             jobs += [
                 Job(trained, TrainPolicies(study, culture, robot), (recorded,), 30),
@@ -198,7 +209,8 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
     in_turn = read_json(folder / f"culture-{culture}" / robot / MEASURED)["rows"]
     measured = rows_by_name(in_turn)
     simulated = rows_by_name(told["rows"])
-    gap = (told["context"] or {}).get("context_gap") or {}
+    context = told["context"] or {}
+    gap = context.get("context_gap") or {}
     score = told["context_score"] or {}
     information = told["whose_work"]["rows"][0]["goal_information"]
 
@@ -216,6 +228,7 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
         coupling=on_simulator("coupling"),
         policies=simulated["policies"]["mean_return"],
         optimum=None if told["optimum"] is None else told["optimum"]["value"],
+        best_known=context.get("best_known"),
         gap=gap.get("value"),
         gap_low_95=gap.get("low"),
         gap_high_95=gap.get("high"),

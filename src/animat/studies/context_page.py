@@ -57,7 +57,7 @@ def _whose_work(study: ContextStudy, found: RanContext, lost: dict[str, dict[str
 
 def _has_something(row: ContextRow) -> bool:
     """Whether the policies are above random stimuli by a tenth of the way to the best that is known."""
-    best = max(each for each in (row.optimum, row.policies, row.coupling) if each is not None)
+    best = max(each for each in (row.optimum, row.best_known, row.policies, row.coupling) if each is not None)
     return row.policies - row.random > 0.1 * (best - row.random) > 0
 
 
@@ -65,13 +65,14 @@ def in_short(rows: Sequence[ContextRow]) -> str:
     """In two sentences, of one robot on all cultures: what the task asks for, and what the policies do."""
     n, needs = sum(row.gap is not None for row in rows), sum(row.needs_context for row in rows)
     if not n:
-        return "The context gap is not known, as no optimal return is."
+        return "The context gap is not known."
     has = sum(row.has_context for row in rows)
     gaps = [row.gap for row in rows if row.gap is not None]
-    between = f" (context gap {_range(gaps)})" if gaps else ""
+    least = "at least " if any(row.is_least for row in rows) else ""
+    between = f" (context gap {least}{_range(gaps)})" if gaps else ""
     asked = f"A reflex leaves half of the task or more undone on {needs} of {n} cultures{between}."
     scores = [row.score for row in rows if row.score is not None]
-    scored = f" (context score {_range(scores)})" if scores else ""
+    scored = f" (context score {least}{_range(scores)})" if scores else ""
     return f"{asked} The policies do significantly more than the best reflex on {has} of {n}{scored}."
 
 
@@ -81,7 +82,8 @@ def _range(values: Sequence[float]) -> str:
 
 
 def _estimate(row: ContextRow, name: str) -> Estimate:
-    return Estimate(*(getattr(row, each) for each in (name, f"{name}_low_95", f"{name}_high_95")))
+    value, low, high = (getattr(row, each) for each in (name, f"{name}_low_95", f"{name}_high_95"))
+    return Estimate(value, low, high, row.is_least)
 
 
 def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[str, dict[str, list[float]]]:
@@ -102,7 +104,7 @@ def _context_picture(study: ContextStudy, folder: Path) -> Picture:
         "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
         f"random); from the dashed line on a task is taken to need context. Right: how far the {study.policies} "
         "policies come from that reflex to the optimum. A point is a culture, with its 95 % interval on the culture's "
-        "simulator.",
+        "simulator. Triangles: at least so much, as the optimal return is not known.",
         (*(f"{_GAPS}.{ending}" for ending in FORMATS[1:]), TABLE),
     )
 
@@ -151,9 +153,11 @@ def _table(rows: Sequence[ContextRow]) -> Table:
             row.heuristic,
             row.coupling,
             row.policies,
-            row.optimum,
-            None if row.gap is None else f"{row.gap:.2f}".replace("-", "−"),
-            None if row.score is None else f"{cell(row.score)} ({cell(row.score_low_95)} to {cell(row.score_high_95)})",
+            row.optimum if row.best_known is None else f"≥ {cell(row.best_known)}",
+            None if row.gap is None else least + f"{row.gap:.2f}".replace("-", "−"),
+            None
+            if row.score is None
+            else f"{least}{cell(row.score)} ({cell(row.score_low_95)} to {cell(row.score_high_95)})",
             row.bits,
             row.measured_random,
             row.measured_heuristic,
@@ -161,11 +165,12 @@ def _table(rows: Sequence[ContextRow]) -> Table:
             row.measured_policies,
             row.predicted_policies,
         )
-        for row in rows
+        for row, least in ((row, "≥ " if row.is_least else "") for row in rows)
     )
     note = (
         "Mean returns on the simulator of the last recording; measured: in closed loop on the culture, from where its "
         "recordings ended, beside the returns predicted for the same policies. Bits: goal information, of robots with "
-        "several goals."
+        "several goals. ≥: no optimal return is known. The gap is then with the best of policies and heuristic in its "
+        "place, and the score with the highest return of any episode: both are at least that."
     )
     return Table("Tasks and cultures", head, cells, note=note, beside=TABLE)

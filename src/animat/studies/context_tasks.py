@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
@@ -18,8 +18,13 @@ from animat.responses.responses import Responses
 from animat.studies.draws import draw_seed
 from animat.writing import atomic_write
 
+if TYPE_CHECKING:
+    from animat.stimulation.protocol import Protocol
+
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 SIMULATED, MEASURED = "simulated.json", "measured.json"
+READOUTS = {1: "all", 2: "halves"}
+"""By how many commands a robot takes."""
 
 
 @record
@@ -27,8 +32,10 @@ class ContextStudy:
     """Which tasks, on which virtual cultures, and how much of everything.
 
     Attributes:
-        cultures: seeds of virtual cultures, each recorded as it will run (`animat.stimulation.protocol.CLOSED_LOOP`).
-        robots: by name; each with one command, a best coupling and an optimal return.
+        cultures: seeds of virtual cultures, each recorded as it will run (`animat.stimulation.protocol`: `CLOSED_LOOP`,
+            and for robots with two commands `TWO_COMMANDS`).
+        robots: by name; each in JAX, with one or two commands. Where one has no optimal return, its context gap is the
+            least that it can be (`animat.evaluation.coupling.least_context_gap`).
         policies: trained for each robot and culture.
         iterations_share: of the robot's own number of iterations.
         episodes: of each policy and control, on the simulator.
@@ -47,7 +54,6 @@ class ContextStudy:
     seed: Seed = 1
 
     def __post_init__(self) -> None:
-        from animat.robots.grid import no_grid
         from animat.robots.host import HostRobot
         from animat.robots.registry import robot_named
 
@@ -57,10 +63,8 @@ class ContextStudy:
                 raise InvalidArgument(f"{what}: expected at least one, each once, got {given}")
         for name in self.robots:
             robot = robot_named(name)
-            if robot.n_commands != 1 or isinstance(robot, HostRobot) or no_grid(robot) is not None:
-                raise InvalidArgument(
-                    f"robots: expected ones in JAX with one command and an optimal return, got {name!r}"
-                )
+            if robot.n_commands not in READOUTS or isinstance(robot, HostRobot):
+                raise InvalidArgument(f"robots: expected ones in JAX with one or two commands, got {name!r}")
 
 
 def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
@@ -96,28 +100,30 @@ class ContextTask(Task):
         """The culture's folder."""
         return folder / f"culture-{self.culture}"
 
-    def series(self, folder: Path) -> list[Responses]:
-        """The responses of its recordings."""
-        from animat.recordings.reading import read_sources
-        from animat.responses.series import extract_series
-
-        return extract_series(read_sources([self.at(folder) / RECORDINGS]))
+    def recordings(self, folder: Path, n_commands: int) -> Path:
+        """The folder of its recordings for robots with so many commands."""
+        return self.at(folder) / (RECORDINGS if n_commands == 1 else f"{RECORDINGS}-{n_commands}-commands")
 
 
 @final
 @dataclass(frozen=True)
 class RecordCulture(ContextTask):
-    """Record the culture twice, five minutes apart."""
+    """Record the culture twice, five minutes apart.
+
+    Attributes:
+        n_commands: of the robots that it is recorded for.
+    """
+
+    n_commands: int = 1
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
         from animat.cultures.virtual import VirtualCulture
-        from animat.stimulation.protocol import CLOSED_LOOP
 
-        out = self.at(folder) / RECORDINGS
+        out = self.recordings(folder, self.n_commands)
         files = record_virtual_series(
             lambda: VirtualCulture(self.culture),
-            CLOSED_LOOP,
+            presented_for(self.n_commands),
             out,
             sessions=2,
             interval_min=5.0,
@@ -136,6 +142,21 @@ class RobotTask(ContextTask):
     """
 
     robot: str
+
+    @property
+    def n_commands(self) -> int:
+        """Of the robot."""
+        from animat.robots.registry import robot_named
+
+        return robot_named(self.robot).n_commands
+
+    def series(self, folder: Path) -> list[Responses]:
+        """The responses of the culture's recordings on the robot's readouts."""
+        from animat.recordings.reading import read_sources
+        from animat.responses.series import extract_series
+
+        recordings = read_sources([self.recordings(folder, self.n_commands)])
+        return extract_series(recordings, readouts=READOUTS[self.n_commands])
 
     def drawn(self, what: str) -> int:
         """A seed of its own for each culture and robot: else sessions of all begin at the same few starts."""
@@ -207,7 +228,6 @@ class Measure(RobotTask):
         from animat.cultures.series import STATE_FILE
         from animat.cultures.virtual import VirtualCulture
         from animat.reality_gap import Calibration, run_policies
-        from animat.stimulation.protocol import CLOSED_LOOP
         from animat.training.policy import load_policies
 
         policies = load_policies(self.beside(folder, POLICIES))
@@ -216,7 +236,8 @@ class Measure(RobotTask):
         # Of a run that was killed: its culture is gone with it.
         shutil.rmtree(session, ignore_errors=True)
         culture = VirtualCulture(self.culture)
-        culture.restore_state(self.at(folder) / RECORDINGS / STATE_FILE)
+        culture.restore_state(self.recordings(folder, self.n_commands) / STATE_FILE)
+        protocol = presented_for(self.n_commands)
         with culture:
             gap = run_policies(
                 policies,
@@ -226,8 +247,8 @@ class Measure(RobotTask):
                 episodes=self.study.episodes_measured,
                 with_coupling=True,
                 seed=self.drawn("measure"),
-                pulse=CLOSED_LOOP.pulse,
-                patterns=CLOSED_LOOP.patterns,
+                pulse=protocol.pulse,
+                patterns=protocol.patterns,
                 progress=progress,
             )
         if gap.session.ending.by != "plan":
@@ -236,6 +257,13 @@ class Measure(RobotTask):
         # The session is told by its folder, with the times at which it ran.
         kept = {name: told[name] for name in ("robot", "mapping", "rows", "optimum", "verdict", "reasons")}
         return [write_json(self.beside(folder, MEASURED), kept)]
+
+
+def presented_for(n_commands: int) -> Protocol:
+    """How a culture is stimulated in recordings for robots with so many commands, as by `animat record`."""
+    from animat.stimulation import protocol
+
+    return protocol.CLOSED_LOOP if n_commands == 1 else protocol.TWO_COMMANDS
 
 
 def write_json(path: Path, words: Any) -> Path:

@@ -1,0 +1,74 @@
+"""Detour: a small robot on two wheels on the way to a goal behind one of four screens that stand around it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, final
+
+import numpy as np
+from jaxtyping import Float
+
+from animat.errors import InvalidArgument
+from animat.records import record
+from animat.robots.registry import register_robot
+from animat.robots.surroundings import Obstacles, Walls
+from animat.robots.wheeled import ARENA, Wheeled
+
+_NEAR_M, _FAR_M, _LEFT_M, _RIGHT_M = 0.29, 0.71, 0.42, 0.58
+_SCREENS = (
+    (_LEFT_M, _NEAR_M, _RIGHT_M, _NEAR_M),
+    (_LEFT_M, _FAR_M, _RIGHT_M, _FAR_M),
+    (_NEAR_M, _LEFT_M, _NEAR_M, _RIGHT_M),
+    (_FAR_M, _LEFT_M, _FAR_M, _RIGHT_M),
+)
+_POSTS = tuple((x, y, 0.015) for x1, y1, x2, y2 in _SCREENS for x, y in ((x1, y1), (x2, y2)))
+"""At both ends of each screen: the end of a wall of no thickness is seen by no sensor."""
+
+
+@final
+@register_robot
+@record
+class Detour(Wheeled):
+    """Wheels in an arena in which the straight way from the start to the goal is always blocked (see `Wheeled`).
+
+    A goal is drawn from the places that the robot can reach and cannot drive straight to: somewhere on the straight way
+    its body would touch a wall or an obstacle. By default the start is in the middle of four screens with a post at
+    both ends of each, and goals are behind the screens.
+
+    Raises:
+        InvalidArgument: as `Wheeled`, and for surroundings in which no straight way is blocked.
+
+    Source: the detour problem, in which an animal has to move away from what it wants (Köhler 1921,
+    Intelligenzprüfungen an Menschenaffen, ch. 1).
+    """
+
+    walls: Walls = (*ARENA, *_SCREENS)
+    obstacles: Obstacles = _POSTS
+
+    name: ClassVar[str] = "detour"
+
+    def __post_init__(self) -> None:
+        if len(super()._goals_m) and not len(self._goals_m):
+            raise InvalidArgument(
+                "walls, obstacles: expected some that block the straight way to places within reach, got none that do"
+            )
+        super().__post_init__()
+
+    def heuristic(self, observation: Any) -> Any:
+        """To the goal; where something is on the goal's side, along that at some distance, past its end."""
+        xp = observation.__array_namespace__()
+        bearing = observation[9]
+        right, left = observation[:4], xp.flip(observation[4:8])
+        # On which side more is seen: 1 to the right, -1 to the left.
+        side = xp.where(xp.sum(left) > xp.sum(right), -1.0, 1.0)
+        seen = xp.where(side < 0, left, right)
+        is_in_the_way = (xp.sum(seen) > 0.05) & (bearing * side > -0.2)
+        along = side * (0.5 * (0.35 - seen[2]) - 2 * seen[0] - seen[1])
+        turn = xp.where(is_in_the_way, along, xp.clip(bearing, -1.0, 1.0))
+        ahead = xp.clip(1 - 0.7 * xp.abs(turn), 0.0, 1.0)
+        return xp.clip(xp.stack([ahead + turn, ahead - turn]), -1.0, 1.0)
+
+    @property
+    def _goals_m(self) -> Float[np.ndarray, "goals 2"]:
+        """Of the places within reach, those that the robot cannot drive straight to."""
+        places = super()._goals_m
+        return places[self._around.on_ways_m((self.start_x_m, self.start_y_m), places) < self.body_radius_m]

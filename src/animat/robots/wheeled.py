@@ -1,0 +1,257 @@
+"""A small robot on two wheels among walls and obstacles: what tasks with its body share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from animat.errors import InvalidArgument
+from animat.records import Number, record
+from animat.robots.base import Iterations, Quantity, Robot, Size
+from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture
+from animat.robots.motion import cost_of_distance, within_half_a_turn
+from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Walls, places_within_reach
+
+if TYPE_CHECKING:
+    from jax import Array
+    from matplotlib.axes import Axes
+
+SENSORS_DEG = (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0)
+"""Where the e-puck's proximity sensors look, IR0 to IR7, clockwise from straight ahead."""
+
+SENSORS = (
+    "right_front",
+    "right_diagonal",
+    "right_side",
+    "right_back",
+    "left_back",
+    "left_side",
+    "left_diagonal",
+    "left_front",
+)
+
+APART, SLIPPING = 0.4, 0.21
+"""Parts of the body's radius: between neighbours of the square lattice through the start that goals are drawn from; and
+what room such a lattice shows where a robot could slip through.
+
+One iteration moves at most a radius, and is checked at its end: half way there is room of at least half a radius, and
+at the nearest place of the lattice of 0.4 / sqrt(2) less, 0.217. A wall is not slipped through, as on one side of it a
+place has at most 0.2.
+"""
+
+ARENA = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0))
+"""The walls of a square of 1 m."""
+
+
+class WheelsState(NamedTuple):
+    """Where the robot is and looks, and where its goal is: seen from above, x to the right, y down.
+
+    The heading is 0 to the right and grows clockwise, as y points down; it lies in (-pi, pi].
+    """
+
+    x_m: Float[Array, ""]
+    y_m: Float[Array, ""]
+    heading_rad: Float[Array, ""]
+    goal_x_m: Float[Array, ""]
+    goal_y_m: Float[Array, ""]
+
+
+@record
+class Wheeled(Robot[WheelsState]):
+    """Two wheels and eight proximity sensors on the way to a goal, in an arena.
+
+        v = max_speed_m_per_s u,    forward = (v_left + v_right) / 2,    turning = (v_left - v_right) / wheel_distance_m
+        reward = reward_goal if d <= R (and the episode ends), reward_bump where it bumped, else R / d - 1
+        sensor = 1 - clip(distance / sensor_range_m, 0, 1)
+
+    The commands are those of the left and the right wheel. Without a bump the robot moves along the arc of a circle,
+    exactly. Where its body would touch a wall or an obstacle at the end of an iteration, it turns and stays where it
+    is. d is the distance from its centre to the goal and R the goal's radius. A sensor looks straight away from the
+    centre, and its distance is from the edge of the body to what it meets first. An episode starts at `start_x_m`,
+    `start_y_m`, looking anywhere; its goal is drawn from the places that the robot can reach from there with some
+    space around it, and is not yet at.
+
+    Attributes:
+        max_speed_m_per_s: of a wheel at u = 1.
+        sensor_range_m: beyond it a sensor shows 0.
+        walls: each from x, y to x, y (m), of no thickness; of the default an arena of 1 m.
+        obstacles: each with the x and y of its centre and its radius (m).
+        goal_radius_m: R.
+        reward_bump: of an iteration in which it could not move.
+
+    Raises:
+        InvalidArgument: for a parameter that is not finite or has no meaning, a start without room or without goals
+            within reach, walls that do not close, or a step so long that the robot could pass through a wall.
+
+    Source: Mondada et al. 2009, the e-puck (body, wheels and sensors). Its sensors show reflected infrared light, which
+    falls with distance less evenly, depends on what reflects it, and is noisy; here they show distance.
+    """
+
+    body_radius_m: Size = 0.035
+    wheel_distance_m: Size = 0.053
+    max_speed_m_per_s: Size = 0.13
+    sensor_range_m: Size = 0.1
+    walls: Walls = ARENA
+    obstacles: Obstacles = ()
+    start_x_m: Number = 0.5
+    start_y_m: Number = 0.5
+    goal_radius_m: Size = 0.05
+    step_s: Size = 0.2
+    reward_goal: Number = 50.0
+    reward_bump: Number = -2.0
+    episode_limit: Iterations = 100
+
+    n_commands: ClassVar[int] = 2
+    noise_size: ClassVar[int] = 0
+    paper_iterations: ClassVar[int] = 500_000
+
+    def __post_init__(self) -> None:
+        stride_m = self.max_speed_m_per_s * self.step_s
+        if stride_m > self.body_radius_m or 2 * stride_m > 2 * math.pi * self.wheel_distance_m:
+            most_s = min(self.body_radius_m, math.pi * self.wheel_distance_m) / self.max_speed_m_per_s
+            raise InvalidArgument(f"step_s: expected at most {most_s:.3g} at this speed, got {self.step_s:g}")
+        if not len(self._goals_m):
+            raise InvalidArgument(
+                "start_x_m, start_y_m: expected a place between the walls, with room for the robot and for goals that "
+                f"it can reach (in at most {MOST_PLACES * (APART * self.body_radius_m) ** 2:.3g} m^2), got "
+                f"{self.start_x_m:g}, {self.start_y_m:g}"
+            )
+        left, top, right, bottom = self._around.box_m()
+        x_m, y_m = self._within_reach(SLIPPING).T
+        if x_m.min() <= left or x_m.max() >= right or y_m.min() <= top or y_m.max() >= bottom:
+            raise InvalidArgument("walls: expected them all around the robot, got a gap through which it could leave")
+
+    @property
+    def return_range(self) -> tuple[float, float]:
+        """Of an episode with the worst that an iteration can give, or one that reaches the goal at once."""
+        dearest = min(-1.0, self.reward_bump)
+        best = max(0.0, self.reward_bump)
+        last = (self.episode_limit - 1) * dearest
+        return min(last + dearest, last + self.reward_goal, self.reward_goal), max(
+            self.episode_limit * best, (self.episode_limit - 1) * best + self.reward_goal
+        )
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        """The sensors clockwise from the front right, then how far the goal is and in which direction."""
+        left, top, right, bottom = self._around.box_m()
+        farthest_m = math.hypot(right - left, bottom - top)
+        return (
+            *(Quantity(f"proximity_{sensor}", "1", 1.0, 0.0, 1.0) for sensor in SENSORS),
+            Quantity("goal_distance", "m", farthest_m / 2, 0.0, farthest_m, of_goal=True),
+            Quantity("goal_bearing", "rad", math.pi, -math.pi, math.pi, of_goal=True),
+        )
+
+    def reset(self, key: Array) -> WheelsState:
+        """At the start, looking anywhere; the goal drawn."""
+        import jax
+        import jax.numpy as jnp
+
+        for_goal, for_heading = jax.random.split(key)
+        goal = jnp.asarray(self._goals_m, jnp.float32)[jax.random.randint(for_goal, (), 0, len(self._goals_m))]
+        heading = math.pi * (1 - 2 * jax.random.uniform(for_heading))
+        return WheelsState(jnp.float32(self.start_x_m), jnp.float32(self.start_y_m), heading, goal[0], goal[1])
+
+    def advance(
+        self, uniforms: Float[Array, " noise_size"], state: WheelsState, u: Float[Array, " n_commands"]
+    ) -> tuple[WheelsState, Float[Array, ""], Bool[Array, ""]]:
+        """Both wheels turn at constant speeds (see `Robot.advance` and the class)."""
+        import jax.numpy as jnp
+
+        left_m, right_m = self.max_speed_m_per_s * self.step_s * jnp.asarray(u)
+        turn = (left_m - right_m) / self.wheel_distance_m
+        # The chord of the arc, which points half way between the headings at its ends; jnp.sinc has a factor pi.
+        chord_m = (left_m + right_m) / 2 * jnp.sinc(turn / (2 * math.pi))
+        x_m = state.x_m + chord_m * jnp.cos(state.heading_rad + turn / 2)
+        y_m = state.y_m + chord_m * jnp.sin(state.heading_rad + turn / 2)
+        bumped = self._around.clearance_m(x_m, y_m) < self.body_radius_m
+        x_m, y_m = jnp.where(bumped, state.x_m, x_m), jnp.where(bumped, state.y_m, y_m)
+        after = WheelsState(x_m, y_m, within_half_a_turn(state.heading_rad + turn), *state[3:])
+
+        distance_m = jnp.hypot(state.goal_x_m - x_m, state.goal_y_m - y_m)
+        terminated = distance_m <= self.goal_radius_m
+        cost = jnp.where(bumped, self.reward_bump, cost_of_distance(distance_m, self.goal_radius_m))
+        reward = jnp.where(terminated, self.reward_goal, cost).astype(x_m.dtype)
+        return after, reward, terminated
+
+    def observe(self, state: WheelsState) -> Float[Array, " observations"]:
+        """The eight sensors (1 at the body's edge, 0 out of range), distance (m) and bearing (rad) of the goal.
+
+        The bearing is 0 straight ahead and positive to the right, in [-pi, pi].
+        """
+        import jax.numpy as jnp
+
+        x_m, y_m, heading, goal_x_m, goal_y_m = state
+        directions = heading + jnp.radians(jnp.asarray(SENSORS_DEG, x_m.dtype))
+        free_m = self._around.along_rays_m(x_m, y_m, directions) - self.body_radius_m
+        proximity = 1 - jnp.clip(free_m / self.sensor_range_m, 0.0, 1.0)
+        to_x_m, to_y_m = goal_x_m - x_m, goal_y_m - y_m
+        bearing = within_half_a_turn(jnp.arctan2(to_y_m, to_x_m) - heading)
+        return jnp.concatenate([proximity, jnp.stack([jnp.hypot(to_x_m, to_y_m), bearing])])
+
+    def with_goal_of(self, state: WheelsState, other: WheelsState) -> WheelsState:
+        """Where one is, on the way to the other's goal."""
+        return state._replace(goal_x_m=other.goal_x_m, goal_y_m=other.goal_y_m)
+
+    def draw(
+        self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
+    ) -> Picture:
+        """What the robot senses, seen from itself and looking up: sensors, goal and wheels; its place is not observed.
+
+        A sensor's line ends where it meets something, or at its range (see `animat.robots.drawing`).
+        """
+        body, reach_m = self.body_radius_m, self.body_radius_m + self.sensor_range_m
+        half_m = 1.4 * reach_m
+        canvas = Canvas(height_px, height_px, (height_px / 2, height_px / 2), height_px / 2 / half_m)
+
+        def at(bearing: float, distance_m: float) -> tuple[float, float]:
+            return distance_m * math.sin(bearing), -distance_m * math.cos(bearing)
+
+        distance_m, bearing = float(observation[8]), float(observation[9])
+        # A goal out of the picture stands at its edge.
+        goal = at(bearing, min(distance_m, 1.25 * reach_m))
+        canvas.disc(goal, self.goal_radius_m, GOAL)
+        canvas.disc(goal, 0.85 * self.goal_radius_m, GOAL_FILL)
+        for degrees, proximity in zip(SENSORS_DEG, observation[:8], strict=True):
+            end = at(math.radians(degrees), body + (1 - float(proximity)) * self.sensor_range_m)
+            canvas.stroke([(0.0, 0.0), end], 0.06 * body, ACCENT if proximity > 0 else RAIL)
+            if proximity > 0:
+                canvas.disc(end, 0.12 * body, INK)
+        canvas.disc((0.0, 0.0), body, BODY)
+        for side, u in zip((-1, 1), command, strict=True):
+            wheel = side * self.wheel_distance_m / 2
+            canvas.stroke([(wheel, 0.0), (wheel, -0.8 * body * float(u))], 0.15 * body, ACCENT)
+        return canvas.picture()
+
+    def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
+        """How far the goal was in each episode, over time."""
+        arrived = 0
+        for path in paths:
+            there = bool(path[-1, 8] <= self.goal_radius_m)
+            arrived += there
+            time_s = np.arange(len(path)) * self.step_s
+            axes.plot(time_s, path[:, 8], color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
+        axes.axhline(self.goal_radius_m, color=EDGE, linewidth=0.8, linestyle="--")
+        axes.set_xlim(0, self.episode_limit * self.step_s)
+        axes.set_ylim(bottom=0)
+        axes.set(xlabel=f"time (s); {arrived} of {len(paths)} arrived", ylabel="distance to the goal (m)")
+
+    @property
+    def _around(self) -> Surroundings:
+        return Surroundings(self.walls, self.obstacles)
+
+    @property
+    def _goals_m(self) -> Float[np.ndarray, "goals 2"]:
+        """Where goals may be: with half a body's radius to spare, and so far that it is not there at the start."""
+        places = self._within_reach(1.5)
+        apart_m = np.hypot(places[:, 0] - self.start_x_m, places[:, 1] - self.start_y_m)
+        return places[apart_m > 2 * self.goal_radius_m]
+
+    def _within_reach(self, room: float) -> Float[np.ndarray, "places 2"]:
+        """Places to which a disc of so many body radii could be moved from the start."""
+        start_m, radius_m = (self.start_x_m, self.start_y_m), self.body_radius_m
+        return places_within_reach(self._around, start_m, room * radius_m, APART * radius_m)
