@@ -12,7 +12,7 @@ import numba
 import pytest
 
 import animat
-from animat import compilation
+from animat import compilation, devices
 from animat.compilation import cache_folder, kept_njit
 
 
@@ -48,9 +48,20 @@ def test_what_xla_flags_say_is_left_as_it_is(
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     if flags is not None:
         monkeypatch.setenv("XLA_FLAGS", flags)
-    options = runpy.run_path(compilation.__file__)["FAST_TO_COMPILE"]
+    options = runpy.run_path(compilation.__file__)["COMPILER_OPTIONS"]
     assert options.get("xla_backend_optimization_level") == level
     assert options["xla_cpu_parallel_codegen_split_count"] == 1
+
+
+def test_options_of_the_processor_s_compiler_do_not_reach_that_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """XLA for GPUs ends the process at an optimisation level below 2."""
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    monkeypatch.setattr(devices.importlib.util, "find_spec", lambda name: name)
+    assert runpy.run_path(compilation.__file__)["COMPILER_OPTIONS"] == {"xla_gpu_deterministic_ops": True}
+    # As in pinned workers, and in commands.
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    assert "xla_gpu_deterministic_ops" not in runpy.run_path(compilation.__file__)["COMPILER_OPTIONS"]
 
 
 COMPILING = """

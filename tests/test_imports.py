@@ -17,6 +17,7 @@ GROUND = (
     "brief",
     "compilation",
     "ctrl_c",
+    "devices",
     "differences",
     "errors",
     "extras",

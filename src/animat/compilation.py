@@ -10,15 +10,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-FAST_TO_COMPILE = {
+from animat.devices import may_use_gpu
+
+_FAST_TO_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_parallel_codegen_split_count": 1}
+_DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
+
+COMPILER_OPTIONS = {
     option: value
-    for option, value in {"xla_backend_optimization_level": 1, "xla_cpu_parallel_codegen_split_count": 1}.items()
+    for option, value in (_DETERMINISTIC if may_use_gpu() else _FAST_TO_COMPILE).items()
     if f"--{option}" not in os.environ.get("XLA_FLAGS", "")
 }
-"""For programs of loops over small networks, as options of `jax.jit`: a fifth less time to compile, and as fast.
+"""For programs of loops over small networks, as options of `jax.jit`.
 
-At level 2 LLVM looks longer at what XLA made, and finds nothing; several parts are for more cores than a worker has.
-What `XLA_FLAGS` says of them is left as it is.
+On a processor: a fifth less time to compile, and as fast. At level 2 LLVM looks longer at what XLA made, and finds
+nothing; several parts are for more cores than a worker has. XLA for GPUs refuses a level below 2; there, the same bits
+each time. What `XLA_FLAGS` says of them is left as it is.
 """
 
 

@@ -41,6 +41,7 @@ from animat.cli.tune import TuneFile
 from animat.cli.validate import Validate
 from animat.cli.watch import Watch
 from animat.ctrl_c import heard_everywhere
+from animat.devices import stay_on_cores
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 
 Command = (
@@ -78,6 +79,7 @@ _LESS: dict[type, str] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
+    stay_on_cores()
     # Streams that were closed are None, which the parser and others do not expect: what is written goes nowhere.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from animat.coding.mapping import N_PERCENTILES
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot
@@ -184,12 +184,12 @@ def _nothing(
     return np.zeros((n_actors, n), np.int64), np.zeros((n_actors, n, *readouts), np.int64)
 
 
-@partial(jax.jit, static_argnums=(0, 2), compiler_options=FAST_TO_COMPILE)
+@partial(jax.jit, static_argnums=(0, 2), compiler_options=COMPILER_OPTIONS)
 def _started(environment: Environment[Any], keys: Key[Array, " actors"], episodes: int) -> State:
     return jax.vmap(lambda key: jax.vmap(environment.reset)(jax.random.split(key, episodes)).carried)(keys)
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=FAST_TO_COMPILE)
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _iteration(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,

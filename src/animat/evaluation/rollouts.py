@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
 from animat.brief import briefly
 from animat.coding.mapping import N_PERCENTILES
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.errors import InvalidArgument, shown
 from animat.evaluation.host_rollouts import roll_out_on_host
@@ -200,7 +200,7 @@ def roll_out(
     return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed, came_to)
 
 
-@partial(jax.jit, static_argnums=(0, 1), compiler_options=FAST_TO_COMPILE)
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
 def _roll_out(
     environment: Environment[Any],
     episodes: int,

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.cluster import Cluster
+from animat.execution.gpu import WithGpu
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
@@ -80,13 +81,16 @@ class Jobs:
         self.waiting = [job for job in in_order(jobs) if not self._is_done(job)]
         """Those that are not done, the most urgent first."""
 
-    def run(self, *, workers: int | None, executor: Executor | None, progress: Progress) -> dict[str, float]:
+    def run(
+        self, *, workers: int | None, executor: Executor | None, progress: Progress, has_gpu: bool = False
+    ) -> dict[str, float]:
         """Run the jobs that are not done; the first that fails ends all, but on a cluster the others go on first.
 
         Args:
             workers: processes, each on a core of its own; None: one a core. Not with an executor.
             executor: where tasks are run, in view of the folder; it stays open. None: processes on this machine.
             progress: told how far it is, and what runs.
+            has_gpu: whether this machine has a GPU for what trains policies; if not, that is done on cores.
 
         Returns:
             The processor seconds of each job that was run.
@@ -120,16 +124,16 @@ class Jobs:
             note = f"{len(self._done)} of {n_jobs} jobs; {'; '.join(parts)}" if parts else ""
             progress.update(done_s, total_s, note)
 
-        with _running_on(executor, workers, running) as at:
+        with _running_on(executor, workers, running, has_gpu) as at:
             # Those that wait for one that failed wait in vain.
             while running or any(self._has_needs(job) for job in self.waiting):
-                for job in [job for job in self.waiting if self._has_needs(job)]:
+                ready = [job for job in self.waiting if self._has_needs(job)]
+                for job in ready:
                     self.waiting.remove(job)
-                    # What it needs may have been made again, with the same bytes as before.
-                    if self._is_done(job):
-                        ended_s += job.cost_s
-                    else:
-                        running[self._submit(job, at, receipt_path(notices, job.name))] = job
+                # What one needs may have been made again, with the same bytes as before.
+                left = [job for job in ready if not self._is_done(job)]
+                ended_s += sum(job.cost_s for job in ready) - sum(job.cost_s for job in left)
+                running |= zip(self._submit(left, at, notices), left, strict=True)
                 if time.monotonic() - told_s > _LOOK_EVERY_S:
                     report()
                 # Those that succeeded first: their receipts are kept, whatever the others raise.
@@ -157,11 +161,20 @@ class Jobs:
             raise failed[0]
         return cpu_s
 
-    def _submit(self, job: Job, at: Executor, notice: Path) -> Future[Done]:
+    def _submit(self, jobs: Sequence[Job], at: Executor | WithGpu, notices: Path) -> list[Future[Done]]:
+        told = [receipt_path(notices, job.name) for job in jobs]
+        if isinstance(at, WithGpu):
+            return at.hand_in([job.task for job in jobs], self._folder, told)
         if isinstance(at, Cluster):
-            reads = self._read_by(job)
-            return at.submit_task(job.task, self._folder, notice, name=job.name, cost_s=job.cost_s, reads=reads)
-        return at.submit(carry_out_alone, job.task, self._folder, notice)
+            return [
+                at.submit_task(
+                    job.task, self._folder, notice, name=job.name, cost_s=job.cost_s, reads=self._read_by(job)
+                )
+                for job, notice in zip(jobs, told, strict=True)
+            ]
+        return [
+            at.submit(carry_out_alone, job.task, self._folder, notice) for job, notice in zip(jobs, told, strict=True)
+        ]
 
     def _read_by(self, job: Job) -> dict[str, str]:
         """The digests of the files that a job reads, by their places: of all that comes before it."""
@@ -191,11 +204,13 @@ class Jobs:
 
 
 @contextmanager
-def _running_on(executor: Executor | None, workers: int | None, running: dict[Future[Done], Job]) -> Iterator[Executor]:
+def _running_on(
+    executor: Executor | None, workers: int | None, running: dict[Future[Done], Job], has_gpu: bool
+) -> Iterator[Executor | WithGpu]:
     """The executor that was lent, or processes of ours; if the block fails, nothing goes on after it."""
     if executor is None:
-        with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours:
-            yield ours
+        with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours, PinnedProcesses([None]) as beside:
+            yield WithGpu(ours, beside) if has_gpu else ours
         return
     try:
         yield executor

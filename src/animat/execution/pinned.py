@@ -29,10 +29,11 @@ class PinnedProcesses(ThreadPoolExecutor):
     as a context manager, the executor ends what still runs. Work whose process ends raises a `BrokenExecutor`.
 
     Args:
-        cores: one process for each, which is started when there is work for it; a core named twice gets two.
+        cores: one process for each, which is started when there is work for it; a core named twice gets two. None: a
+            process that is pinned to no core and may use the GPU.
     """
 
-    def __init__(self, cores: Sequence[int]) -> None:
+    def __init__(self, cores: Sequence[int | None]) -> None:
         super().__init__(len(cores), initializer=self._settle)
         self._cores = list(reversed(cores))
         self._mine = threading.local()
@@ -89,9 +90,10 @@ class PinnedProcesses(ThreadPoolExecutor):
 class _Process:
     """A process of `animat.execution.worker`, which imports from where this one does."""
 
-    def __init__(self, core: int) -> None:
+    def __init__(self, core: int | None) -> None:
+        self._core = core
         self._popen = subprocess.Popen(
-            [sys.executable, "-m", "animat.execution.worker", str(core)],
+            [sys.executable, "-m", "animat.execution.worker", "gpu" if core is None else str(core)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             # In a group of its own: Ctrl-C reaches this process alone, which then ends the other without a word.
@@ -117,9 +119,11 @@ class _Process:
 
     @property
     def is_spent(self) -> bool:
-        """Whether it has ended, or grown large."""
+        """Whether it has ended, or grown large, as what there is for a GPU is from the start."""
         if self._popen.poll() is not None:
             return True
+        if self._core is None:
+            return False
         resident_pages = int(Path(f"/proc/{self._popen.pid}/statm").read_text().split()[1])
         return resident_pages * os.sysconf("SC_PAGE_SIZE") / 2**20 > _LARGEST_MIB
 

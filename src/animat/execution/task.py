@@ -10,7 +10,7 @@ import platform
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,31 +118,49 @@ def carry_out(task: Task, folder: Path, notice: Path) -> Done:
     Raises:
         AnimatError: if it fails; in one line, also where nobody foresaw it.
     """
+    return carried_out([task], folder, [notice], lambda progress: [task.run(folder, progress)])[0]
 
-    progress = _Notice(notice)
+
+def carried_out(
+    tasks: Sequence[Task], folder: Path, notices: Sequence[Path], run: Callable[[Progress], list[list[Path]]]
+) -> list[Done]:
+    """Have tasks done together.
+
+    Args:
+        tasks: which.
+        folder: in which all files are.
+        notices: the file of each in which it is told how far it is.
+        run: does them; returns the files that each left.
+
+    Raises:
+        AnimatError: if they fail; in one line, also where nobody foresaw it.
+    """
+    progress = _Notice(notices)
     progress.update(0, 1)
     began_s = time.process_time()
     try:
-        files = sorted(task.run(folder, progress))
+        left = run(progress)
     except AnimatError:
         raise
     except Exception as error:
         memory = out_of_memory(error)
-        raise AnimatError(_unforeseen(error) if memory is None else f"{memory}: {memory_of(task)}") from error
-    sums = {file.relative_to(folder).as_posix(): digest_of(file) for file in files}
-    return Done(sums, time.process_time() - began_s)
+        raise AnimatError(_unforeseen(error) if memory is None else f"{memory}: {memory_of(tasks[0])}") from error
+    sums = [{file.relative_to(folder).as_posix(): digest_of(file) for file in sorted(files)} for files in left]
+    cpu_s = (time.process_time() - began_s) / len(tasks)
+    return [Done(each, cpu_s) for each in sums]
 
 
 class _Notice:
-    """A progress in a file, which is whole whenever it is read."""
+    """A progress in files, each of which is whole whenever it is read; words only in the first of several."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = paths
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        # Where it cannot be written, no work is lost.
-        with suppress(OSError):
-            report(self._path, (done / total, note))
+        for path in self._paths:
+            # Where it cannot be written, no work is lost.
+            with suppress(OSError):
+                report(path, (done / total, note if path == self._paths[0] else None))
 
 
 def report(path: Path, words: Any) -> None:

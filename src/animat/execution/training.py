@@ -12,12 +12,16 @@ from pathlib import Path
 from typing import final
 
 from animat.coding.decoder import expect_fit
+from animat.devices import gpu_here
 from animat.errors import InvalidArgument, UnusableData
 from animat.execution.curves import CurveFile, Curves
+from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
-from animat.execution.task import UNFINISHED, Task
+from animat.execution.task import UNFINISHED
+from animat.execution.trains import Trains, Work
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
+from animat.robots.host import HostRobot
 from animat.training.callbacks import TrainingCallback
 from animat.training.course import rows_of
 from animat.training.folder import (
@@ -30,7 +34,7 @@ from animat.training.folder import (
     write_assessments,
     write_description,
 )
-from animat.training.group import BEST, CHECKPOINT_S, AddPart, Group, save_policies, train_group
+from animat.training.group import BEST, CHECKPOINT_S, Group, train_group
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import clear_away, exclusive_lock
@@ -53,6 +57,7 @@ def train(
 
     Stopped at any moment, also by SIGKILL, and called again, it goes on from the last chunk and ends in the same bits
     as if it had not been stopped, with any number of workers. On a finished folder it reads the policies and returns.
+    Where there is a GPU, it trains all policies at once (`animat.execution.gpu`).
 
     Args:
         training: what is trained.
@@ -94,7 +99,10 @@ def train(
         expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
     training = training.over(timeline)
     rows_of(training, timeline)
-    manifest = describe(training, timeline, sources, random_return)
+    on_cores = folder is None or executor is not None or isinstance(training.robot, HostRobot)
+    gpu = None if on_cores else find_gpu()
+    device = gpu_here() if folder is None else gpu
+    manifest = describe(training, timeline, sources, random_return, device=device)
     groups = groups_of(training, timeline, manifest, fewest=2)
     if folder is None:
         return _in_memory(groups, _phase_of(groups, progress), callbacks)
@@ -117,7 +125,7 @@ def train(
         if left:
             jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
             try:
-                jobs.run(workers=workers, executor=executor, progress=curves)
+                jobs.run(workers=workers, executor=executor, progress=curves, has_gpu=gpu is not None)
             except UnusableData:
                 # What the robot gave was no number: whoever corrects it begins anew.
                 shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
@@ -141,7 +149,7 @@ def _load(folder: Path, file: str) -> Policy:
 
 @final
 @dataclass(frozen=True, eq=False)
-class TrainGroup(Task):
+class TrainGroup(Trains):
     """Train a group of policies, going on from its checkpoint.
 
     Attributes:
@@ -158,37 +166,15 @@ class TrainGroup(Task):
     def grows_with(self) -> dict[str, object]:
         return {"algorithm": self.group.training.algorithm}
 
-    def run(self, folder: Path, progress: Progress) -> list[Path]:
-        self.group.training.register()
+    @property
+    def training(self) -> Training:
+        return self.group.training
+
+    def prepare(self, folder: Path) -> Work:
+        self.training.register()
         checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
         add_part = CurveFile(folder, self.group.members[0]).add if self.tells_rows else None
-        return train_into(folder, self.group, checkpoint, progress, checkpoint_s=self.checkpoint_s, add_part=add_part)
-
-
-def train_into(
-    folder: Path,
-    group: Group,
-    checkpoint: Path,
-    progress: Progress,
-    *,
-    checkpoint_s: float = CHECKPOINT_S,
-    add_part: AddPart | None = None,
-) -> list[Path]:
-    """Train a group of policies, going on from its checkpoint; returns their files.
-
-    Args:
-        folder: for the policies.
-        group: what is trained.
-        checkpoint: file to write now and then; gone at the end.
-        progress: told how far it is.
-        checkpoint_s: seconds between checkpoints.
-        add_part: as of `train_group`.
-    """
-    progress.update(0, CHUNKS, "compiling")
-    policies = train_group(group, checkpoint, progress, checkpoint_s=checkpoint_s, add_part=add_part)
-    files = save_policies(group, policies, folder)
-    checkpoint.unlink(missing_ok=True)
-    return files
+        return Work(self.group, folder, checkpoint, self.checkpoint_s, add_part)
 
 
 def _phase_of(groups: Sequence[Group], progress: Progress | None) -> Progress:

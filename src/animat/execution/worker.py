@@ -1,4 +1,6 @@
-"""A process that does what it is told on one core: `python -m animat.execution.worker CPU`, of `PinnedProcesses`.
+"""A process that does what it is told, on one core or, called `gpu`, on the GPU: of `PinnedProcesses`.
+
+`python -m animat.execution.worker CPU`, or `python -m animat.execution.worker gpu`.
 
 Calls come pickled on standard input, from the process that started it; what they return or raise goes out so too.
 """
@@ -15,7 +17,7 @@ from typing import BinaryIO
 
 def main() -> int:
     """Answer calls until standard input ends."""
-    answers = pin_worker(int(sys.argv[1]))
+    answers = pin_worker(None if sys.argv[1] == "gpu" else int(sys.argv[1]))
 
     from animat.compilation import keep_compilations
 
@@ -41,18 +43,24 @@ def answer(work: bytes) -> bytes:
             return pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
-def pin_worker(core: int) -> BinaryIO:
-    """Make this process a worker: on one core, without an accelerator, and gone when the one that started it is.
+def pin_worker(core: int | None) -> BinaryIO:
+    """Make this process a worker: on one core without a GPU, or on the GPU; gone when the one that started it is.
 
     To be called before JAX or BLAS are loaded.
 
     Returns:
         Where answers go: what libraries and robots print goes to standard error from now on.
     """
-    # They size their threads by the cores they may use, and one pinned core beats two shared ones.
-    os.sched_setaffinity(0, {core})
-    # Networks of 64 units keep a core busy and no GPU, and workers, one a core, would all take the same one.
-    os.environ["JAX_PLATFORMS"] = "cpu"
+    if core is None:
+        os.environ.pop("JAX_PLATFORMS", None)
+        # Others may have some of its memory; and products of numbers of 32 bits are to be such.
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+        os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+    else:
+        # They size their threads by the cores they may use, and one pinned core beats two shared ones.
+        os.sched_setaffinity(0, {core})
+        # A few networks of 64 units keep a core busy and no GPU; workers, one a core, would all take the same one.
+        os.environ["JAX_PLATFORMS"] = "cpu"
     end_with_parent()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
+from animat.devices import gpu_here
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
-from animat.execution.training import train_into
+from animat.execution.trains import Work, train_alone
 from animat.progress import Progress
 from animat.records import Positive, Seed, Whole, as_json, record
 from animat.responses.responses import Responses
@@ -176,7 +177,7 @@ class TrainPolicies(RobotTask):
         from animat.coding.mapping import mapping_named
         from animat.neurons.timeline import fit_timeline
         from animat.robots.registry import robot_named
-        from animat.training.folder import describe, provenance_of, write_description
+        from animat.training.folder import describe, provenance_of
         from animat.training.group import Group
         from animat.training.specification import Training
 
@@ -189,12 +190,12 @@ class TrainPolicies(RobotTask):
             seed=self.drawn("context"),
             shadowing=True,
         ).over(timeline)
-        manifest = describe(training, timeline)
+        manifest = describe(training, timeline, device=gpu_here())
         out = self.beside(folder, POLICIES)
         members = tuple(range(training.policies))
         group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / f"culture-{self.culture}" / f"{self.robot}.npz"
-        return [*train_into(out, group, checkpoint, progress), write_description(out, manifest)]
+        return train_alone(Work(group, out, checkpoint, description=manifest), progress)
 
 
 @final

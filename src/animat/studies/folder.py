@@ -31,12 +31,13 @@ _PACKAGES = (
 _ABOUT_FILES = "# files: as seen from where the specification lay. To run it from here: files = ['recordings']\n"
 
 
-def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
+def describe_study(study: Study, sources: dict[str, str], device: str | None = None) -> dict[str, Any]:
     """What decides how a study comes out, with a fingerprint over all of it.
 
     Args:
         study: the specification.
         sources: SHA-256 of each file of recordings, by its place.
+        device: the kind of GPU that trains, which rounds otherwise; None for cores, which are not told.
     """
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     if study.culture.kind == "virtual":
@@ -47,6 +48,8 @@ def describe_study(study: Study, sources: dict[str, str]) -> dict[str, Any]:
     for spec in study.robots:
         if isinstance(robot := without_goal(spec.robot()), HostRobot):
             versions |= robot.versions
+    if device is not None:
+        versions["device"] = device
     told: dict[str, Any] = {
         "study": study.to_dict(),
         "sources": sources,

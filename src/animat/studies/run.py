@@ -11,6 +11,7 @@ from pathlib import Path
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidFile
+from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
@@ -70,7 +71,8 @@ def run_study(
     """
     expect_workers(workers, executor)
     folder, base = Path(folder).absolute(), Path(base).absolute()
-    manifest = describe_study(study, sums_of(source_files(study, base), base))
+    gpu = find_gpu() if executor is None else None
+    manifest = describe_study(study, sums_of(source_files(study, base), base), gpu)
     with held(folder, study, manifest):
         jobs = plan_study(study, base)
         left = Jobs(jobs, folder, folder / RECEIPTS, manifest["fingerprint"])
@@ -86,6 +88,8 @@ def run_study(
             for arm in study.arms:
                 if ":" in arm.mapping:
                     check_mapping(mapping_named(arm.mapping))
-            took_s = left.run(workers=workers, executor=executor, progress=progress or Silent())
+            took_s = left.run(
+                workers=workers, executor=executor, progress=progress or Silent(), has_gpu=gpu is not None
+            )
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     return Ran(folder, folder / REPORT, len(jobs), took_s)

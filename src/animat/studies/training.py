@@ -7,23 +7,24 @@ from pathlib import Path
 from typing import final
 
 from animat.coding.mapping import mapping_named
+from animat.devices import gpu_here
 from animat.execution.task import UNFINISHED
-from animat.execution.training import train_into
+from animat.execution.trains import Trains, Work, train_alone
 from animat.progress import Progress
 from animat.studies.draws import draw_seed
 from animat.studies.places import TIMELINE, policies_folder
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
-from animat.training.folder import describe, provenance_of, write_description
-from animat.training.group import Group, save_policies, untrained_policies
+from animat.training.folder import describe, provenance_of
+from animat.training.group import Group, untrained_policies
 from animat.training.settings import SAC
 from animat.training.specification import Training
 
 
 @final
 @dataclass(frozen=True)
-class TrainGroup(StudyTask):
+class TrainGroup(StudyTask, Trains):
     """Train some policies of an arm on a robot, going on from where a killed run stopped."""
 
     sizes = ("algorithm",)
@@ -32,18 +33,21 @@ class TrainGroup(StudyTask):
     arm: Arm
     members: tuple[int, ...]
 
-    def make(self, folder: Path, progress: Progress) -> list[Path]:
+    @property
+    def training(self) -> Training | None:
+        return training_of(self.study, self.spec, self.arm) if self.arm.trained else None
+
+    def prepare(self, folder: Path) -> Work:
         timeline = load_timeline(folder / TIMELINE) if self.arm.through_neurons else None
         training = training_of(self.study, self.spec, self.arm)
-        manifest = describe(training, timeline)
-        out = policies_folder(folder, self.spec, self.arm)
+        manifest = describe(training, timeline, device=gpu_here())
         group = Group(training, self.members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / self.spec.name / self.arm.slug / f"p{self.members[0]}.npz"
-        if self.arm.trained:
-            files = train_into(out, group, checkpoint, progress)
-        else:
-            files = save_policies(group, untrained_policies(group), out)
-        return [*files, write_description(out, manifest)]
+        return Work(group, policies_folder(folder, self.spec, self.arm), checkpoint, description=manifest)
+
+    def make(self, folder: Path, progress: Progress) -> list[Path]:
+        work = self.prepare(folder)
+        return train_alone(work, progress) if self.arm.trained else work.leave(untrained_policies(work.group))
 
 
 def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:

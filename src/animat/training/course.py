@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
@@ -89,9 +89,9 @@ def programs_with_ranges(
         return assess(varied(ranges), episodes, actor, simulator, key)
 
     return (
-        jax.jit(jax.vmap(beginning), compiler_options=FAST_TO_COMPILE),
-        jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=1, compiler_options=FAST_TO_COMPILE),
-        jax.jit(jax.vmap(assessment, in_axes=(0, 0, None, None)), compiler_options=FAST_TO_COMPILE),
+        jax.jit(jax.vmap(beginning), compiler_options=COMPILER_OPTIONS),
+        jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=1, compiler_options=COMPILER_OPTIONS),
+        jax.jit(jax.vmap(assessment, in_axes=(0, 0, None, None)), compiler_options=COMPILER_OPTIONS),
     )
 
 

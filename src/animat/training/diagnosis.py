@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.training.exploration import paid_for_entropy
 from animat.training.networks import forward, squashed_normal
@@ -69,5 +69,5 @@ def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, ava
 def diagnosing(environment: Environment[Any], algorithm: SAC) -> Callable[..., Any]:
     """`diagnose` for several policies side by side, to be compiled when it is first called."""
     return jax.jit(
-        jax.vmap(partial(diagnose, environment, algorithm), in_axes=(0, None)), compiler_options=FAST_TO_COMPILE
+        jax.vmap(partial(diagnose, environment, algorithm), in_axes=(0, None)), compiler_options=COMPILER_OPTIONS
     )

@@ -79,11 +79,22 @@ def describe(
     timeline: SimulatorTimeline | None,
     sources: Sequence[str] = (),
     random_return: float | None = None,
+    *,
+    device: str | None = None,
 ) -> dict[str, Any]:
-    """What decides how policies come out, as plain data, with a fingerprint over all of it; and what is told beside."""
+    """What decides how policies come out, as plain data, with a fingerprint over all of it; and what is told beside.
+
+    Args:
+        training, timeline: what is trained, and on what.
+        sources: names of the recordings; told beside.
+        random_return: mean return of random actions; told beside, where it is known.
+        device: the kind of GPU that trains, which rounds otherwise; None for cores, which are not told.
+    """
     versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
     if isinstance(training.robot, HostRobot):
         versions |= training.robot.versions
+    if device is not None:
+        versions["device"] = device
     manifest: dict[str, Any] = {
         "training": training.to_dict(),
         "simulators": None if timeline is None else _described(timeline),
@@ -121,7 +132,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
     """
     if (found := _description_in(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
-        unknown = ("simulators", *_BESIDE, "fingerprint", *(("duration_min",) if as_long_as_recordings else ()))
+        unknown = ("simulators", *_BESIDE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
         if difference := _first_difference(found, describe(training, None), unknown):
             raise of_another(folder, "training", difference)
 

@@ -1,4 +1,4 @@
-"""Policies that are trained side by side in one process: chunk after chunk, with a checkpoint to go on from."""
+"""Policies that are trained side by side in one program: chunk after chunk, with a checkpoint to go on from."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.errors import InvalidFile, UnusableData
 from animat.neurons.simulator import NeuronSimulator
@@ -40,6 +40,7 @@ CHECKPOINT_S = 2.0
 """Seconds of training that a kill may cost; a checkpoint of five policies is 30 MB and takes about 50 ms."""
 
 
+Rows = TypeVar("Rows", list[Policy], np.ndarray)
 AddPart: TypeAlias = Callable[[Float64[np.ndarray, "policies columns"]], None]
 """What is given a part of the learning curves, a row a policy; columns as `CURVE`."""
 
@@ -86,29 +87,60 @@ def train_group(
     Raises:
         InvalidFile: if the checkpoint cannot be read or written, or is of another training.
     """
-    training, timeline = group.training, group.timeline
-    if timeline is not None and training.percentiles == "first":
-        timeline = timeline.with_first_percentiles()
-    together = SideBySide(group)
+    return train_groups([group], checkpoint, progress, checkpoint_s=checkpoint_s, add_parts=[add_part])[0]
+
+
+def train_groups(
+    groups: Sequence[Group],
+    checkpoint: Path | None,
+    progress: Progress,
+    *,
+    checkpoint_s: float = CHECKPOINT_S,
+    add_parts: Sequence[AddPart | None],
+) -> list[list[Policy]]:
+    """Train several groups of policies at once, as `train_group` does one; returns the policies of each.
+
+    How many are trained at once changes the last bits.
+
+    Args:
+        groups: that can be trained at once (`animat.execution.gpu.programs_among`).
+        checkpoint, progress: as of `train_group`.
+        checkpoint_s: as there.
+        add_parts: of each group, as there, or None.
+    """
+    together = SideBySide(*groups)
     done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
-    start_min = 0.0 if timeline is None else float(timeline.start_min[0])
-    if add_part is not None:
-        for part in together.curve:
-            add_part(part)
+    at = [_simulators_of(group) for group in groups]
+
+    def tell(part: Float64[np.ndarray, "policies columns"]) -> None:
+        for rows, add_part in zip(together.split(part), add_parts, strict=True):
+            if add_part is not None:
+                add_part(rows)
+
+    for part in together.curve:
+        tell(part)
     written = time.monotonic()
     for index in range(done, CHUNKS):
-        simulator = None if timeline is None else timeline.at(start_min + training.minute(index))
-        if timeline is not None and training.shadowing == "drawn":
-            simulator = timeline.simulators
-        mean_return = together.train(index, simulator)
-        if add_part is not None:
-            add_part(together.curve[-1])
+        mean_return = together.train(index, *(simulator_at(index) for simulator_at in at))
+        tell(together.curve[-1])
         if checkpoint is not None and time.monotonic() - written > checkpoint_s:
             together.keep(checkpoint)
             written = time.monotonic()
         returned = "" if math.isnan(mean_return) else f"return {mean_return:.1f}"
         progress.update(index + 1, CHUNKS, ", ".join(filter(None, (returned, together.note()))))
-    return together.policies()
+    return together.split(together.policies())
+
+
+def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
+    """The simulator that a group is trained on in each chunk; where episodes draw theirs, all of them."""
+    training, timeline = group.training, group.timeline
+    if timeline is None:
+        return lambda _: None
+    if training.percentiles == "first":
+        timeline = timeline.with_first_percentiles()
+    if training.shadowing == "drawn":
+        return lambda _: timeline.simulators
+    return lambda index: timeline.at(float(timeline.start_min[0]) + training.minute(index))
 
 
 def untrained_policies(group: Group) -> list[Policy]:
@@ -129,17 +161,24 @@ def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> lis
 
 
 @lru_cache(maxsize=8)
-def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def programs(
+    environment: Environment[Any], algorithm: SAC, own_simulators: bool = False
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """`begin` and `train_chunk` for several policies side by side, to be compiled when they are first called.
 
     The same for the same arguments: a process that trains one group after another traces them once.
+
+    Args:
+        environment: what they act in.
+        algorithm: settings of all.
+        own_simulators: whether each policy has its own simulator, rather than one for all.
     """
     limited = EpisodeLimit(environment)
     beginning = jax.vmap(partial(begin, limited, algorithm))
-    chunk = jax.vmap(partial(train_chunk, limited, algorithm), in_axes=(0, None, None, None))
+    chunk = jax.vmap(partial(train_chunk, limited, algorithm), in_axes=(0, 0 if own_simulators else None, None, None))
     return (
-        jax.jit(beginning, compiler_options=FAST_TO_COMPILE),
-        jax.jit(chunk, donate_argnums=0, compiler_options=FAST_TO_COMPILE),
+        jax.jit(beginning, compiler_options=COMPILER_OPTIONS),
+        jax.jit(chunk, donate_argnums=0, compiler_options=COMPILER_OPTIONS),
     )
 
 
@@ -148,44 +187,62 @@ class SideBySide:
 
     Args:
         group: the policies; of its timeline only what all simulators of it share is used.
+        others: trained with them by the same program, the same number of rounds. Where any is of another training,
+            none has lessons or is stepped outside JAX.
     """
 
-    def __init__(self, group: Group) -> None:
+    def __init__(self, group: Group, *others: Group) -> None:
         training = group.training
-        self._group = group
+        self._groups = groups = (group, *others)
+        self._places = [(each, member) for each in groups for member in each.members]
+        self._own_simulators = len({each.fingerprint for each in groups}) > 1
         self._environment = training.environment(0 if group.timeline is None else len(group.timeline.conditions))
         self._course = None
         if training.is_varied:
-            self._course = Course(training, self._environment, group.timeline, len(group.members))
+            self._course = Course(training, self._environment, group.timeline, len(self._places))
             beginning, self._chunk = self._course.begin, self._course.train
+        elif isinstance(training.robot, HostRobot):
+            beginning, self._chunk = programs_on_host(self._environment, training.algorithm)
         else:
-            made = programs_on_host if isinstance(training.robot, HostRobot) else programs
-            beginning, self._chunk = made(self._environment, training.algorithm)
+            beginning, self._chunk = programs(self._environment, training.algorithm, self._own_simulators)
+        keys = [jax.random.fold_in(jax.random.key(each.training.seed), member) for each, member in self._places]
         self._diagnose = diagnosing(self._environment, training.algorithm)
-        keys = jnp.stack([jax.random.fold_in(jax.random.key(training.seed), member) for member in group.members])
-        self._learners = beginning(keys)
+        self._learners = beginning(jnp.stack(keys))
         self._curve: list[np.ndarray] = []
+
+    def split(self, rows: Rows) -> list[Rows]:
+        """What there is of each policy, cut into that of each group."""
+        ends = np.cumsum([len(group.members) for group in self._groups])
+        return [rows[end - len(group.members) : end] for group, end in zip(self._groups, ends, strict=True)]
 
     @property
     def curve(self) -> Sequence[Float64[np.ndarray, "policies columns"]]:
         """The learning curves so far: of each part, a row a policy."""
         return self._curve
 
-    def train(self, index: int, simulator: NeuronSimulator | None) -> float:
+    def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
         """Train one chunk; returns the mean return of the episodes that ended in it, NaN for none.
 
         Chunks are numbered on from 0; one may go beyond those of the training.
 
+        Args:
+            index: of the chunk.
+            simulators: of each group; None without neurons.
+
         Raises:
             UnusableData: if what was learned is no longer a finite number.
         """
-        first, last = self._group.training.chunk(index)
-        algorithm = self._group.training.algorithm
+        training, simulator = self._groups[0].training, simulators[0]
+        algorithm = training.algorithm
+        if self._own_simulators:
+            of_each = np.repeat(np.arange(len(self._groups)), [len(group.members) for group in self._groups])
+            simulator = jax.tree.map(lambda *leaves: jnp.stack(leaves)[of_each], *simulators)
+        first, last = training.chunk(index)
         self._learners, finished = self._chunk(self._learners, simulator, jnp.int32(first), jnp.int32(last))
         episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
         iterations = np.full(len(episodes), last * algorithm.environments)
         # Before a checkpoint is written, from which no training would recover.
-        robot, deployed = self._group.training.robot, jax.tree.leaves(self._learners.deployed)
+        robot, deployed = training.robot, jax.tree.leaves(self._learners.deployed)
         if not all(np.isfinite(leaf).all() for leaf in deployed):
             raise UnusableData(
                 f"{robot.name}: expected finite rewards and observations, got NaN or infinite ones "
@@ -205,13 +262,13 @@ class SideBySide:
 
     def policies(self) -> list[Policy]:
         """What they are now, each with its best where they are assessed."""
-        return [self._policy(i) for i in range(len(self._group.members))]
+        return [self._policy(i) for i in range(len(self._places))]
 
     def _policy(self, i: int) -> Policy:
         done = len(self._curve)
         curve = np.stack(self._curve)[:, i] if done else np.zeros((0, len(CURVE)))
         now = self._as_policy(i, self._learners.deployed, curve)
-        if self._course is None or not done or not self._group.training.episodes_assessed:
+        if self._course is None or not done or not self._groups[0].training.episodes_assessed:
             return now
         standing = self._course.standing
         assessments, until = standing.table[:done, i].copy(), int(standing.best_at[i]) + 1
@@ -220,26 +277,31 @@ class SideBySide:
 
     def _as_policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
         network = jax.tree.map(lambda leaf: np.array(leaf[i]), networks)
-        return _policy(self._group, self._environment.scales, network, curve)
+        return _policy(self._places[i][0], self._environment.scales, network, curve)
 
     def keep(self, checkpoint: Path) -> None:
         """Write a checkpoint."""
         learners = self._learners._replace(key=jax.random.key_data(self._learners.key))
         leaves = jax.tree.leaves((learners, self._standing))
         arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-        arrays |= {"fingerprint": np.array(self._group.fingerprint), "done": np.array(len(self._curve))}
+        arrays |= {"fingerprint": np.array(self.fingerprint), "done": np.array(len(self._curve))}
         with atomic_write(checkpoint) as beside, beside.open("wb") as file:
             np.savez(file, curve=np.stack(self._curve), **arrays)
 
     def resume(self, checkpoint: Path) -> int:
         """Go on from a checkpoint; returns how many chunks are done."""
         done, self._learners, standing, curve = _read_checkpoint(
-            checkpoint, self._group.fingerprint, self._learners, self._standing
+            checkpoint, self.fingerprint, self._learners, self._standing
         )
         if self._course is not None:
             self._course.standing = standing
         self._curve = list(curve[:done])
         return done
+
+    @property
+    def fingerprint(self) -> str:
+        """Of all that decides how the policies come out."""
+        return "+".join(dict.fromkeys(group.fingerprint for group in self._groups))
 
     @property
     def _standing(self) -> Any:

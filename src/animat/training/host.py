@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.neurons.history import AT_FIRST
 from animat.neurons.simulator import NeuronSimulator
@@ -136,9 +136,9 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
     acting = jax.vmap(partial(act, environment, algorithm), in_axes=(0, None))
     learning = jax.vmap(partial(learn_and_act, environment, algorithm), in_axes=(0, 0, 0, None, None))
     return (
-        jax.jit(beginning, compiler_options=FAST_TO_COMPILE),
-        jax.jit(acting, donate_argnums=0, compiler_options=FAST_TO_COMPILE),
-        jax.jit(learning, donate_argnums=(0, 1), compiler_options=FAST_TO_COMPILE),
+        jax.jit(beginning, compiler_options=COMPILER_OPTIONS),
+        jax.jit(acting, donate_argnums=0, compiler_options=COMPILER_OPTIONS),
+        jax.jit(learning, donate_argnums=(0, 1), compiler_options=COMPILER_OPTIONS),
     )
 
 

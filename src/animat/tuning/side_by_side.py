@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from animat.compilation import FAST_TO_COMPILE
+from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.errors import InvalidFile
 from animat.evaluation.rollouts import Networks
@@ -54,8 +54,8 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
         return train_chunk(limited, _traced(algorithm, numbers), learner, simulator, first, last)
 
     return (
-        jax.jit(jax.vmap(beginning), compiler_options=FAST_TO_COMPILE),
-        jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=0, compiler_options=FAST_TO_COMPILE),
+        jax.jit(jax.vmap(beginning), compiler_options=COMPILER_OPTIONS),
+        jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=0, compiler_options=COMPILER_OPTIONS),
     )
 
 
