@@ -14,9 +14,9 @@ import pytest
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
-from animat.studies.context import ContextRow, LostRow, RanContext, run_context_study
+from animat.studies.context import ContextRow, LostRow, RanContext, _plan, run_context_study
 from animat.studies.context_page import in_short, write_context_page
-from animat.studies.context_tasks import ContextStudy
+from animat.studies.context_tasks import ContextStudy, RecordCulture, presented_for
 
 
 def row(culture: int, robot: str, **known: Any) -> ContextRow:
@@ -128,22 +128,11 @@ def test_a_small_study_from_a_culture_to_its_table(tmp_path: Path, monkeypatch: 
         run_context_study(replace(study, policies=3), tmp_path)
 
 
-@pytest.mark.oracle
-@pytest.mark.usefixtures("in_this_process", "few_bootstraps")
-def test_a_small_study_of_a_robot_with_two_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.stimulation.protocol.TWO_COMMANDS", replace(TWO_COMMANDS, trials=40))
-    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
-    study = ContextStudy(
-        cultures=(1,), robots=("detour",), policies=2, iterations_share=0.01, episodes=40, episodes_measured=1
-    )
-    (only,) = run_context_study(study, tmp_path).rows
-    told = json.loads((tmp_path / "culture-1" / "detour" / "simulated.json").read_text())
-    rows = {each["name"]: each for each in told["rows"]}
-    assert only.optimum is None and only.is_least and only.best_known is not None
-    # That of the heuristic, or of a policy, in the second half of its episodes.
-    assert only.best_known >= rows["heuristic"]["mean_return"] - 20
-    expected = (only.best_known - only.coupling) / (only.best_known - only.random)
-    assert only.gap == pytest.approx(min(max(expected, 0.0), 1.0))
-    session = read_session(tmp_path / "culture-1" / "detour" / "session")
-    assert {len(tick.command) for tick in session.ticks if tick.agent == "coupling"} == {2}
-    assert only.measured_coupling is not None and only.bits is not None
+def test_robots_with_two_commands_have_recordings_of_their_own(tmp_path: Path) -> None:
+    jobs = {job.name: job for job in _plan(ContextStudy(cultures=(1,), robots=("shuttle", "detour")))}
+    assert jobs["train/1/shuttle"].needs == ("record/1",) and jobs["train/1/detour"].needs == ("record/1/2-commands",)
+    one, two = (jobs[name].task for name in ("record/1", "record/1/2-commands"))
+    assert isinstance(one, RecordCulture) and isinstance(two, RecordCulture)
+    assert (one.n_commands, two.n_commands) == (1, 2)
+    assert one.recordings(tmp_path, 1) != two.recordings(tmp_path, 2)
+    assert presented_for(1) == CLOSED_LOOP and presented_for(2) == TWO_COMMANDS
