@@ -14,7 +14,7 @@ import pytest
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
-from animat.studies.context import ContextRow, LostRow, RanContext, _plan, run_context_study
+from animat.studies.context import ContextRow, LostRow, RanContext, plan_context_study, run_context_study
 from animat.studies.context_page import in_short, write_context_page
 from animat.studies.context_tasks import ContextStudy, RecordCulture, presented_for
 
@@ -129,7 +129,7 @@ def test_a_small_study_from_a_culture_to_its_table(tmp_path: Path, monkeypatch: 
 
 
 def test_robots_with_two_commands_have_recordings_of_their_own(tmp_path: Path) -> None:
-    jobs = {job.name: job for job in _plan(ContextStudy(cultures=(1,), robots=("shuttle", "detour")))}
+    jobs = {job.name: job for job in plan_context_study(ContextStudy(cultures=(1,), robots=("shuttle", "detour")))}
     assert jobs["train/1/shuttle"].needs == ("record/1",) and jobs["train/1/detour"].needs == ("record/1/2-commands",)
     one, two = (jobs[name].task for name in ("record/1", "record/1/2-commands"))
     assert isinstance(one, RecordCulture) and isinstance(two, RecordCulture)

@@ -184,7 +184,7 @@ def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
         RobotSpec("a/b", kind="cartpole")
     with pytest.raises(InvalidArgument, match="culture"):
         RobotSpec("culture", kind="cartpole")
-    with pytest.raises(InvalidArgument, match="cartpole, navigation"):
+    with pytest.raises(InvalidArgument, match="cartpole, detour, navigation"):
         RobotSpec("as printed")
 
 

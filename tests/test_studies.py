@@ -66,6 +66,10 @@ TINY = Path(__file__).parent / "tiny_study.toml"
 CONTROLS = [arm.name for arm in read_study(TINY).arms if arm.delivery == "shuffled"]
 
 
+NAMES = "arm, cartpole, detour, navigation, shuttle, swing-up, wheels"
+"""Of the robots."""
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny study, run in this process, where its programs are compiled once."""
@@ -753,17 +757,17 @@ COMPARED = (
         ("robots = 'cartpole'", "robots: expected a list"),
         (
             "[[robots]]\nname = 'cart'",
-            "robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'cart'",
+            f"robot: expected one of {NAMES}, got 'cart'",
         ),
         ("[[robots]]\niterations = 3", "robots.name: expected to be given"),
         ("[[robots]]\nname = 'cartpole'\nparameters = { mass = 1 }", "parameters: cartpole: expected parameters"),
         (
             "[[robots]]\nname = 'cartpol'",
-            "robots.name: robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'cartpol';",
+            f"robots.name: robot: expected one of {NAMES}, got 'cartpol';",
         ),
         (
             "[[robots]]\nname = 'a'\nkind = 'b'",
-            "robots.kind: robot: expected one of arm, cartpole, navigation, shuttle, swing-up, wheels, got 'b';",
+            f"robots.kind: robot: expected one of {NAMES}, got 'b';",
         ),
         ("[robots.cartpole]\niterations = 3", "robots: expected [[robots]] for each, and its name in it, got [robots."),
         ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
