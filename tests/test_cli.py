@@ -80,8 +80,13 @@ def test_what_training_reports_is_what_the_deployed_policies_get(
 
 @pytest.mark.oracle
 def test_the_live_page_has_what_returns_are_compared_with(
-    recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recordings: Path,
+    policies: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    with_a_rough_optimum(monkeypatch)
     folder = tmp_path / "policies"
     shutil.copytree(policies, folder)
     manifest = json.loads((folder / "training.json").read_text())
@@ -106,6 +111,23 @@ def test_the_live_page_has_what_returns_are_compared_with(
     capsys.readouterr()
     assert main([*evaluate, "--out", str(folder / "training.json" / "x.json")]) == 1
     assert "training.json" in capsys.readouterr().err
+
+
+def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The optimal return on a coarse grid, and a short search for the coupling; returns the resolutions asked for."""
+    asked = []
+
+    def rough(*case: Any, resolution: float, seed: int) -> Optimum:
+        asked.append(resolution)
+        return best_return(*case, resolution=0.25, episodes=0, seed=seed)
+
+    def narrow(*of: Any, resolution: float, seed: int) -> tuple[Optimum, ...]:
+        return with_intervals(*of, resolution=0.25, resamples=3, seed=seed)
+
+    monkeypatch.setattr("animat.evaluation.table.best_return", rough)
+    monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
+    monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 4)
+    return asked
 
 
 def levels_in(folder: Path) -> list[tuple[str, float]]:
@@ -191,17 +213,7 @@ def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys
 def test_evaluate_tells_the_optimum_of_the_recording_it_evaluates_on(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
-
-    def rough(*case: Any, resolution: float, seed: int) -> Optimum:
-        asked.append(resolution)
-        return best_return(*case, resolution=0.25, episodes=0, seed=seed)
-
-    def narrow(*of: Any, resolution: float, seed: int) -> tuple[Optimum, ...]:
-        return with_intervals(*of, resolution=0.25, resamples=3, seed=seed)
-
-    monkeypatch.setattr("animat.evaluation.table.best_return", rough)
-    monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
+    asked = with_a_rough_optimum(monkeypatch)
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0"]
     assert main([*command, "--optimum", "--json"]) == 0
     said = capsys.readouterr().out

@@ -143,7 +143,7 @@ def test_actions_are_held_until_the_policy_alone_does_better(
     assert bool((np.asarray(taken) != 7).any()) == expected
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_swing_up_is_learned_through_nine_thresholds() -> None:
     """To 0.84 of the optimal return (142.5, by dynamic programming) in 400,000 iterations, by each of four policies.
 

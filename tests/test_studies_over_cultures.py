@@ -170,7 +170,7 @@ def test_scores_of_all_cultures_are_one_table_the_same_in_parquet(
     assert run_scored(tmp_path, monkeypatch).parquet == found.parquet and found.parquet.read_bytes() == before
 
 
-@pytest.mark.oracle
+@pytest.mark.long
 def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
