@@ -111,6 +111,8 @@ def test_the_live_page_has_what_returns_are_compared_with(
     capsys.readouterr()
     assert main([*evaluate, "--out", str(folder / "training.json" / "x.json")]) == 1
     assert "training.json" in capsys.readouterr().err
+    assert main([*evaluate, "--out", str(folder)]) == 1
+    assert capsys.readouterr().err == f"animat: --out: expected a file, got the folder {folder}\n"
 
 
 def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:

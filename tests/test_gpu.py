@@ -266,6 +266,19 @@ def test_without_a_plugin_and_where_the_processor_is_asked_for_nothing_is_looked
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.oracle
+def test_a_platform_that_jax_does_not_have_is_not_asked_for(tmp_path: Path) -> None:
+    command = ["train", "cartpole", "--mapping", "none", "--iterations", "2400", "--policies", "1"]
+    done = subprocess.run(
+        [sys.executable, "-m", "animat", *command, "--out", str(tmp_path / "policies")],
+        env=os.environ | {"JAX_PLATFORMS": "abacus"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
 class Process(ThreadPoolExecutor):
     """In place of the process that may use the GPU."""
 

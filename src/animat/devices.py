@@ -19,10 +19,10 @@ GPU_IS_ALLOWED = may_use_gpu()
 def stay_on_cores() -> None:
     """Keep JAX off the GPU in this process, before it is imported; training, in one of its own, has the GPU's memory.
 
-    So recordings, simulators and evaluations have the same bits with a GPU and without.
+    So recordings, simulators and evaluations have the same bits with a GPU and without, and whatever else
+    `JAX_PLATFORMS` asks for.
     """
-    if GPU_IS_ALLOWED:
-        os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ["JAX_PLATFORMS"] = "cpu"
 
 
 def gpu_here() -> str | None:

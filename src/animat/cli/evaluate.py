@@ -10,6 +10,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for, say_findings
+from animat.errors import InvalidArgument
 from animat.records import as_json
 from animat.writing import atomic_write, expect_writable
 
@@ -53,6 +54,8 @@ class Evaluate(Fitting):
         from animat.progress import Bar
 
         if self.out is not None:
+            if self.out.is_dir():
+                raise InvalidArgument(f"--out: expected a file, got the folder {self.out}")
             expect_writable(self.out.parent)
         policies = policies_for(self.robot, self.mapping, self.policies)
         check_at_once("--episodes", self.episodes, len(policies))
