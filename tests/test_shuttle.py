@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +20,7 @@ from animat.robots import Shuttle, ShuttleState
 from animat.robots.drawing import BODY, GOAL_FILL, draw_robot
 from animat.robots.grid import grid_for
 from animat.wrappers import GoalSwitch
-
-NO_NOISE = jnp.zeros(0)
+from test_swing_up import scanned
 
 
 def path(robot: Shuttle, start: tuple[float, float, float], u) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -30,15 +28,6 @@ def path(robot: Shuttle, start: tuple[float, float, float], u) -> tuple[np.ndarr
     with jax.enable_x64(True):
         state = ShuttleState(*(jnp.float64(value) for value in start))
         return jax.tree.map(np.asarray, scanned(robot, state, jnp.asarray(u, jnp.float64)))
-
-
-@partial(jax.jit, static_argnums=0)
-def scanned(robot: Shuttle, state: ShuttleState, u):
-    def iterate(state, u):
-        state, reward, terminated = robot.advance(NO_NOISE, state, u)
-        return state, (jnp.stack(state), reward, terminated)
-
-    return jax.lax.scan(iterate, state, u)[1]
 
 
 def test_it_starts_at_rest_in_the_middle_and_either_cue_is_as_likely() -> None:

@@ -32,7 +32,9 @@ def path(robot: SwingUp, start: tuple[float, float], u) -> tuple[np.ndarray, np.
 
 
 @partial(jax.jit, static_argnums=0)
-def scanned(robot: SwingUp, state: SwingUpState, u):
+def scanned(robot, state, u):
+    """States, rewards and ends of iterations with these commands, of a robot without noise."""
+
     def iterate(state, u):
         state, reward, terminated = robot.advance(NO_NOISE, state, u)
         return state, (jnp.stack(state), reward, terminated)
