@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,10 +109,7 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     def ran(study: Study, folder: Path, **_: Any) -> Ran:
         if study.culture.seed == 2:
             raise UnusableData("recording 1: no responses")
-        results_file(folder).parent.mkdir(parents=True, exist_ok=True)
-        rows = (compared(0.0, float(study.culture.seed), SECOND),)
-        write_typed(results_file(folder), Results((), rows, (), (), (), ()))
-        return Ran(folder, folder / "report.html", 1, {})
+        return told_and_tables(study, folder)
 
     monkeypatch.setattr(cultures, "run_study", ran)
     study = replace(read_study(TINY), culture=Source(seeds="1-3"))
@@ -121,6 +122,63 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     assert pd.read_csv(tmp_path / cultures.SUMMARY)["difference"].tolist() == [2.0]
     with pytest.raises(AnimatError, match="culture-2: recording 1: no responses"):
         run_over_cultures(replace(study, culture=Source(seeds="2")), tmp_path)
+
+
+def told_and_tables(study: Study, folder: Path) -> Ran:
+    results_file(folder).parent.mkdir(parents=True, exist_ok=True)
+    rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
+    write_typed(results_file(folder), Results((), rows, (), (), (), ()))
+    return Ran(folder, folder / "report.html", 1, {})
+
+
+def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The barrier lets nobody through before two are there; told in order, the whole never goes back."""
+    both, at_once, most = threading.Barrier(2, timeout=60), 0, 0
+
+    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> Ran:
+        nonlocal at_once, most
+        at_once += 1
+        both.wait()
+        most = max(most, at_once)
+        for done in range(4):
+            progress.update(done, 3)
+        at_once -= 1
+        return told_and_tables(study, folder)
+
+    told: list[tuple[float, str]] = []
+    monkeypatch.setattr(cultures, "run_study", ran)
+    monkeypatch.setattr(cultures, "find_gpu", lambda: None)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    whole = SimpleNamespace(update=lambda done, total, note="": told.append((done / total, note)))
+    found = run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-4")), tmp_path, progress=whole)
+    assert list(found.ran) == ["culture-1", "culture-2", "culture-3", "culture-4"]
+    assert most == 2
+    assert [share for share, _ in told] == sorted(share for share, _ in told)
+    assert told[-1] == (1.0, "4 of 4 cultures")
+    assert any(note.startswith("0 of 4 cultures; culture-") for _, note in told)
+
+
+def test_what_nobody_foresaw_ends_all_cultures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Ctrl-C does: the others are stopped at their next report, and no more are begun."""
+    begun, running = [], threading.Event()
+
+    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> Ran:
+        begun.append(study.culture.seed)
+        if study.culture.seed == 1:
+            running.wait(60)
+            raise KeyboardInterrupt
+        while True:
+            progress.update(1, 2)
+            running.set()
+            time.sleep(0.01)
+
+    monkeypatch.setattr(cultures, "run_study", ran)
+    monkeypatch.setattr(cultures, "find_gpu", lambda: None)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    with pytest.raises(KeyboardInterrupt):
+        run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-9")), tmp_path)
+    assert set(begun) <= {1, 2, 3}, "one may take the place of the first before all are stopped"
+    assert not [each for each in threading.enumerate() if each.name.startswith("culture")]
 
 
 SCORED: dict[str, Any] = {

@@ -117,6 +117,10 @@ class Cluster(Executor):
             )
         )
 
+    def cores(self) -> int:
+        """How many cores its workers have now; one if there is no worker yet."""
+        return max(1, sum(map(int, self._client.nthreads().values())))
+
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """As any executor's; what still runs is ended, if it is not waited for."""
         if wait and not cancel_futures:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from concurrent.futures import Executor
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import AnimatError
-from animat.progress import Part, Progress, Silent
+from animat.execution.cluster import Cluster
+from animat.execution.gpu import find_gpu
+from animat.execution.jobs import expect_workers
+from animat.execution.pinned import PinnedProcesses
+from animat.progress import Progress, Silent
 from animat.studies.parquet import write_parquet
 from animat.studies.places import results_file
 from animat.studies.results import ComparedReturns, Results, Score, read_typed, write_records, write_table
@@ -22,6 +29,8 @@ from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND
 
 RESAMPLES = 10_000
+MOST_AT_ONCE = 64
+"""Cultures: each has a thread here, which looks after its jobs."""
 COMPARISONS, SUMMARY, SCORES = "comparisons.csv", "over-cultures.csv", "scores.csv"
 
 
@@ -98,7 +107,9 @@ def run_over_cultures(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> RanCultures:
-    """Run a study of many cultures, or go on with one: culture after culture, each as `run_study` does.
+    """Run a study of many cultures, or go on with one: each culture as `run_study` does, one for each core at a time.
+
+    A culture is recorded on one core, whatever there is. Beside it the jobs of other cultures are done.
 
     A culture whose study fails is told in the end, and the others go on. More cultures may be added later: what is done
     is not done again.
@@ -110,19 +121,20 @@ def run_over_cultures(
 
     Raises:
         AnimatError: if the study of every culture failed, with what each failed of.
+        InvalidArgument: for fewer workers than one, or any beside an executor.
     """
-    folder, progress = Path(folder).absolute(), progress or Silent()
+    expect_workers(workers, executor)
+    folder = Path(folder).absolute()
     studies = studies_of(study)
-    ran: dict[str, Ran] = {}
-    failed: dict[str, str] = {}
-    for i, (name, each) in enumerate(studies.items()):
-        try:
-            part = Part(progress, i, 1, len(studies), name)
-            ran[name] = run_study(each, folder / name, base=base, workers=workers, executor=executor, progress=part)
-        except AnimatError as error:
-            failed[name] = str(error)
-            if len(failed) == len(studies):
-                raise AnimatError("; ".join(f"{which}: {why}" for which, why in failed.items())) from error
+    with _room(workers, executor) as (room, at_once):
+        here = workers if room is None else None
+        runs = {
+            name: partial(run_study, each, folder / name, base=base, workers=here, executor=room)
+            for name, each in studies.items()
+        }
+        ran, failed = _side_by_side(runs, min(at_once, MOST_AT_ONCE), room, progress or Silent())
+    if not ran:
+        raise AnimatError("; ".join(f"{which}: {why}" for which, why in failed.items()))
     results = {name: read_typed(results_file(each.folder), Results) for name, each in ran.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
@@ -136,6 +148,95 @@ def run_over_cultures(
     parquet = (folder / SCORES).with_suffix(".parquet")
     is_written = write_parquet(parquet, scores, Score, "culture")
     return RanCultures(folder, ran, failed, comparisons, summary, parquet if is_written else None)
+
+
+@contextmanager
+def _room(workers: int | None, executor: Executor | None) -> Iterator[tuple[Executor | None, int]]:
+    """Where the jobs of all cultures are run, and how many cultures at once keep that busy."""
+    if executor is not None:
+        yield executor, executor.cores() if isinstance(executor, Cluster) else MOST_AT_ONCE
+    elif find_gpu() is not None:
+        # It trains all policies of a culture at once.
+        yield None, 1
+    else:
+        cores = sorted(os.sched_getaffinity(0))[:workers]
+        with PinnedProcesses(cores) as ours:
+            yield ours, len(cores)
+
+
+def _side_by_side(
+    runs: Mapping[str, Callable[..., Ran]], at_once: int, room: Executor | None, progress: Progress
+) -> tuple[dict[str, Ran], dict[str, str]]:
+    """Run studies, so many at a time: those that are finished, and why the others are not."""
+    ran: dict[str, Ran] = {}
+    failed: dict[str, str] = {}
+    together = _Together(progress, len(runs))
+    with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:
+        futures = {threads.submit(run, progress=together.of(name)): name for name, run in runs.items()}
+        try:
+            for future in as_completed(futures):
+                name = futures[future]
+                try:
+                    ran[name] = future.result()
+                except AnimatError as error:
+                    failed[name] = str(error)
+                together.end(name)
+        except BaseException:
+            together.stop()
+            threads.shutdown(wait=False, cancel_futures=True)
+            if isinstance(room, PinnedProcesses):
+                # Else the studies would wait for what runs.
+                room.kill_workers()
+            raise
+    return {name: ran[name] for name in runs if name in ran}, {name: failed[name] for name in runs if name in failed}
+
+
+class _Together:
+    """The progress of many studies, each of which is told of its own; stopped, it stops them at their next report."""
+
+    def __init__(self, whole: Progress, studies: int) -> None:
+        self._whole, self._studies = whole, studies
+        self._shares: dict[str, float] = {}
+        self._ended = 0
+        self._lock = threading.Lock()
+        self._is_stopped = False
+
+    def of(self, name: str) -> Progress:
+        """That of one study."""
+        return _OfOne(partial(self._see, name))
+
+    def end(self, name: str) -> None:
+        """It is finished, or has failed."""
+        with self._lock:
+            self._shares.pop(name, None)
+            self._ended += 1
+        self._tell()
+
+    def stop(self) -> None:
+        """Stop them all."""
+        self._is_stopped = True
+
+    def _see(self, name: str, share: float) -> None:
+        if self._is_stopped:
+            raise AnimatError("stopped")
+        with self._lock:
+            self._shares[name] = share
+        self._tell()
+
+    def _tell(self) -> None:
+        with self._lock:
+            running = "; ".join(f"{name} {100 * share:.0f} %" for name, share in self._shares.items())
+            note = f"{self._ended} of {self._studies} cultures" + (f"; {running}" if running else "")
+            self._whole.update(self._ended + sum(self._shares.values()), self._studies, note)
+
+
+@dataclass(frozen=True)
+class _OfOne:
+    see: Callable[[float], None]
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        """Tell the others of it."""
+        self.see(done / total)
 
 
 def over_cultures(found: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
