@@ -28,7 +28,8 @@ from watching import OWN, PORT, TOKEN, asked, session_in
 pytest.importorskip("starlette", reason="the extra [watch] is not installed")
 pytest.importorskip("uvicorn", reason="the extra [watch] is not installed")
 
-from animat.watch.app import app_for
+from animat.watch.app import _VIEWS, app_for
+from animat.watch.session import SessionView
 
 
 @contextlib.contextmanager
@@ -153,11 +154,11 @@ def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: 
         wait_for(lambda: said("#state").startswith("● running"))
         first = wait_for(lambda: said("#now dd"))
         wait_for(lambda: said("#now dd") != first)
-        wait_for(lambda: browser.execute_script("return document.querySelector('img')?.naturalWidth > 0"))
+        wait_for(lambda: browser.execute_script("return document.querySelector('canvas.robot')?.hidden === false"))
         browser.find_element("id", "pause").click()
         wait_for(lambda: said("#pause") == "Follow")
         browser.find_element("id", "stop").click()
-        wait_for(lambda: ended)
+        assert_no_more_pulses(folder, ended)
         wait_for(lambda: said("#state").startswith("■ ended: person"))
         browser.find_element("id", "pause").click()
         with (folder / "ticks.csv").open(newline="") as file:
@@ -172,6 +173,56 @@ def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: 
         assert numbers == pytest.approx([float(row["time_s"]), float(row["rate_hz"])], rel=1e-5)
         assert not [line for line in browser.get_log("browser") if "favicon" not in line["message"]]
         assert not browser.execute_script("return document.querySelectorAll('option img, header img').length")
+
+
+@pytest.mark.oracle
+@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium, chromedriver and selenium")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_with_the_server_killed_the_page_says_how_to_stop_a_session(tmp_path: Path, browser: Any) -> None:
+    folder = tmp_path / "session"
+    command = [sys.executable, "-m", "animat", "watch", str(tmp_path)]
+    with running(folder) as ended, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        browser.get(server.stdout.readline().split()[0])
+        wait_for(lambda: browser.find_element("id", "state").text.startswith("● running"))
+        server.kill()
+        trouble = browser.find_element("id", "trouble")
+        wait_for(lambda: "a session is stopped by a file STOP in its folder" in trouble.text)
+        browser.quit()
+        assert not ended
+        (folder / STOP_FILE).touch()
+        assert_no_more_pulses(folder, ended)
+
+
+def assert_no_more_pulses(folder: Path, ended: list[Session]) -> None:
+    """From the next tick on, of a session in whose folder STOP is being made."""
+    wait_for(lambda: ended or (folder / STOP_FILE).exists())
+    before = SessionView(folder).view(None, 60.0)["n_ticks"]
+    wait_for(lambda: ended)
+    assert ended[0].ending.by == "person"
+    # The tick that was under way, and the one that was being written.
+    assert ended[0].outline.ticks <= before + 2
+
+
+def test_beside_a_loop_that_runs_the_page_gives_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not hasattr(os, "SCHED_IDLE"):
+        pytest.skip("this system has no such scheduling")
+    seen: list[int] = []
+
+    class Noting(SessionView):
+        def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+            seen.append(os.sched_getscheduler(0))
+            return {"state": states[len(seen) - 1]}
+
+    monkeypatch.setitem(_VIEWS, "session", Noting)
+    states = ["running", "running", "ended", "ended"]
+    session_in(tmp_path, episodes=1)
+    app = app_for(tmp_path, TOKEN, PORT)
+    for state in states:
+        assert asked(app, "view", kind="session", **{"in": ""}).json == {"state": state}
+    # After the first look it is known that a loop runs, after the third that it does not.
+    assert seen == [os.SCHED_OTHER, os.SCHED_IDLE, os.SCHED_IDLE, os.SCHED_OTHER]
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 @contextlib.contextmanager

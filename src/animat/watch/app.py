@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.found import Kind, find, place_within
+from animat.watch.giving_way import Answering
 from animat.watch.guard import App, Guard
 from animat.watch.picture import picture_of
 from animat.watch.plain import text
@@ -65,6 +66,8 @@ class Watched:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.is_beside_a_loop = False
+        """Whether what was looked at last is a closed loop that runs."""
         self._views: OrderedDict[tuple[str, str], View] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -86,7 +89,9 @@ class Watched:
     def view(self, kind: str, place: str, to_s: float | None, span_s: float) -> dict[str, Any]:
         """How it is."""
         with self._lock:
-            return self._view(kind, place).view(to_s, span_s)
+            found = self._view(kind, place).view(to_s, span_s)
+        self.is_beside_a_loop = kind == "session" and found.get("state") == "running"
+        return found
 
     def picture(self, place: str, at: int) -> bytes | None:
         """The robot of a session at a record, as PNG."""
@@ -119,12 +124,11 @@ class Watched:
 def app_for(folder: Path, token: str, port: int) -> App:
     """The page of a folder as an ASGI application, guarded."""
     from starlette.applications import Starlette
-    from starlette.concurrency import run_in_threadpool
     from starlette.requests import Request
     from starlette.responses import Response
     from starlette.routing import Route
 
-    watched = Watched(folder)
+    watched, answers = Watched(folder), Answering()
     pages = {address: (_file(name), kind) for address, (name, kind) in _FILES.items()}
 
     async def file(request: Request) -> Response:
@@ -134,18 +138,9 @@ def app_for(folder: Path, token: str, port: int) -> App:
     def answering(answer: Callable[[Any], Any]) -> Callable[[Request], Any]:
         @functools.wraps(answer)
         async def endpoint(request: Request) -> Response:
-            status, body = 200, b"{}"
-            try:
-                found = await run_in_threadpool(answer, request.query_params)
-                if isinstance(found, bytes):
-                    return Response(found, media_type="image/png")
-                body = json.dumps(found, allow_nan=False).encode()
-            except AnimatError as error:
-                status, body = 409, _told(str(error))
-            except Exception as error:
-                # Anything may be in a file.
-                status, body = 500, _told(f"cannot be shown: {first_line(error)}")
-            return Response(body, status, media_type="application/json")
+            made = functools.partial(_answered, answer, request.query_params)
+            status, kind, body = await answers.run(made, beside_a_loop=watched.is_beside_a_loop)
+            return Response(body, status, media_type=kind)
 
         return endpoint
 
@@ -175,6 +170,20 @@ def app_for(folder: Path, token: str, port: int) -> App:
         Route("/stop", answering(stop), methods=["POST"]),
     ]
     return Guard(Starlette(routes=routes), token, port)
+
+
+def _answered(answer: Callable[[Any], Any], asked: Any) -> tuple[int, str, bytes]:
+    """Status, kind and content of an answer."""
+    try:
+        found = answer(asked)
+        if isinstance(found, bytes):
+            return 200, "image/png", found
+        return 200, "application/json", json.dumps(found, allow_nan=False).encode()
+    except AnimatError as error:
+        return 409, "application/json", _told(str(error))
+    except Exception as error:
+        # Anything may be in a file.
+        return 500, "application/json", _told(f"cannot be shown: {first_line(error)}")
 
 
 def _file(name: str) -> bytes:

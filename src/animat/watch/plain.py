@@ -43,7 +43,9 @@ def text(value: Any, most: int = _MOST_LETTERS) -> str:
 def short(value: Any) -> str:
     """A setting in a few letters."""
     known = number(value)
-    return text(value, 60) if known is None else f"{known:.4g}"
+    if known is None:
+        return text(value, 60)
+    return f"{known:,}" if isinstance(known, int) else f"{known:.4g}"
 
 
 def listed(value: Any) -> list[Any]:

@@ -173,7 +173,7 @@ def _shares(shares: dict[Path, tuple[float, dict[str, float]]], files: int) -> d
     """How each condition was answered in each recording that was looked at."""
     known = sorted(((minute, of) for minute, of in shares.values() if of), key=lambda each: each[0])
     labels = list(dict.fromkeys(label for _, of in known for label in of))
-    rows = [[label, *(of.get(label) for _, of in known)] for label in labels]
+    rows = [[label, *(f"{of[label]:.2f}" if label in of else None for _, of in known)] for label in labels]
     words = (
         "The share of the responses at or above the median of all: the more it differs between conditions, the better "
         f"a robot can be driven. {len(shares)} of {files} recordings were looked at so far."
@@ -188,6 +188,8 @@ def _inspected(inspection: Inspection | None) -> list[dict[str, Any]]:
     conditions = [[c.label, c.n_responses, c.n_non_burst, c.median_rate_hz] for c in inspection.conditions]
     findings = [[each.severity, each.message] for each in inspection.findings]
     return [
-        table("Responses", ["condition", "responses", "no bursts", "median (Hz)"], conditions[:200], width="third"),
+        table(
+            "Responses", ["condition", "responses", "without bursts", "median (Hz)"], conditions[:200], width="third"
+        ),
         table("Findings", ["severity", "what"], findings, "" if findings else "none", width="whole"),
     ]

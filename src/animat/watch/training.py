@@ -182,4 +182,7 @@ def _table(
         last = ended[-1] if ended else "none yet"
         rows.append([f"p{i}", f"{100 * shares[i]:.0f} %", last, assessed.get(f"p{i}", "none in the folder yet")])
     words = "; ".join(f"{name}: {100 * share:.0f} % {note}" for name, (share, note, _) in told.items())
-    return table("Policies", ["policy", "done", "last return", "best assessment"], rows, words, width="whole")
+    head = ["policy", "done", "last return", "best assessment"]
+    if not assessed:
+        head, rows = head[:3], [row[:3] for row in rows]
+    return table("Policies", head, rows, words, width="whole")

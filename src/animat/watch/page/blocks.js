@@ -69,13 +69,8 @@ export class BlocksPage {
   raster({ body, words, legend }, block) {
     legend.replaceChildren();
     words.textContent = minus(block.words);
-    const times = unpacked(block.spikes.times), channels = unpacked(block.spikes.channels);
     const frame = new Frame(body, [block.from_s, block.to_s], [-0.5, Math.max(0.5, block.n_channels - 0.5)], { top: 18, left: 52, xLabel: "recording's clock (s)" });
-    const width = frame.right - frame.left, high = Math.max(1, Math.min(2.5, (frame.bottom - frame.top) / Math.max(1, block.n_channels)));
-    frame.within((g) => {
-      g.fillStyle = colour("ink");
-      for (let i = 0; i < times.length; i += 1) g.fillRect(frame.left + (times[i] / 65535) * width - 0.5, frame.atY(channels[i]) - high / 2, 1.2, high);
-    });
+    frame.spikes(unpacked(block.spikes.times), unpacked(block.spikes.channels), block.n_channels);
     frame.g.fillStyle = colour("red");
     for (const pulse of block.pulses_s) frame.g.fillRect(frame.atX(pulse) - 1, 4, 2, 12);
   }

@@ -11,12 +11,18 @@ const KINDS = {
   tuning: { name: "tuning", page: BlocksPage },
   recording: { name: "recordings", page: BlocksPage, seeks: true },
 };
-const LIVE_MS = 150, SETTLED_MS = 1000, THINGS_MS = 3000;
+// From the start of a look to that of the next, and after a look at what does not change.
+const LIVE_MS = 200, SETTLED_MS = 1000, THINGS_MS = 3000;
 const $ = (id) => document.getElementById(id);
 
 let thing = null, about = null, page = null, view = null;
 let picked = false;
 let following = true, to = null, span = 8, asking = false, timer = 0, again = false;
+
+// What a study makes is part of it.
+function isPartOf(whole, each) {
+  return ["study", "tuning"].includes(whole?.kind) && each.kind !== whole.kind && (!whole.place || each.place.startsWith(`${whole.place}/`));
+}
 
 function ask(path, more = {}) {
   const words = new URLSearchParams({ ...(thing ? { kind: thing.kind, in: thing.place } : {}), ...more });
@@ -40,7 +46,7 @@ async function look() {
   if (asking) { again = true; return; }
   asking = true;
   again = false;
-  const of = thing;
+  const of = thing, began = performance.now();
   try {
     if (of) await lookAt(of);
     trouble("");
@@ -51,7 +57,7 @@ async function look() {
   clearTimeout(timer);
   const settled = !view || view.state !== "running" || !following;
   const busy = view && (view.summed < 1 || !(view.is_found ?? true));
-  timer = setTimeout(look, again || busy ? 20 : settled ? SETTLED_MS : LIVE_MS);
+  timer = setTimeout(look, again || busy ? 20 : settled ? SETTLED_MS : Math.max(20, LIVE_MS - (performance.now() - began)));
 }
 
 async function lookAt(of) {
@@ -100,13 +106,13 @@ async function things() {
       $("things").replaceChildren(...listed.map((each) => make("option", { value: key(each), textContent: `${KINDS[each.kind].name}${each.place ? `: ${each.place}` : ""}` })));
       $("things").things = listed;
       if (thing) $("things").value = key(thing);
-      // What came last is what goes on, unless somebody chose; what a study makes is part of it.
-      const isPart = (each) => ["study", "tuning"].includes(thing?.kind) && each.kind !== thing.kind;
-      const fresh = found.things.find((each) => !before.has(key(each)) && !isPart(each));
+      // What came last is what goes on, unless somebody chose.
+      const fresh = found.things.find((each) => !before.has(key(each)) && !isPartOf(thing, each));
       if (thing && fresh && !picked) choose(fresh);
     }
     $("choose").hidden = found.things.length < 2;
-    if (!thing && found.things.length) choose(found.things[0]);
+    const [newest] = found.things;
+    if (!thing && newest) choose(found.things.find((each) => isPartOf(each, newest)) ?? newest);
     if (!thing) $("main").replaceChildren(make("p", { className: "words", textContent: `${found.folder} holds nothing to watch yet: no session, training, study, tuning or recording. It is looked at again every few seconds.` }));
   } catch {
     // Said where it is looked at.

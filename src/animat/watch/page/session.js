@@ -22,7 +22,8 @@ export class SessionPage {
     this.ask = ask;
     this.picture = null;
     this.now = make("dl", { id: "now" });
-    this.robot = make("img", { alt: "the robot", hidden: true });
+    this.robot = make("canvas", { className: "robot", hidden: true });
+    this.robot.setAttribute("aria-label", "the robot");
     this.robotWords = make("p", { className: "words", textContent: "no picture yet" });
     main.append(make("section", { className: "third" }, make("h2", { textContent: "Robot" }), this.robot, this.robotWords, this.now));
     this.raster = card(main, "two-thirds", "Spikes by channel", "tall");
@@ -105,20 +106,28 @@ export class SessionPage {
     if (wanted === null || wanted === this.picture || this.loading) return;
     this.loading = true;
     this.picture = wanted;
-    this.robot.onload = () => { this.loading = false; this.robot.hidden = false; this.robotWords.textContent = ""; };
-    this.robot.onerror = () => { this.loading = false; this.robot.hidden = true; this.robotWords.textContent = "no picture of this tick"; };
-    this.robot.src = this.ask("robot.png", { at: wanted });
+    this.#loadRobot(wanted).then(
+      () => { this.robot.hidden = false; this.robotWords.textContent = ""; },
+      () => { this.robot.hidden = true; this.robotWords.textContent = "no picture of this tick"; },
+    ).finally(() => { this.loading = false; });
+  }
+
+  // Into one canvas: images that follow each other in an element stay in the browser's memory, as does an answer that is not read.
+  async #loadRobot(wanted) {
+    const answer = await fetch(this.ask("robot.png", { at: wanted }), { cache: "no-store" });
+    const content = await answer.blob();
+    if (!answer.ok) throw new Error(`status ${answer.status}`);
+    const image = await createImageBitmap(content);
+    this.robot.width = image.width;
+    this.robot.height = image.height;
+    this.robot.getContext("2d").drawImage(image, 0, 0);
+    image.close();
   }
 
   #drawRaster(view) {
     const n = this.about.channels.x_um.length;
     const frame = new Frame(this.raster.canvas, this.span, [-0.5, Math.max(n - 0.5, 0.5)], { top: 18, left: LEFT, xLabel: "session's clock (s)" });
-    const times = unpacked(view.spikes.times), channels = unpacked(view.spikes.channels);
-    const width = frame.right - frame.left, high = Math.max(1, Math.min(2.5, (frame.bottom - frame.top) / Math.max(n, 1)));
-    frame.within((g) => {
-      g.fillStyle = colour("ink");
-      for (let i = 0; i < times.length; i += 1) g.fillRect(frame.left + (times[i] / 65535) * width - 0.5, frame.atY(channels[i]) - high / 2, 1.2, high);
-    });
+    frame.spikes(unpacked(view.spikes.times), unpacked(view.spikes.channels), n);
     const { ticks } = view;
     ticks.pulse_time_s.forEach((pulses, i) => {
       for (const pulse of pulses) {
