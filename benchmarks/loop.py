@@ -149,7 +149,7 @@ def policy() -> Policy:
 
 def loop_of(iterations: int, **settings: Any) -> Loop:
     """A loop whose robot never falls: an episode lasts as long as is measured."""
-    robot = Cartpole(track_length_m=1e8, angle_limit_rad=1e8, force_n=0.0, episode_limit=iterations)
+    robot = Cartpole(angle_limit_rad=1e8, force_n=0.0, episode_limit=iterations)
     percentiles = np.linspace(0, 40, 11)
     settings = {"pause_s": PAUSE_S, "warm_up": 0, **settings}
     return Loop(robot, mapping_named("9-thresholds"), CONDITIONS, percentiles, **settings)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -260,6 +262,28 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
         session = run_session(culture, loop, [RANDOM], tmp_path, episodes=2, clock=Ticking())
     assert len(session.ticks) == 12
     assert 0 < max(tick.decided_s for tick in session.ticks) < 0.002
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_RR"), reason="the system has no real-time scheduling")
+@pytest.mark.parametrize("real_time", [True, False])
+def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_path: Path, real_time: bool) -> None:
+    seen: set[int] = set()
+
+    class Noting(AnyCondition):
+        def act(self, observation: Any, rng: np.random.Generator) -> int:
+            seen.add(os.sched_getscheduler(0))
+            return super().act(observation, rng)
+
+    def may() -> bool:
+        with ThreadPoolExecutor(1) as thread:
+            asked = thread.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(1))
+            return asked.exception() is None
+
+    before = os.sched_getscheduler(0)
+    with FakeCulture() as culture:
+        run_session(culture, loop_of(real_time=real_time), [Agent("noting", "", Noting(5))], tmp_path, episodes=1)
+    assert seen == {os.SCHED_RR if real_time and may() else before}
+    assert os.sched_getscheduler(0) == before
 
 
 def test_agents_take_turns_in_random_order() -> None:

@@ -27,7 +27,7 @@ from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, expect_no_session
 from animat.closed_loop.tick import Ending
-from animat.closed_loop.timing import Clock, WallClock
+from animat.closed_loop.timing import Clock, WallClock, ahead_of_other_programs
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
@@ -146,7 +146,10 @@ class _Supervisor:
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
-        with told_instead(self._stop_for_a_person), _without_collector(), _switching_every(_SWITCH_S):
+        # What computes as fast as it can would leave nothing to the others.
+        has_deadlines = self._loop.real_time or self._culture.device is not None
+        ahead = ahead_of_other_programs() if has_deadlines else contextlib.nullcontext()
+        with told_instead(self._stop_for_a_person), _without_collector(), _switching_every(_SWITCH_S), ahead:
             thread.start()
             try:
                 ending = self._watch(thread)
