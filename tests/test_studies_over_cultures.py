@@ -17,10 +17,11 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import bootstrap
+from scipy.stats import bootstrap, mannwhitneyu
 
 from animat.cli import main
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, UnusableData
+from animat.evaluation.statistics import compare
 from animat.studies import cultures
 from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
 from animat.studies.places import results_file
@@ -28,7 +29,7 @@ from animat.studies.results import ComparedReturns, Results, Score, write_typed
 from animat.studies.run import Ran, run_study
 from animat.studies.source import Source, read_seeds
 from animat.studies.specification import Study
-from animat.studies.tabulating import NONE, SECOND
+from animat.studies.tabulating import NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 
 TINY = Path(__file__).parent / "tiny_study.toml"
@@ -100,9 +101,26 @@ def test_over_cultures_each_counts_the_same() -> None:
     found = over_cultures([[compared(0, 10, SECOND)], [compared(5, 6, NONE)], [compared(1, 2, SECOND)]])
     (row,) = found
     assert (row.cultures, row.mean_first, row.mean_second, row.difference, row.holds_in) == (3, 2, 6, 4, 2)
+    assert (row.larger_in, row.tested, row.found_better) == (3, 3, "2 of 3")
     assert row.low_95 is not None and 1 <= row.low_95 < 4 < (row.high_95 or 0) <= 10
     (alone,) = over_cultures([[compared(0, 10, SECOND)]])
     assert (alone.low_95, alone.high_95) == (None, None)
+
+
+@given(st.lists(st.tuples(st.integers(-9, 9), st.integers(-9, 9), st.booleans()), min_size=1, max_size=20))
+def test_with_too_few_policies_larger_means_are_still_counted(found: list[tuple[int, int, bool]]) -> None:
+    rows = [[compared(first, second, TOO_FEW if is_few else NONE)] for first, second, is_few in found]
+    (row,) = over_cultures(rows)
+    assert row.larger_in == np.sum(np.less(*np.array(found).T[:2]))
+    enough = [is_few for *_, is_few in found].count(False)
+    assert (row.tested, row.found_better) == (enough, f"0 of {enough}" if enough else "too few policies")
+
+
+@pytest.mark.parametrize("n", range(1, 12))
+def test_too_few_are_those_who_could_not_be_found_better_at_best(n: int) -> None:
+    best = mannwhitneyu(np.arange(n), np.arange(n) + n, method="asymptotic").pvalue
+    told = outcome_of(compare(np.arange(n), np.arange(n) + n))
+    assert told == (SECOND if best < 0.01 else TOO_FEW)
 
 
 def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,9 +118,11 @@ def _run_many(study: Study, base: Path, out: Path, workers: int | None, executor
     for row in found.summary:
         interval = "" if row.low_95 is None else f"{row.low_95:+.1f} to {row.high_95:+.1f}"
         means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}", f"{row.difference:+.1f}"
-        cells.append([f"{row.robot}, {row.comparison}", *means, interval, f"{row.holds_in} of {row.cultures}"])
+        counts = f"{row.larger_in} of {row.cultures}", row.found_better
+        cells.append([f"{row.robot}, {row.comparison}", *means, interval, *counts])
     if cells:
-        print("\n".join(lined_up(["", "first", "second", "difference", "95 % interval", "second better in"], cells)))
+        head = ["", "first", "second", "difference", "95 % interval", "second larger in", "found better in"]
+        print("\n".join(lined_up(head, cells)))
     jobs = sum(len(each.done_now) for each in found.ran.values())
     print(f"{len(found.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
     if found.parquet is None:

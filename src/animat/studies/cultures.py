@@ -26,7 +26,7 @@ from animat.studies.results import ComparedReturns, Results, Score, read_typed, 
 from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
-from animat.studies.tabulating import SECOND
+from animat.studies.tabulating import SECOND, TOO_FEW
 
 RESAMPLES = 10_000
 MOST_AT_ONCE = 64
@@ -44,7 +44,9 @@ class OverCultures:
         difference: mean of the cultures' differences, second less first.
         low_95, high_95: of its percentile bootstrap over cultures; None of fewer than two. Of few cultures it is too
             narrow.
+        larger_in: cultures in which the second arm's mean return is the larger one.
         holds_in: cultures in which the second arm was found to be better.
+        tested: cultures with enough policies that a difference could be found.
     """
 
     comparison: str
@@ -55,7 +57,14 @@ class OverCultures:
     difference: float
     low_95: float | None
     high_95: float | None
+    larger_in: int
     holds_in: int
+    tested: int
+
+    @property
+    def found_better(self) -> str:
+        """In how many cultures the second arm was found to be better, in words."""
+        return f"{self.holds_in} of {self.tested}" if self.tested else "too few policies"
 
 
 @dataclass(frozen=True)
@@ -260,7 +269,9 @@ def _over(rows: tuple[ComparedReturns, ...]) -> OverCultures:
         difference=float((second - first).mean()),
         low_95=low,
         high_95=high,
+        larger_in=int((second > first).sum()),
         holds_in=sum(row.outcome == SECOND for row in rows),
+        tested=sum(row.outcome != TOO_FEW for row in rows),
     )
 
 

@@ -35,12 +35,9 @@ def _drawn(found: RanCultures, i: int, row: OverCultures) -> Compared:
 
 
 def _in_short(study: Study, found: RanCultures) -> Section:
-    n = len(found.ran)
-    points = tuple(
-        (f"{row.robot}, {row.comparison}", f"the second arm was better in {row.holds_in} of {n} cultures.")
-        for row in found.summary
-    )
-    head = ("comparison", "robot", "mean first", "mean second", "difference", "95 % interval", "better in")
+    points = tuple((f"{row.robot}, {row.comparison}", _told(row)) for row in found.summary)
+    means = "mean first", "mean second", "difference", "95 % interval"
+    head = ("comparison", "robot", *means, "larger in", "found better in")
     rows = tuple(
         (
             row.comparison,
@@ -49,7 +46,8 @@ def _in_short(study: Study, found: RanCultures) -> Section:
             row.mean_second,
             row.difference,
             "–" if row.low_95 is None else f"{row.low_95:.1f} to {row.high_95:.1f}".replace("-", "−"),
-            f"{row.holds_in} of {row.cultures}",
+            f"{row.larger_in} of {row.cultures}",
+            row.found_better,
         )
         for row in found.summary
     )
@@ -69,8 +67,18 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         f"{len(found.comparisons)} cultures.",
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
-    said = f"The second arm counts as better in a culture at p < {LEVEL:g}, as in its own report."
+    said = (
+        f"The second arm is found to be better in a culture at p < {LEVEL:g}, as in its own report. Where that cannot "
+        "be reached with so few policies, it only counts in how many cultures its mean return is the larger one."
+    )
     return Section("Results in short", (said,), points, (table,), (picture,))
+
+
+def _told(row: OverCultures) -> str:
+    larger = f"the second arm's mean return is larger in {row.larger_in} of {row.cultures} cultures"
+    if not row.tested:
+        return f"{larger}; with so few policies no test finds a difference in one culture."
+    return f"{larger}; it is found to be better in {row.found_better}."
 
 
 def _each(found: RanCultures) -> Section:
