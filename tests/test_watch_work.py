@@ -170,7 +170,7 @@ def test_recordings_are_inspected_one_after_the_other(tmp_path: Path) -> None:
     inspected = [inspect_recording(read_recording(file)) for file in files]
     rows = block(found, "P(x >= P50) of each condition")["rows"]
     assert rows == [
-        [first.label, first.share_above_median, second.share_above_median]
+        [first.label, f"{first.share_above_median:.2f}", f"{second.share_above_median:.2f}"]
         for first, second in zip(*(each.conditions for each in inspected), strict=True)
     ]
     raster = block(found, "Spikes by channel")
