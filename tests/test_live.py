@@ -14,9 +14,11 @@ import pytest
 from animat.cli import main
 from animat.closed_loop.session import recover_session
 from animat.coding.mapping import Thresholds
+from animat.cultures import under_way
 from animat.cultures.budget import Account, Budget
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
+from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import (
     AnimatError,
@@ -27,6 +29,7 @@ from animat.errors import (
     UnsafeStimulus,
     UnusableData,
 )
+from animat.live import shadowing
 from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
@@ -42,6 +45,7 @@ from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.training.policy import load_policies
 from animat.training.settings import SAC
 from animat.training.specification import Training
+from animat.watch.recording import RecordingView
 from cultures import small_culture
 from fake_culture import FakeCulture
 
@@ -76,6 +80,32 @@ def test_the_culture_is_recorded_every_interval(ran: tuple[LiveRun, Path, int]) 
     orders = [recording.stimuli.frequency_hz.tolist() for recording in recordings]
     assert orders[0] != orders[1] != orders[2]
     assert found.culture_min == pytest.approx(30.0)
+
+
+def test_recordings_are_watched_as_they_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, seen = tmp_path / "live" / "recordings", []
+
+    class Watched(UnderWay):
+        def __call__(self, so_far: Any) -> None:
+            super().__call__(so_far)
+            found = RecordingView(folder).view(None, 8.0)
+            facts = dict(found["blocks"][0]["rows"])
+            seen.append((found["state"], facts["whole ones"], facts["shown"], found["end_s"]))
+
+    monkeypatch.setattr(under_way, "EVERY_S", 0.0)
+    monkeypatch.setattr(shadowing, "UnderWay", Watched)
+    protocol = replace(PROTOCOL, order="blocked")
+    with FakeCulture() as culture:
+        found = live(ONE, culture, protocol, tmp_path / "live", timetable=QUICK, episodes=1)
+    assert {state for state, *_ in seen} == {"running"}
+    assert {shown for *_, shown, _ in seen} == {"the one under way, as far as it is"}
+    for number, file in enumerate(found.recordings):
+        until_s = [end_s for _, whole, _, end_s in seen if whole == number]
+        assert len(until_s) > 1 and until_s == sorted(set(until_s))
+        assert until_s[-1] <= read_recordings([file])[0].duration_s + 1e-9
+    after = RecordingView(folder).view(None, 8.0)
+    assert (after["state"], dict(after["blocks"][0]["rows"])["whole ones"]) == ("ended", 3)
+    assert not (folder / under_way.UNDER_WAY).exists()
 
 
 def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(ran: tuple[LiveRun, Path, int]) -> None:

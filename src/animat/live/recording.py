@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
@@ -13,11 +14,20 @@ from animat.stimulation.protocol import Protocol
 
 
 def record_within(
-    account: Account, culture: Culture, protocol: Protocol, seed: int, progress: Progress | None = None
+    account: Account,
+    culture: Culture,
+    protocol: Protocol,
+    seed: int,
+    progress: Progress | None = None,
+    follow: Callable[[Callable[[], Recording]], None] | None = None,
 ) -> Recording:
     """Record by a protocol if the budget holds all of it.
 
     Of a recording that fails half way, what it handed to the culture until then is spent, and nothing that others did.
+
+    Args:
+        account: of the budget.
+        culture, protocol, seed, progress, follow: as of `Culture.record`.
 
     Raises:
         BudgetSpent: if it does not; nothing is delivered then.
@@ -28,7 +38,7 @@ def record_within(
     account.check([stimulus for stimuli in by_block for stimulus in stimuli])
     blocks = _Blocks(progress or Silent())
     try:
-        return culture.record(protocol, seed, blocks)
+        return culture.record(protocol, seed, blocks, follow)
     except BaseException as error:
         # Of the block under way only an error of the culture tells that it was refused; not if some of it was over.
         if not blocks.is_within_one:

@@ -19,6 +19,7 @@ import jax
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.series import STATE_FILE
+from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.exchange import Exchange
@@ -267,9 +268,12 @@ class _Run:
         began_s = time.monotonic()
         # Other cultures and other recordings have other orders.
         seed = self._training.seed * 10_000 + number
-        recording = record_within(self.account, self._culture, self._protocol, seed, progress)
-        file = self.folder / RECORDINGS / recording_name(round(recording.start_min, 3))
-        write_nwb(recording, file)
+        folder = self.folder / RECORDINGS
+        # Held as by `animat record`: whoever looks knows that it goes on.
+        with exclusive_lock(folder), UnderWay(folder) as follow:
+            recording = record_within(self.account, self._culture, self._protocol, seed, progress, follow)
+            file = folder / recording_name(round(recording.start_min, 3))
+            write_nwb(recording, file)
         self.files.append(file)
         self.keep_state()
         try:

@@ -166,7 +166,7 @@ def _rates(recording: Recording) -> dict[str, Any]:
     line = curve("", np.arange(1, len(rates_hz) + 1).tolist(), rates_hz.tolist(), "line", "blue")
     median = float(np.median(rates_hz)) if len(rates_hz) else 0.0
     words = f"Spikes a second, the most active channel first; median {median:.2f} Hz, {int((counts == 0).sum())} silent"
-    return chart("Rates of channels", "channels, by rate", "Hz", [line], words)
+    return chart("Rates of channels", "channels, by rate", "Hz", [line], words, width="half")
 
 
 def _shares(shares: dict[Path, tuple[float, dict[str, float]]], files: int) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _shares(shares: dict[Path, tuple[float, dict[str, float]]], files: int) -> d
         f"a robot can be driven. {len(shares)} of {files} recordings were looked at so far."
     )
     head = ["condition", *(f"{minute:g} min" for minute, _ in known)]
-    return table("P(x >= P50) of each condition", head, rows, words, width="two-thirds")
+    return table("P(x >= P50) of each condition", head, rows, words)
 
 
 def _inspected(inspection: Inspection | None) -> list[dict[str, Any]]:
@@ -188,8 +188,6 @@ def _inspected(inspection: Inspection | None) -> list[dict[str, Any]]:
     conditions = [[c.label, c.n_responses, c.n_non_burst, c.median_rate_hz] for c in inspection.conditions]
     findings = [[each.severity, each.message] for each in inspection.findings]
     return [
-        table(
-            "Responses", ["condition", "responses", "without bursts", "median (Hz)"], conditions[:200], width="third"
-        ),
-        table("Findings", ["severity", "what"], findings, "" if findings else "none", width="whole"),
+        table("Responses", ["condition", "responses", "without bursts", "median (Hz)"], conditions[:200]),
+        table("Findings", ["severity", "what"], findings, "" if findings else "none"),
     ]
