@@ -28,7 +28,7 @@ from watching import OWN, PORT, TOKEN, asked, session_in
 pytest.importorskip("starlette", reason="the extra [watch] is not installed")
 pytest.importorskip("uvicorn", reason="the extra [watch] is not installed")
 
-from animat.watch.app import _VIEWS, app_for
+from animat.watch.app import app_for
 from animat.watch.session import SessionView
 
 
@@ -202,27 +202,6 @@ def assert_no_more_pulses(folder: Path, ended: list[Session]) -> None:
     assert ended[0].ending.by == "person"
     # The tick that was under way, and the one that was being written.
     assert ended[0].outline.ticks <= before + 2
-
-
-def test_beside_a_loop_that_runs_the_page_gives_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not hasattr(os, "SCHED_IDLE"):
-        pytest.skip("this system has no such scheduling")
-    seen: list[int] = []
-
-    class Noting(SessionView):
-        def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-            seen.append(os.sched_getscheduler(0))
-            return {"state": states[len(seen) - 1]}
-
-    monkeypatch.setitem(_VIEWS, "session", Noting)
-    states = ["running", "running", "ended", "ended"]
-    session_in(tmp_path, episodes=1)
-    app = app_for(tmp_path, TOKEN, PORT)
-    for state in states:
-        assert asked(app, "view", kind="session", **{"in": ""}).json == {"state": state}
-    # After the first look it is known that a loop runs, after the third that it does not.
-    assert seen == [os.SCHED_OTHER, os.SCHED_IDLE, os.SCHED_IDLE, os.SCHED_OTHER]
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 @contextlib.contextmanager

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.found import Kind, find, place_within
-from animat.watch.giving_way import Answering
 from animat.watch.guard import App, Guard
 from animat.watch.picture import picture_of
 from animat.watch.plain import text
@@ -66,8 +65,6 @@ class Watched:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.is_beside_a_loop = False
-        """Whether what was looked at last is a closed loop that runs."""
         self._views: OrderedDict[tuple[str, str], View] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -89,9 +86,7 @@ class Watched:
     def view(self, kind: str, place: str, to_s: float | None, span_s: float) -> dict[str, Any]:
         """How it is."""
         with self._lock:
-            found = self._view(kind, place).view(to_s, span_s)
-        self.is_beside_a_loop = kind == "session" and found.get("state") == "running"
-        return found
+            return self._view(kind, place).view(to_s, span_s)
 
     def picture(self, place: str, at: int) -> bytes | None:
         """The robot of a session at a record, as PNG."""
@@ -124,11 +119,12 @@ class Watched:
 def app_for(folder: Path, token: str, port: int) -> App:
     """The page of a folder as an ASGI application, guarded."""
     from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
     from starlette.requests import Request
     from starlette.responses import Response
     from starlette.routing import Route
 
-    watched, answers = Watched(folder), Answering()
+    watched = Watched(folder)
     pages = {address: (_file(name), kind) for address, (name, kind) in _FILES.items()}
 
     async def file(request: Request) -> Response:
@@ -138,8 +134,7 @@ def app_for(folder: Path, token: str, port: int) -> App:
     def answering(answer: Callable[[Any], Any]) -> Callable[[Request], Any]:
         @functools.wraps(answer)
         async def endpoint(request: Request) -> Response:
-            made = functools.partial(_answered, answer, request.query_params)
-            status, kind, body = await answers.run(made, beside_a_loop=watched.is_beside_a_loop)
+            status, kind, body = await run_in_threadpool(_answered, answer, request.query_params)
             return Response(body, status, media_type=kind)
 
         return endpoint
