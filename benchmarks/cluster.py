@@ -1,4 +1,4 @@
-"""What a cluster costs on one machine, and how work grows with policies.
+"""What a cluster costs on one machine, and how work grows with policies and cultures.
 
     python benchmarks/cluster.py [--parts study tasks sizes growth] [--rounds 3] [--json results.json]
 
@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from animat.execution.receipts import Receipt, receipt_path
 from animat.execution.task import Done, Task, carry_out_alone
 from animat.execution.training import train
 from animat.progress import Silent
+from animat.studies.cultures import run_over_cultures
 from animat.studies.places import RECEIPTS
 from animat.studies.plan import plan_study
 from animat.studies.run import run_study
@@ -81,9 +82,9 @@ def study(scheduler: Path, rounds: int) -> dict[str, Any]:
 
 
 def tasks(scheduler: Path, rounds: int) -> dict[str, Any]:
-    """A thousand tasks of 0.1 s and of nothing, each with its receipt, beside what they rest."""
+    """A thousand tasks of a second, of 0.1 s and of nothing, each with its receipt, beside what they rest."""
     told = {}
-    for seconds in (0.1, 0.0):
+    for seconds in (1.0, 0.1, 0.0):
 
         def work(folder: Path, cluster: Any, seconds: float = seconds) -> None:
             jobs = [Job(f"rest/{i}", Rest(i, seconds), cost_s=max(seconds, 0.001)) for i in range(1000)]
@@ -121,18 +122,28 @@ def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
 
 
 def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
-    """Seconds to train 10 and 100 policies, 50,000 iterations each, on pinned processes, in turns."""
+    """Seconds for 10, 100 and 1,000 policies of 10,000 iterations, and for the tiny study on 1, 10 and 100 cultures.
+
+    On pinned processes, once each, after one of each kind that fills the cache of compiled programs.
+    """
     from training import timeline, training
 
-    took_s: dict[int, list[float]] = {10: [], 100: []}
-    for turn in range(-1, rounds):
-        for policies, seconds in took_s.items():
-            if turn < 0 and policies > 10:
-                continue
-            what = training(policies, 50_000)
-            each = timed(lambda folder, _, what=what: train(what, timeline(), folder, workers=WORKERS), None)
-            seconds += [each] if turn >= 0 else []
-    return {f"{policies} policies": seconds for policies, seconds in took_s.items()}
+    def policies(many: int) -> float:
+        what = training(many, 10_000)
+        return timed(lambda folder, _: train(what, timeline(), folder, workers=WORKERS), None)
+
+    def cultures(many: int) -> float:
+        study = read_study(STUDY)
+        study = replace(study, culture=replace(study.culture, seeds=f"1-{many}"))
+        return timed(lambda folder, _: run_over_cultures(study, folder, workers=WORKERS), None)
+
+    told = {}
+    for name, work, most in (("policies", policies, 1000), ("cultures", cultures, 100)):
+        work(2)
+        for many in (most // 100, most // 10, most):
+            told[f"{many} {name}"] = work(many)
+            print(f"{many} {name}: {told[f'{many} {name}']:.1f} s", flush=True)
+    return told
 
 
 PARTS = {"study": study, "tasks": tasks, "sizes": sizes, "growth": growth}

@@ -1,4 +1,4 @@
-"""On a Dask cluster, SIGKILL at random moments: of workers, schedulers and clients; always the same bits in the end."""
+"""On a Dask cluster of four workers, SIGKILL of workers, schedulers and clients: always the same bits in the end."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_whoever_is_killed_when_a_study_is_the_same_bits(moments: dict[str, int]
     on = ("--cluster", str(file), *(() if shared else ("--no-shared-folder",)))
     folders = [tmp_path / "study-0"]
     with ExitStack() as running:
-        scheduler, _ = running.enter_context(local_cluster(2, file))
+        scheduler, _ = running.enter_context(local_cluster(4, file))
         process = started(folders[-1], *on)
         for of in kills:
             time.sleep(rng.uniform(5, 30))
@@ -79,7 +79,7 @@ def test_whoever_is_killed_when_a_study_is_the_same_bits(moments: dict[str, int]
                     folders.append(tmp_path / f"study-{len(folders)}")
                 if of == "scheduler":
                     running.close()
-                    scheduler, _ = running.enter_context(local_cluster(2, file))
+                    scheduler, _ = running.enter_context(local_cluster(4, file))
                 process = started(folders[-1], *on)
         said, _ = process.communicate()
     assert process.returncode == 0, said

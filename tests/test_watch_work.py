@@ -152,7 +152,7 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     (tmp_path / "journal.jsonl").write_text("".join(json.dumps(each) + "\n" for each in told))
     found = TuningView(tmp_path).view(None, 8.0)
     rows = facts(found, "Trials")
-    assert rows["trials told"] == "3 of 5"
+    assert rows["trials done"] == "3 of 5"
     assert [rows[name] for name in ("complete", "stopped early", "diverged")] == [1, 1, 1]
     # One that came further counts before one that did well at the first rung.
     assert rows["best so far"] == "trial 0, 4.0"

@@ -150,9 +150,7 @@ def running_jobs(folder: Path, done: dict[str, int]) -> dict[str, tuple[float, s
 def running_table(told: dict[str, tuple[float, str, float]], width: Width = "two-thirds") -> dict[str, Any]:
     """What runs."""
     rows = [[name, f"{100 * share:.0f} %", note] for name, (share, note, _) in told.items()]
-    return table(
-        "Running", ["job", "done", "what it says"], rows, "" if rows else "nothing runs now", width="two-thirds"
-    )
+    return table("Running", ["job", "done", "what it says"], rows, "" if rows else "nothing runs now", width=width)
 
 
 def results_table(folder: Path) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class TuningView:
         states = [trial["state"] for trial in trials]
         best = max((t for t in trials if t["last"] is not None), key=lambda t: (t["rungs"], t["last"]), default=None)
         rows: list[tuple[str, Any]] = [
-            ("trials told", f"{len(trials):,} of {planned:,}"),
+            ("trials done", f"{len(trials):,} of {planned:,}"),
             ("complete", states.count("complete")),
             ("stopped early", states.count("stopped")),
             ("diverged", states.count("diverged")),
@@ -119,8 +119,10 @@ def _chart(trials: list[dict[str, Any]]) -> dict[str, Any]:
         of = [trial for trial in known if trial["state"] == state]
         if of:
             series.append(curve(state, [t["trial"] for t in of], [t["last"] for t in of], "dots", colour))
-    words = "A dot a trial, at the mean return after its last rung; those that were stopped were trained for less."
-    return chart("Trials", "trial", "mean return", series, words if series else "No trial is told yet.")
+    words = (
+        "One dot for each trial: its mean return after its last rung. Trials that were stopped were trained for less."
+    )
+    return chart("Trials", "trial", "mean return", series, words if series else "No trial has ended yet.")
 
 
 def _table(trials: list[dict[str, Any]]) -> dict[str, Any]:
