@@ -107,7 +107,9 @@ def page_of(folder: Path, command: str) -> Iterator[webdriver.Chrome]:
 
 
 def memory(driver: webdriver.Chrome) -> dict[str, float]:
-    """Of the page's scripts after collection is due, and of the process that draws it, in MB."""
+    """After a collection of garbage: of the page's scripts, and of the process that draws it, in MB; and its nodes."""
+    driver.execute_cdp_cmd("HeapProfiler.collectGarbage", {})
+    nodes = driver.execute_cdp_cmd("Memory.getDOMCounters", {})["nodes"]
     heap = driver.execute_script("return performance.memory.usedJSHeapSize")
     drawing = 0
     for each in Path("/proc").glob("[0-9]*"):
@@ -117,7 +119,7 @@ def memory(driver: webdriver.Chrome) -> dict[str, float]:
                 drawing = max(drawing, *map(int, kb))
         except (OSError, TypeError):
             continue
-    return {"scripts_mb": heap / 1e6, "drawing_mb": drawing / 1e3}
+    return {"scripts_mb": heap / 1e6, "drawing_mb": drawing / 1e3, "nodes": nodes}
 
 
 def watched(minutes: float, command: str | None) -> dict[str, Any]:
@@ -182,7 +184,8 @@ def main() -> None:
         print(f"{options.minutes:g} min, from a pulse to the page (s): {words}; {found['n_shown']:,} pulses")
         print(f"  {found['over_half_a_second']} after more than 0.5 s; {found['missed']} of {found['of']:,} missed")
         for minute, each in enumerate(found["memory"], 1):
-            print(f"  {minute:3} min: scripts {each['scripts_mb']:.1f} MB, drawing {each['drawing_mb']:.0f} MB")
+            memory_mb = f"scripts {each['scripts_mb']:.1f} MB, drawing {each['drawing_mb']:.0f} MB"
+            print(f"  {minute:3} min: {memory_mb}, {each['nodes']:.0f} nodes")
     if options.json:
         options.json.write_text(json.dumps(measured, indent=1) + "\n")
 

@@ -183,5 +183,5 @@ def _own_cores(threads: int) -> list[int]:
         own.append(core)
         if len(own) == threads:
             return own
-    print(f"animat: {threads} threads, but {len(own)} cores that no other worker has; they share", file=sys.stderr)
+    print(f"animat: this worker shares cores with others: {threads} needed, {len(own)} free", file=sys.stderr)
     return own + [allowed[i % len(allowed)] for i in range(threads - len(own))]
