@@ -13,6 +13,7 @@ import pytest
 from animat.cli import COMMANDS, main
 from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.log import LogWriter, read_log
+from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
 from animat.tuning.folder import MANIFEST as TUNING
@@ -180,7 +181,13 @@ def test_an_empty_folder_says_so_and_is_looked_at_again(tmp_path: Path) -> None:
 
 
 def test_folders_are_known_by_the_files_that_are_written() -> None:
-    assert dict(_MARKS) == {"session": LOG_FILE, "training": TRAINING, "tuning": TUNING, "study": STUDY}
+    assert dict(_MARKS) == {
+        "session": LOG_FILE,
+        "training": TRAINING,
+        "tuning": TUNING,
+        "study": STUDY,
+        "cultures": CULTURES,
+    }
 
 
 def test_each_command_that_takes_watch_has_its_folder_served(

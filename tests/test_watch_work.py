@@ -19,6 +19,7 @@ from animat.responses.inspection import inspect_recording
 from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
+from animat.watch.cultures import CulturesView
 from animat.watch.held import is_held
 from animat.watch.recording import RecordingView
 from animat.watch.speed import Speed
@@ -119,6 +120,34 @@ def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
     assert block(found, "Running")["rows"] == [[jobs[2], "25 %", "a remark"]]
     assert sorted(block(found, "Done")["rows"]) == sorted([job, 2] for job in jobs[:2])
     assert [job for (job,) in block(found, "Waiting")["rows"]] == jobs[3:]
+
+
+def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_path: Path) -> None:
+    names = [f"culture-{seed}" for seed in range(1, 6)]
+    (tmp_path / "cultures.json").write_text(json.dumps({"cultures": [*names, "../elsewhere", 3]}))
+    for name, means in zip(names[:3], ((1.0, 4.0), (2.0, 3.0), (6.0, 5.0)), strict=True):
+        (tmp_path / name / "tables").mkdir(parents=True)
+        table = ["comparison,robot,mean_first,mean_second", f"a and b,arm,{means[0]},{means[1]}"]
+        (tmp_path / name / "tables" / "comparisons.csv").write_text("\n".join(table))
+        Receipt("report", "x", {}, {"a": "b"}).save(tmp_path / name / "jobs")
+    for name in names[3:]:
+        (tmp_path / name / "jobs").mkdir(parents=True)
+        (tmp_path / name / "study.toml").write_text(TINY.read_text())
+    planned = plan_study(read_study(TINY), tmp_path)
+    Receipt(planned[0].name, "x", {}, {"a": "b"}).save(tmp_path / names[3] / "jobs")
+    view = CulturesView(tmp_path)
+    assert view.about()["title"] == "study over 5 cultures"
+    with exclusive_lock(tmp_path / names[3]):
+        found = view.view(None, 8.0)
+    rows = facts(found, "Cultures")
+    assert (rows["cultures done"], rows["running"], rows["begun, not running"]) == ("3 of 5", 1, 1)
+    share = planned[0].cost_s / sum(job.cost_s for job in planned)
+    assert block(found, "Running")["rows"] == [[names[3], f"{100 * share:.0f} %"]]
+    assert block(found, "Comparisons")["rows"] == [["a and b", "arm", 3.0, 4.0, "2 of 3"]]
+    assert view.view(None, 8.0)["state"] == "silent"
+    (tmp_path / "cultures.json").write_text("[]")
+    with pytest.raises(InvalidFile, match="expected the names of cultures"):
+        view.view(None, 8.0)
 
 
 def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -> None:

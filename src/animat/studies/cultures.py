@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,11 +28,14 @@ from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND, TOO_FEW
+from animat.writing import atomic_write
 
 RESAMPLES = 10_000
 MOST_AT_ONCE = 64
 """Cultures: each has a thread here, which looks after its jobs."""
 COMPARISONS, SUMMARY, SCORES = "comparisons.csv", "over-cultures.csv", "scores.csv"
+MANIFEST = "cultures.json"
+"""Names the folders of the cultures."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +139,8 @@ def run_over_cultures(
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
+    with atomic_write(folder / MANIFEST) as unfinished:
+        unfinished.write_text(json.dumps({"cultures": list(studies)}, indent=1) + "\n")
     with _room(workers, executor) as (room, at_once):
         here = workers if room is None else None
         runs = {

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from animat.errors import AnimatError, InvalidArgument, first_line
+from animat.watch.cultures import CulturesView
 from animat.watch.found import Kind, find, place_within
 from animat.watch.guard import App, Guard
 from animat.watch.picture import picture_of
@@ -51,6 +52,7 @@ _VIEWS: dict[Kind, Callable[[Path], View]] = {
     "session": SessionView,
     "training": TrainingView,
     "study": StudyView,
+    "cultures": CulturesView,
     "tuning": TuningView,
     "recording": RecordingView,
 }

@@ -12,13 +12,14 @@ from animat.closed_loop.gathering import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
 
-Kind = Literal["session", "training", "study", "tuning", "recording"]
+Kind = Literal["session", "training", "study", "cultures", "tuning", "recording"]
 
 _MARKS: tuple[tuple[Kind, str], ...] = (
     ("session", LOG_FILE),
     ("training", "training.json"),
     ("tuning", "tune.json"),
     ("study", "study.json"),
+    ("cultures", "cultures.json"),
 )
 """By which file each is known; the modules that write them import JAX, which a page has no need of."""
 _DEPTH, _MOST_FOLDERS, _MOST_FOUND = 4, 2000, 200
@@ -46,7 +47,9 @@ def find(folder: Path) -> list[Found]:
     A folder that is not there yet holds nothing.
     """
     found = [each for place in _folders(folder) for each in _in_folder(folder, place)]
-    return sorted(found, key=lambda each: (-each.changed_s, each.place))[:_MOST_FOUND]
+    found.sort(key=lambda each: (-each.changed_s, each.place))
+    # What all the others are part of is among them, however many came after it.
+    return found[:_MOST_FOUND] + [each for each in found[_MOST_FOUND:] if not each.place]
 
 
 def place_within(folder: Path, place: str) -> Path:

@@ -47,15 +47,12 @@ class StudyView:
         planned = self._plan(done)
         names = set(done)
         left = [] if planned is None else [(name, cost) for name, cost in planned if name not in names]
-        costs = dict(planned or ())
-        worked = sum(costs.get(name, 0.0) for name in done)
-        worked += sum(share * costs.get(name, 0.0) for name, (share, *_) in told.items())
+        worked, total = _work(planned or [], done, told)
         self._speed.see(worked)
         is_done = planned is not None and not left
         changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / _UNFINISHED).glob("*/*.json")])
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
-        total = sum(costs.values())
         waiting = [name for name, _ in left if name not in told]
         rows: list[tuple[str, Any]] = [
             ("jobs done", len(done)),
@@ -77,6 +74,12 @@ class StudyView:
             ],
         }
 
+    def share(self) -> float | None:
+        """How much of the work is done, by what jobs cost; None where that is not known."""
+        done = done_jobs(self.folder)
+        worked, total = _work(self._plan(done) or [], done, running_jobs(self.folder, done))
+        return worked / total if total else None
+
     def _manifest(self) -> dict[str, Any]:
         found = json_of(self.folder / "study.json")
         if not isinstance(found, dict):
@@ -94,6 +97,15 @@ class StudyView:
                 # Of another version, or damaged.
                 self._why_not = f"the specification cannot be read ({type(error).__name__})"
         return self._planned
+
+
+def _work(
+    planned: list[tuple[str, float]], done: dict[str, int], told: dict[str, tuple[float, str, float]]
+) -> tuple[float, float]:
+    """How much of the work is done, and all that there is, in what jobs cost."""
+    costs = dict(planned)
+    worked = sum(costs.get(name, 0.0) for name in done)
+    return worked + sum(share * costs.get(name, 0.0) for name, (share, *_) in told.items()), sum(costs.values())
 
 
 def _jobs_of(folder: Path) -> list[tuple[str, float]]:

@@ -8,6 +8,7 @@ const KINDS = {
   session: { name: "closed loop", page: SessionPage, seeks: true },
   training: { name: "training", page: BlocksPage },
   study: { name: "study", page: BlocksPage },
+  cultures: { name: "study over cultures", page: BlocksPage },
   tuning: { name: "tuning", page: BlocksPage },
   recording: { name: "recordings", page: BlocksPage, seeks: true },
 };
@@ -21,7 +22,7 @@ let following = true, to = null, span = 8, asking = false, timer = 0, again = fa
 
 // What a study makes is part of it.
 function isPartOf(whole, each) {
-  return ["study", "tuning"].includes(whole?.kind) && each.kind !== whole.kind && (!whole.place || each.place.startsWith(`${whole.place}/`));
+  return ["study", "cultures", "tuning"].includes(whole?.kind) && each.kind !== whole.kind && (!whole.place || each.place.startsWith(`${whole.place}/`));
 }
 
 function ask(path, more = {}) {
@@ -112,7 +113,8 @@ async function things() {
     }
     $("choose").hidden = found.things.length < 2;
     const [newest] = found.things;
-    if (!thing && newest) choose(found.things.find((each) => isPartOf(each, newest)) ?? newest);
+    const [outermost] = found.things.filter((each) => isPartOf(each, newest)).sort((a, b) => a.place.length - b.place.length);
+    if (!thing && newest) choose(outermost ?? newest);
     if (!thing) $("main").replaceChildren(make("p", { className: "words", textContent: `${found.folder} holds nothing to watch yet: no session, training, study, tuning or recording. It is looked at again every few seconds.` }));
   } catch {
     // Said where it is looked at.

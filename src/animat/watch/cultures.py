@@ -1,0 +1,110 @@
+"""The view of a study over many cultures: how far each is, and the comparisons over those that are done."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+from animat.errors import InvalidFile
+from animat.plain_file import read_plain_text
+from animat.watch.blocks import facts, table, time_left
+from animat.watch.files import json_of, newest_s
+from animat.watch.held import is_held, state_of
+from animat.watch.plain import listed, mapped, text
+from animat.watch.speed import Speed
+from animat.watch.study import StudyView
+
+_MANIFEST, _DONE, _COMPARISONS = "cultures.json", "jobs/report.json", "tables/comparisons.csv"
+_MOST_CULTURES, _MOST_BYTES = 10_000, 2**20
+_WORDS = "Means over the cultures that are done. Larger: in how many of them the second mean is the larger one."
+
+
+class CulturesView:
+    """The folder of a study over many cultures, looked at again and again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._speed = Speed()
+        self._studies: dict[str, StudyView] = {}
+        self._compared: dict[str, list[tuple[str, str, float, float]]] = {}
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+    def about(self) -> dict[str, Any]:
+        """How many cultures are studied."""
+        return {"generation": 0, "title": f"study over {len(self._names()):,} cultures"}
+
+    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
+        """How far the cultures are; a study has no clock of its own."""
+        names = self._names()
+        done = [name for name in names if (self.folder / name / _DONE).exists()]
+        begun = [name for name in names if name not in done and (self.folder / name).is_dir()]
+        shares = {name: self._share(name) for name in begun if is_held(self.folder / name) is not False}
+        self._speed.see(worked := len(done) + sum(shares.values()))
+        changed_s = newest_s([self.folder, *(self.folder / name / "jobs" for name in begun)])
+        # Programs lock the folders of the cultures, not the one around them.
+        state = state_of(self.folder / next(iter(shares), ""), changed_s, is_done=len(done) == len(names))
+        running = shares if state["state"] == "running" else {}
+        rows: list[tuple[str, Any]] = [
+            ("cultures done", f"{len(done):,} of {len(names):,}"),
+            ("running", len(running)),
+            ("begun, not running", len(begun) - len(running)),
+            ("time left", time_left(self._speed.left_s(len(names) - worked), state)),
+        ]
+        under_way = [[name, f"{100 * share:.0f} %"] for name, share in running.items()]
+        return {
+            "generation": 0,
+            **state,
+            "damage": "",
+            "blocks": [
+                facts("Cultures", rows, "The list at the top has each culture's own page."),
+                table("Running", ["culture", "done"], under_way, "" if under_way else "nothing runs now"),
+                self._comparisons(done),
+            ],
+        }
+
+    def _share(self, name: str) -> float:
+        if name not in self._studies:
+            self._studies = {n: view for n, view in self._studies.items() if is_held(self.folder / n) is not False}
+            self._studies[name] = StudyView(self.folder / name)
+        return self._studies[name].share() or 0.0
+
+    def _comparisons(self, done: list[str]) -> dict[str, Any]:
+        over: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        for name in done:
+            if name not in self._compared:
+                self._compared[name] = _compared(self.folder / name / _COMPARISONS)
+            for comparison, robot, first, second in self._compared[name]:
+                over.setdefault((comparison, robot), []).append((first, second))
+        rows = []
+        for (comparison, robot), means in over.items():
+            first, second = (sum(each) / len(means) for each in zip(*means, strict=True))
+            larger = sum(after > before for before, after in means)
+            rows.append([comparison, robot, first, second, f"{larger:,} of {len(means):,}"])
+        head = ["comparison", "robot", "mean of the first", "mean of the second", "larger"]
+        return table("Comparisons", head, rows, _WORDS if rows else "none yet", width="whole")
+
+    def _names(self) -> list[str]:
+        found = [name for name in listed(mapped(json_of(self.folder / _MANIFEST)).get("cultures")) if _is_name(name)]
+        if not found:
+            raise InvalidFile(f"{self.folder / _MANIFEST}: expected the names of cultures, got none")
+        return found[:_MOST_CULTURES]
+
+
+def _is_name(name: Any) -> bool:
+    return isinstance(name, str) and name.startswith("culture-") and "/" not in name and text(name) == name
+
+
+def _compared(path: Path) -> list[tuple[str, str, float, float]]:
+    """Of one culture each comparison and robot, and the means of both arms."""
+    try:
+        rows = csv.DictReader(io.StringIO(read_plain_text(path, _MOST_BYTES)))
+        return [
+            (text(row["comparison"]), text(row["robot"]), float(row["mean_first"]), float(row["mean_second"]))
+            for row in rows
+        ]
+    except (InvalidFile, csv.Error, KeyError, TypeError, ValueError):
+        return []
