@@ -45,7 +45,7 @@ def test_without_dask_or_a_scheduler_it_is_a_line(
 def test_the_page_has_commands_that_animat_knows() -> None:
     page = (Path(__file__).parents[1] / "docs" / "cluster.md").read_text()
     commands = re.findall(r"^(?:`| +)?animat ([a-z][^&#`\n]+)", page, re.MULTILINE)
-    assert len(commands) == 5
+    assert len(commands) == 4
     for command in commands:
         _parse(shlex.split(command))
 

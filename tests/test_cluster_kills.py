@@ -80,6 +80,9 @@ def test_whoever_is_killed_when_a_study_is_the_same_bits(moments: dict[str, int]
                 # The second, before it was connected.
                 lines = ("has ended; start", "no scheduler answers")
                 assert process.returncode in (0, -signal.SIGKILL) or any(line in last for line in lines), said
+                if process.returncode == 0:
+                    assert contents(folders[-1]) == expected
+                    folders.append(tmp_path / f"study-{len(folders)}")
                 if of == "scheduler":
                     running.close()
                     scheduler, _ = running.enter_context(local_cluster(4, file))

@@ -145,6 +145,11 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
     assert block(found, "Running")["rows"] == [[names[3], f"{100 * share:.0f} %"]]
     assert block(found, "Comparisons")["rows"] == [["a and b", "arm", 3.0, 4.0, "2 of 3"]]
     assert view.view(None, 8.0)["state"] == "silent"
+    for damage in (b"comparison,robot,mean_first,mean_second\na and b,arm,nan,4", b"\xff\x00", b"comparison\nx"):
+        (tmp_path / names[0] / "tables" / "comparisons.csv").write_bytes(damage)
+        compared = block(CulturesView(tmp_path).view(None, 8.0), "Comparisons")
+        assert compared["rows"] == [["a and b", "arm", 4.0, 4.0, "1 of 2"]]
+        assert "cannot be read: 1 of the cultures that are done" in compared["words"]
     (tmp_path / "cultures.json").write_text("[]")
     with pytest.raises(InvalidFile, match="expected the names of cultures"):
         view.view(None, 8.0)

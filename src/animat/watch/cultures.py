@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from animat.watch.study import StudyView
 _MANIFEST, _DONE, _COMPARISONS = "cultures.json", "jobs/report.json", "tables/comparisons.csv"
 _MOST_CULTURES, _MOST_BYTES = 10_000, 2**20
 _WORDS = "Means over the cultures that are done. Larger: in how many of them the second mean is the larger one."
+_Means = list[tuple[str, str, float, float]]
+"""Of one culture each comparison and robot, and the means of both arms."""
 
 
 class CulturesView:
@@ -28,7 +31,7 @@ class CulturesView:
         self.folder = folder
         self._speed = Speed()
         self._studies: dict[str, StudyView] = {}
-        self._compared: dict[str, list[tuple[str, str, float, float]]] = {}
+        self._compared: dict[str, _Means] = {}
 
     def close(self) -> None:
         """Nothing is kept open."""
@@ -74,18 +77,26 @@ class CulturesView:
 
     def _comparisons(self, done: list[str]) -> dict[str, Any]:
         over: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        left_out = 0
         for name in done:
             if name not in self._compared:
-                self._compared[name] = _compared(self.folder / name / _COMPARISONS)
+                means = _means_of(self.folder / name / _COMPARISONS)
+                if means is None:
+                    left_out += 1
+                    continue
+                self._compared[name] = means
             for comparison, robot, first, second in self._compared[name]:
                 over.setdefault((comparison, robot), []).append((first, second))
         rows = []
-        for (comparison, robot), means in over.items():
-            first, second = (sum(each) / len(means) for each in zip(*means, strict=True))
-            larger = sum(after > before for before, after in means)
-            rows.append([comparison, robot, first, second, f"{larger:,} of {len(means):,}"])
+        for (comparison, robot), pairs in over.items():
+            first, second = (sum(each) / len(pairs) for each in zip(*pairs, strict=True))
+            larger = sum(after > before for before, after in pairs)
+            rows.append([comparison, robot, first, second, f"{larger:,} of {len(pairs):,}"])
         head = ["comparison", "robot", "mean of the first", "mean of the second", "larger"]
-        return table("Comparisons", head, rows, _WORDS if rows else "none yet", width="whole")
+        words = _WORDS if rows else "none yet"
+        if left_out:
+            words += f" Left out, as their {_COMPARISONS} cannot be read: {left_out:,} of the cultures that are done."
+        return table("Comparisons", head, rows, words, width="whole")
 
     def _names(self) -> list[str]:
         found = [name for name in listed(mapped(json_of(self.folder / _MANIFEST)).get("cultures")) if _is_name(name)]
@@ -98,13 +109,14 @@ def _is_name(name: Any) -> bool:
     return isinstance(name, str) and name.startswith("culture-") and "/" not in name and text(name) == name
 
 
-def _compared(path: Path) -> list[tuple[str, str, float, float]]:
-    """Of one culture each comparison and robot, and the means of both arms."""
+def _means_of(path: Path) -> _Means | None:
+    """The means in a table of comparisons; None where it is damaged."""
     try:
         rows = csv.DictReader(io.StringIO(read_plain_text(path, _MOST_BYTES)))
-        return [
+        found = [
             (text(row["comparison"]), text(row["robot"]), float(row["mean_first"]), float(row["mean_second"]))
             for row in rows
         ]
     except (InvalidFile, csv.Error, KeyError, TypeError, ValueError):
-        return []
+        return None
+    return found if all(math.isfinite(mean) for *_, first, second in found for mean in (first, second)) else None
