@@ -122,9 +122,10 @@ def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
 
 
 def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
-    """Seconds for 10, 100 and 1,000 policies of 10,000 iterations, and for the tiny study on 1, 10 and 100 cultures.
+    """Seconds for 10, 100 and 1,000 policies of 10,000 iterations, and for a small study on 1, 10 and 100 cultures.
 
-    On pinned processes, once each, after one of each kind that fills the cache of compiled programs.
+    The study is the tiny one with its first two arms. On pinned processes, once each, after one of each kind that fills
+    the cache of compiled programs.
     """
     from training import timeline, training
 
@@ -134,7 +135,8 @@ def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
 
     def cultures(many: int) -> float:
         study = read_study(STUDY)
-        study = replace(study, culture=replace(study.culture, seeds=f"1-{many}"))
+        culture = replace(study.culture, seeds=f"1-{many}")
+        study = replace(study, culture=culture, arms=study.arms[:2], optimum_resolution=0.1)
         return timed(lambda folder, _: run_over_cultures(study, folder, workers=WORKERS), None)
 
     told = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -32,6 +33,7 @@ from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.closed_loop.tick import Tick
+from animat.closed_loop.timing import ahead_of_other_programs, among_other_programs
 from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
@@ -268,22 +270,50 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
 @pytest.mark.parametrize("real_time", [True, False])
 def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_path: Path, real_time: bool) -> None:
     seen: set[int] = set()
+    of_those_it_starts: set[int] = set()
 
     class Noting(AnyCondition):
         def act(self, observation: Any, rng: np.random.Generator) -> int:
-            seen.add(os.sched_getscheduler(0))
+            seen.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            with ThreadPoolExecutor(1) as started:
+                of_those_it_starts.add(started.submit(os.sched_getscheduler, 0).result())
             return super().act(observation, rng)
 
     def may() -> bool:
         with ThreadPoolExecutor(1) as thread:
-            asked = thread.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(1))
+            asked = thread.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(2))
             return asked.exception() is None
 
+    if real_time and not may():
+        pytest.skip("the system gives no real-time priority")
     before = os.sched_getscheduler(0)
     with FakeCulture() as culture:
         run_session(culture, loop_of(real_time=real_time), [Agent("noting", "", Noting(5))], tmp_path, episodes=1)
-    assert seen == {os.SCHED_RR if real_time and may() else before}
-    assert os.sched_getscheduler(0) == before
+    assert seen == {os.SCHED_RR if real_time else before}
+    assert of_those_it_starts == {before}
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_RR"), reason="the system has no real-time scheduling")
+def test_a_thread_that_is_left_alone_is_no_longer_ahead_of_other_programs() -> None:
+    began, may_end, policies = threading.Event(), threading.Event(), list[int]()
+
+    def run() -> None:
+        with ahead_of_other_programs(2):
+            policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            began.set()
+            may_end.wait(60)
+            policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    began.wait(60)
+    among_other_programs(thread)
+    may_end.set()
+    thread.join()
+    if policies[0] != os.SCHED_RR:
+        pytest.skip("the system gives no real-time priority")
+    assert policies[1] == os.SCHED_OTHER
 
 
 def test_agents_take_turns_in_random_order() -> None:

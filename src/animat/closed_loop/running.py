@@ -27,7 +27,7 @@ from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, expect_no_session
 from animat.closed_loop.tick import Ending
-from animat.closed_loop.timing import Clock, WallClock, ahead_of_other_programs
+from animat.closed_loop.timing import Clock, WallClock, ahead_of_other_programs, among_other_programs
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
@@ -146,10 +146,7 @@ class _Supervisor:
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
-        # What computes as fast as it can would leave nothing to the others.
-        has_deadlines = self._loop.real_time or self._culture.device is not None
-        ahead = ahead_of_other_programs() if has_deadlines else contextlib.nullcontext()
-        with told_instead(self._stop_for_a_person), _without_collector(), _switching_every(_SWITCH_S), ahead:
+        with told_instead(self._stop_for_a_person), _without_collector(), _switching_every(_SWITCH_S), self._ahead(1):
             thread.start()
             try:
                 ending = self._watch(thread)
@@ -172,11 +169,19 @@ class _Supervisor:
         self._driver.is_stopped = True
         self._halt(ending)
         thread.join(_GRACE_S)
+        among_other_programs(thread)
         self._halt(ending)
         return self._finish(ending)
 
     def _drive(self) -> None:
-        self._ending = self._driver.run()
+        # Before the thread that writes, which would else have its turns on the same core.
+        with self._ahead(2):
+            self._ending = self._driver.run()
+
+    def _ahead(self, priority: int) -> contextlib.AbstractContextManager[None]:
+        """Ahead of other programs, if there are deadlines: what computes as fast as it can would leave them nothing."""
+        has_deadlines = self._loop.real_time or self._culture.device is not None
+        return ahead_of_other_programs(priority) if has_deadlines else contextlib.nullcontext()
 
     def _watch(self, thread: threading.Thread) -> Ending | None:
         """Write and watch while the loop runs; returns why it must be ended from outside, None if it ended."""

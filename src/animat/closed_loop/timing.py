@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import time
 from collections.abc import Iterator
 from typing import Protocol
@@ -39,18 +40,31 @@ class WallClock:
 
 
 @contextlib.contextmanager
-def ahead_of_other_programs() -> Iterator[None]:
-    """Run the calling thread, and those that it starts, before all that has no deadline, where the system lets it.
+def ahead_of_other_programs(priority: int) -> Iterator[None]:
+    """Run the calling thread before all that has no deadline, where the system lets it; not those that it starts.
 
     Linux lets root, and whoever was given a real-time priority (`ulimit -r`). Elsewhere nothing changes.
+
+    Args:
+        priority: among threads that are ahead; the larger one comes first.
     """
     before = None
     with contextlib.suppress(AttributeError, OSError):
         given = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
         before = given
     try:
         yield
     finally:
         if before is not None:
-            os.sched_setscheduler(0, *before)
+            policy, parameters = before
+            # Whoever is not root may not take back that what it starts is not ahead; that does no harm.
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
+                os.sched_setscheduler(0, policy, parameters)
+
+
+def among_other_programs(thread: threading.Thread) -> None:
+    """Take a thread back that runs ahead of other programs and does not end: it must not starve them."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        os.sched_setscheduler(thread.native_id, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))  # type: ignore[arg-type]

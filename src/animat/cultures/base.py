@@ -227,7 +227,8 @@ class Culture(Openable):
             protocol: what to do; it is kept with the recording.
             seed: decides the order of conditions and patterns.
             progress: told after each block, or stretch of one (`stretch_s`).
-            follow: then called with what gives the recording so far. What it takes comes off the next set-up time.
+            follow: then called with what gives the recording so far, but for the last time, when it is whole. What it
+                takes comes off the next set-up time.
 
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
@@ -260,7 +261,7 @@ class Culture(Openable):
                 observed.append(self.deliver(schedule.deliveries(stretch), stretch.duration_s))
                 parts.append(stretch)
                 progress.update(done + i / len(stretches), len(schedule.blocks))
-                if follow is not None:
+                if follow is not None and (i < len(stretches) or done + 1 < len(schedule.blocks)):
                     seen_s = self.now_s
                     follow(so_far)
                     followed_s = self.now_s - seen_s

@@ -136,14 +136,16 @@ def record_when_due(
         seed: of the orders of stimuli.
         progress: told after each block, and when a recording is dealt with.
     """
-    for session in left:
-        due_s = zero_s + session * interval_s
-        if culture.now_s < due_s + interval_s:
-            culture.rest(max(0.0, due_s - culture.now_s))
-            part = Part(progress, session, 1, len(files), files[session].name)
-            with UnderWay(files[session].parent) as follow:
+    # Entered where nothing is left, too: a killed run may have left a file.
+    with UnderWay(files[0].parent) as follow:
+        for session in left:
+            due_s = zero_s + session * interval_s
+            if culture.now_s < due_s + interval_s:
+                culture.rest(max(0.0, due_s - culture.now_s))
+                part = Part(progress, session, 1, len(files), files[session].name)
                 yield session, culture.record(protocol, _order(seed, session), part, follow)
-            progress.update(session + 1, len(files), files[session].name)
+                follow.remove()
+                progress.update(session + 1, len(files), files[session].name)
 
 
 def _order(seed: int, session: int) -> int:
@@ -153,6 +155,7 @@ def _order(seed: int, session: int) -> int:
 
 def _remove_leftovers(folder: Path) -> None:
     """Remove what a killed run was just writing; no reader takes such files for whole ones."""
+    UnderWay(folder).remove()
     for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
         for leftover in folder.glob(f"{name}.*.partial*"):
             clear_away(leftover)

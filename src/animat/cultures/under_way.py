@@ -11,7 +11,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from animat.errors import InvalidFile
 from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away
 
@@ -33,24 +32,24 @@ class UnderWay:
         self._written_s = -np.inf
 
     def __enter__(self) -> Self:
-        self._remove()
+        self.remove()
         return self
 
     def __call__(self, so_far: Callable[[], Recording]) -> None:
         """Write what was recorded so far, unless that was done just before."""
         if time.monotonic() - self._written_s < EVERY_S:
             return
-        # Where this cannot be written the recording cannot either, which says so.
-        with suppress(InvalidFile), atomic_write(self._path) as beside, beside.open("wb") as file:
+        # A recording is not ended for the sake of a look; what is wrong with it, it says itself.
+        with suppress(Exception), atomic_write(self._path) as beside, beside.open("wb") as file:
             np.savez(file, **_columns(so_far()))
         self._written_s = time.monotonic()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._remove()
+        self.remove()
 
-    def _remove(self) -> None:
+    def remove(self) -> None:
         """Remove the file, and what a killed run left of it."""
         for file in (self._path, *self._path.parent.glob(f".{UNDER_WAY}.*.partial*")):
             clear_away(file)
@@ -61,7 +60,7 @@ def _columns(recording: Recording) -> dict[str, Any]:
     channels, stimuli, presentation = recording.channels, recording.stimuli, recording.presentation
     return {
         "spike_time_s": recording.spike_times_s,
-        "spike_channel": channels.label[recording.spike_channels],
+        "spike_channel": recording.spike_channels,
         "channel_label": channels.label,
         "channel_electrode": channels.electrode,
         "channel_xy_um": np.column_stack([channels.x_um, channels.y_um]),
