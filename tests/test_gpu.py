@@ -37,7 +37,7 @@ from animat.studies.toml import read_study
 from animat.studies.training import TrainGroup as TrainArm
 from animat.training import memory
 from animat.training.folder import describe
-from animat.training.group import Group, train_group, train_groups
+from animat.training.group import Group, SideBySide, train_group, train_groups
 from animat.training.lessons import Lesson
 from animat.training.memory import parts_that_fit
 from animat.training.policy import Policy
@@ -208,6 +208,35 @@ def test_a_device_s_memory_decides_on_the_parts(monkeypatch: pytest.MonkeyPatch)
     ):
         monkeypatch.setattr(memory, "device_memory_bytes", lambda available=available: float(available))
         assert parts_that_fit(groups) == parts
+
+
+@pytest.mark.oracle
+def test_killed_between_two_parts_the_first_is_not_trained_again_and_the_bits_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trains, "parts_that_fit", lambda groups: [[0, 1], [2]])
+    tasks = tasks_of(SHORTEST, (0,), (1,), (2,))
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    notices = [tmp_path / f"{number}.json" for number in range(3)]
+    train_at_once(tasks, tmp_path / "whole", notices)
+    rounds: list[int] = []
+    plain = SideBySide.train
+
+    def stopping(self: SideBySide, index: int, *simulators: Any) -> float:
+        if len(rounds) == CHUNKS:
+            raise KeyboardInterrupt
+        rounds.append(index)
+        return plain(self, index, *simulators)
+
+    monkeypatch.setattr(SideBySide, "train", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        train_at_once(tasks, tmp_path / "killed", notices)
+    rounds.clear()
+    train_at_once(tasks, tmp_path / "killed", notices)
+    assert rounds == list(range(CHUNKS))
+    assert bits(tmp_path / "killed") == bits(tmp_path / "whole")
+    assert not list((tmp_path / "killed").glob(".unfinished/*.npz"))
 
 
 @pytest.mark.oracle

@@ -100,6 +100,14 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     stopped = TrainingView(tmp_path).view(None, 8.0)
     assert stopped["state"] == "silent"
     assert "started again it goes on" in stopped["message"]
+    # As all are trained at once: numbers in the file, and words of the first job alone.
+    (tmp_path / ".unfinished" / "from-p0.npz").unlink()
+    np.savez(tmp_path / ".unfinished" / "at-once-ab.npz", curve=curve, members=np.array([1, 2]), done=np.array(30))
+    (tmp_path / ".unfinished" / ".told" / "p2.json").write_text(json.dumps([0.55, None]))
+    together = TrainingView(tmp_path).view(None, 8.0)
+    assert block(together, "Learning curves")["series"] == [*policies, mean]
+    assert [row[2] for row in block(together, "Policies")["rows"]] == ["none yet", 29.0, 39.0]
+    assert block(together, "Policies")["words"] == "p0 to p1: 55 % return 31.0; p2: 55 %"
 
 
 def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:

@@ -63,11 +63,15 @@ class Trains(Task):
 def train_alone(work: Work, progress: Progress) -> list[Path]:
     """Train a group of policies, going on from its checkpoint; returns the files that are left."""
     progress.update(0, CHUNKS, "compiling")
-    return _trained([work], work.checkpoint, progress)[0]
+    files = _trained([work], work.checkpoint, progress)[0]
+    work.checkpoint.unlink(missing_ok=True)
+    return files
 
 
 def train_at_once(tasks: Sequence[Trains], folder: Path, notices: Sequence[Path]) -> list[Done]:
     """Carry out tasks that one program does: all of their policies at once, or as many as there is memory for.
+
+    Killed at any moment before it returns and called again with the same tasks, it leaves the same bits.
 
     Args:
         tasks: which.
@@ -82,27 +86,32 @@ def train_at_once(tasks: Sequence[Trains], folder: Path, notices: Sequence[Path]
         progress.update(0, CHUNKS, "compiling")
         works = [task.prepare(folder) for task in tasks]
         parts = parts_that_fit([work.group for work in works])
-        files = []
+        files, checkpoints = [], []
         for number, part in enumerate(parts):
             of_part = [works[i] for i in part]
             # A checkpoint is of these and no others.
             who = "".join(f"{work.group.fingerprint}{work.group.members}" for work in of_part)
-            checkpoint = folder / UNFINISHED / f"at-once-{hashlib.sha256(who.encode()).hexdigest()[:16]}.npz"
-            files += _trained(of_part, checkpoint, Part(progress, number * CHUNKS, CHUNKS, len(parts) * CHUNKS))
+            checkpoints.append(folder / UNFINISHED / f"at-once-{hashlib.sha256(who.encode()).hexdigest()[:16]}.npz")
+            of_all = Part(progress, number * CHUNKS, CHUNKS, len(parts) * CHUNKS)
+            files += _trained(of_part, checkpoints[-1], of_all, keeps_end=True)
+        # Only now: the parts before one that is killed are not trained again.
+        for checkpoint in checkpoints:
+            checkpoint.unlink(missing_ok=True)
         return files
 
     return carried_out(tasks, folder, notices, run)
 
 
-def _trained(works: Sequence[Work], checkpoint: Path, progress: Progress) -> list[list[Path]]:
+def _trained(
+    works: Sequence[Work], checkpoint: Path, progress: Progress, *, keeps_end: bool = False
+) -> list[list[Path]]:
     policies = train_groups(
         [work.group for work in works],
         checkpoint,
         progress,
-        # It takes as long as there are policies.
+        # Writing one takes time in proportion to the policies.
         checkpoint_s=works[0].checkpoint_s * len(works),
         add_parts=[work.add_part for work in works],
+        keeps_end=keeps_end,
     )
-    files = [work.leave(each) for work, each in zip(works, policies, strict=True)]
-    checkpoint.unlink(missing_ok=True)
-    return files
+    return [work.leave(each) for work, each in zip(works, policies, strict=True)]

@@ -97,6 +97,7 @@ def train_groups(
     *,
     checkpoint_s: float = CHECKPOINT_S,
     add_parts: Sequence[AddPart | None],
+    keeps_end: bool = False,
 ) -> list[list[Policy]]:
     """Train several groups of policies at once, as `train_group` does one; returns the policies of each.
 
@@ -107,6 +108,7 @@ def train_groups(
         checkpoint, progress: as of `train_group`.
         checkpoint_s: as there.
         add_parts: of each group, as there, or None.
+        keeps_end: whether a checkpoint is written at the end, too: from it the same policies come at once.
     """
     together = SideBySide(*groups)
     done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
@@ -123,7 +125,8 @@ def train_groups(
     for index in range(done, CHUNKS):
         mean_return = together.train(index, *(simulator_at(index) for simulator_at in at))
         tell(together.curve[-1])
-        if checkpoint is not None and time.monotonic() - written > checkpoint_s:
+        is_due = time.monotonic() - written > checkpoint_s or (keeps_end and index + 1 == CHUNKS)
+        if checkpoint is not None and is_due:
             together.keep(checkpoint)
             written = time.monotonic()
         returned = "" if math.isnan(mean_return) else f"return {mean_return:.1f}"
@@ -286,7 +289,8 @@ class SideBySide:
         arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
         arrays |= {"fingerprint": np.array(self.fingerprint), "done": np.array(len(self._curve))}
         with atomic_write(checkpoint) as beside, beside.open("wb") as file:
-            np.savez(file, curve=np.stack(self._curve), **arrays)
+            # Whose curves they are is for the live page alone.
+            np.savez(file, curve=np.stack(self._curve), members=[member for _, member in self._places], **arrays)
 
     def resume(self, checkpoint: Path) -> int:
         """Go on from a checkpoint; returns how many chunks are done."""

@@ -39,23 +39,36 @@ def told_by_jobs(folder: Path) -> dict[str, tuple[float, str, float]]:
         except OSError:
             continue
         if len(told) == 2 and number(told[0]) is not None:
-            found[path.stem.replace("+", "/")] = (float(told[0]), text(told[1]), changed_s)
+            # Of several that are trained at once only one says more.
+            words = "" if told[1] is None else text(told[1])
+            found[path.stem.replace("+", "/")] = (float(told[0]), words, changed_s)
     return found
 
 
-def curve_of_checkpoint(path: Path) -> Float64[np.ndarray, "chunks policies columns"] | None:
-    """The learning curves in a checkpoint; None where there is none that can be read."""
+def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks columns"]]:
+    """The learning curves in a checkpoint, by the numbers of the policies; none where none can be read."""
     try:
         with zipfile.ZipFile(path) as archive:
-            member = archive.getinfo("curve.npy")
-            if member.file_size > _MOST_CURVE_BYTES:
-                return None
-            with archive.open(member) as file:
-                content = file.read(_MOST_CURVE_BYTES)
-        curve = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+            curve = _whole(_array_in(archive, "curve.npy"))
+            if curve is None or curve.ndim != 3:
+                return {}
+            if "members.npy" in archive.namelist():
+                members = _array_in(archive, "members.npy").tolist()
+            else:
+                # Written before the numbers were kept: those of one group, from that in the file's name on.
+                first = int(path.stem.removeprefix("from-p"))
+                members = list(range(first, first + curve.shape[1]))
+            return {int(member): curve[:, row] for row, member in enumerate(members)}
     except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive
-        return None
-    return _whole(curve) if curve.ndim == 3 else None
+        return {}
+
+
+def _array_in(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    member = archive.getinfo(name)
+    if member.file_size > _MOST_CURVE_BYTES:
+        raise ValueError(name)
+    with archive.open(member) as file:
+        return np.lib.format.read_array(io.BytesIO(file.read(_MOST_CURVE_BYTES)), allow_pickle=False)
 
 
 def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import facts, table, time_left
-from animat.watch.files import curve_of_checkpoint, curve_of_policy, json_of, newest_s, told_by_jobs
+from animat.watch.files import curve_of_policy, curves_of_checkpoint, json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
 from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
@@ -90,14 +90,11 @@ class TrainingView:
         """The learning curve of each policy by its number, and how much of its training is done."""
         curves: dict[int, Any] = {}
         shares = dict.fromkeys(range(planned), 0.0)
-        for path in self.folder.glob(f"{_UNFINISHED}/from-p*.npz"):
-            first = re.fullmatch(r"from-p(\d{1,6})", path.stem)
-            found = self._kept(path, curve_of_checkpoint)
-            if first is None or found is None:
-                continue
-            for i in range(found.shape[1]):
-                curves[int(first[1]) + i] = found[:, i]
-                shares[int(first[1]) + i] = min(1.0, len(found) / 60)
+        # Of groups on cores, and of all that are trained at once on a GPU.
+        unfinished = self.folder / _UNFINISHED
+        for path in (*unfinished.glob("from-p*.npz"), *unfinished.glob("at-once-*.npz")):
+            for i, curve in (self._kept(path, curves_of_checkpoint) or {}).items():
+                curves[i], shares[i] = curve, min(1.0, len(curve) / 60)
         for name, (share, _, _) in told_by_jobs(self.folder / _UNFINISHED / ".told").items():
             members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
             if members is not None:
@@ -181,7 +178,7 @@ def _table(
         ended = [] if of is None else [x for x in of[:, 2].tolist() if np.isfinite(x)]
         last = ended[-1] if ended else "none yet"
         rows.append([f"p{i}", f"{100 * shares[i]:.0f} %", last, assessed.get(f"p{i}", "none in the folder yet")])
-    words = "; ".join(f"{name}: {100 * share:.0f} % {note}" for name, (share, note, _) in told.items())
+    words = "; ".join(f"{name}: {100 * share:.0f} % {note}".strip() for name, (share, note, _) in told.items())
     head = ["policy", "done", "last return", "best assessment"]
     if not assessed:
         head, rows = head[:3], [row[:3] for row in rows]
