@@ -57,8 +57,8 @@ def train(
 
     Stopped at any moment, also by SIGKILL, and called again, it goes on from the last chunk and ends in the same bits
     as if it had not been stopped, with any number of workers. On a finished folder it reads the policies and returns.
-    Where there is a GPU, it trains all policies at once (`animat.execution.gpu`); killed while it writes what it trained,
-    those that are left are trained together again, which are others in their last bits.
+    Where there is a GPU, it trains all policies at once (`animat.execution.gpu`). Killed there while it writes the
+    finished ones, it trains the others together again, and their last bits are others.
 
     Args:
         training: what is trained.
