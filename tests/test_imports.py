@@ -21,6 +21,7 @@ GROUND = (
     "differences",
     "errors",
     "extras",
+    "late",
     "lined_up",
     "plain_file",
     "progress",

@@ -31,14 +31,13 @@ from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Outcome, Seen, Tally, counted, nothing_yet, outcome
 from animat.goals.text import read_goal
+from animat.late import Array, jax, jnp
 from animat.robots.base import Quantity, Robot
 from animat.robots.capabilities import WITHOUT, capability
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
 
 if TYPE_CHECKING:
-    from jax import Array
-
     from animat.robots.grid import Grid
 
 FAILED, REACHED = 100.0, 50.0
@@ -152,8 +151,6 @@ class RobotWithGoal(Robot[GoalState]):
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and where episodes start in a region that ends them."""
-        import jax
-
         start = self.robot.reset(jax.random.key(0))
         told = zip(self.goal.objectives, self._objectives, self._seen(start), strict=True)
         in_it = [str(given) for given, each, (_, inside) in told if inside and each.kind in ("avoid", "reach")]
@@ -182,8 +179,6 @@ class RobotWithGoal(Robot[GoalState]):
         self, seen: Seen, outside: tuple[Int[Array, ""], ...], tally: Tally
     ) -> tuple[tuple[Int[Array, ""], ...], Tally, Float[Array, ""], Bool[Array, ""]]:
         """What an iteration comes to after which this is seen, and its reward and whether it ends the episode."""
-        import jax.numpy as jnp
-
         outside = self._outside(seen, outside)
         late = iter(outside)
         no = jnp.bool_(False)
@@ -208,8 +203,6 @@ class RobotWithGoal(Robot[GoalState]):
 
         What else is wanted pays on the way.
         """
-        import jax.numpy as jnp
-
         found: Array = jnp.float32(0.0)
         seen = self._seen(state.robot)
         for each, share, (margin, _) in zip(self._objectives, self._shares, seen, strict=True):
@@ -231,8 +224,6 @@ class RobotWithGoal(Robot[GoalState]):
         Args:
             observations: at its start, and after each iteration.
         """
-        import jax
-
         # All of one length, for one compilation: what comes after the end is not counted.
         missing = self.episode_limit + 1 - len(observations)
         came_to: Outcome = jax.device_get(_outcome_along(self)(np.pad(observations, ((0, missing), (0, 0)), "edge")))
@@ -246,8 +237,6 @@ class RobotWithGoal(Robot[GoalState]):
         return [margin_of(each.region, seen, self._spec) for each in self._objectives]
 
     def _outside(self, seen: Seen, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
-        import jax.numpy as jnp
-
         timed = [inside for each, (_, inside) in zip(self._objectives, seen, strict=True) if each.within is not None]
         before = [jnp.int32(0)] * len(timed) if before is None else before
         return tuple(jnp.where(inside, 0, of + 1).astype(jnp.int32) for inside, of in zip(timed, before, strict=True))
@@ -258,8 +247,6 @@ class RobotWithGoal(Robot[GoalState]):
 
     def _largest(self, flags: Sequence[Bool[Array, ""]]) -> Float[Array, ""]:
         """The largest share of the objectives that a flag is up for."""
-        import jax.numpy as jnp
-
         return reduce(jnp.maximum, (flag * share for flag, share in zip(flags, self._shares, strict=True)))
 
     def _value_grid(self) -> Grid:
@@ -278,9 +265,6 @@ class RobotWithGoal(Robot[GoalState]):
 
     def _is_decided(self, grid: Grid) -> bool:
         """Whether a state alone decides if the next iteration ends the episode, whatever the command, tried on some."""
-        import jax
-        import jax.numpy as jnp
-
         nodes = jax.random.randint(jax.random.key(0), (2, 256), 0, jnp.array([[grid.n_rows], [grid.along.stored]]))
 
         def seen_after(row: Array, node: Array, chance: float, u: float) -> Array:
@@ -297,7 +281,6 @@ class RobotWithGoal(Robot[GoalState]):
 @lru_cache(maxsize=8)
 def _outcome_along(robot: RobotWithGoal) -> Callable[[Any], Outcome]:
     """`RobotWithGoal.outcome_of` episodes of the limit, compiled."""
-    import jax
 
     def along(observations: Float[Array, "iterations observations"]) -> Outcome:
         def iteration(carry: Any, observation: Array) -> tuple[Any, None]:

@@ -8,16 +8,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 
 from animat.errors import AnimatError, BodyFailed, InvalidArgument, first_line
+from animat.late import Array, jnp
 from animat.robots.base import Robot
-
-if TYPE_CHECKING:
-    from jax import Array
 
 Answer = TypeVar("Answer")
 
@@ -89,8 +87,6 @@ class HostRobot(Robot[Any]):
 
     def reset(self, key: Array) -> Float[Array, " observations"]:
         """Nothing was observed yet."""
-        import jax.numpy as jnp
-
         return jnp.zeros(len(self.observation_spec), jnp.float32)
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> Any:

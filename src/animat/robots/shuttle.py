@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
+from animat.late import Array, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size
-from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.registry import register_robot
 
 if TYPE_CHECKING:
-    from jax import Array
     from matplotlib.axes import Axes
 
     from animat.robots.grid import Grid
@@ -74,8 +74,6 @@ class Shuttle(Robot[ShuttleState]):
     episode_limit: Iterations = 120
 
     name: ClassVar[str] = "shuttle"
-    noise_size: ClassVar[int] = 0
-    paper_iterations: ClassVar[int] = 500_000
 
     def __post_init__(self) -> None:
         if self.place_radius_m >= self.place_m:
@@ -106,9 +104,6 @@ class Shuttle(Robot[ShuttleState]):
 
     def reset(self, key: Array) -> ShuttleState:
         """At rest in the middle; the cue is drawn."""
-        import jax
-        import jax.numpy as jnp
-
         zero = jnp.zeros((), jnp.float32)
         return ShuttleState(zero, zero, jnp.where(jax.random.uniform(key) < 0.5, 1.0, -1.0).astype(jnp.float32))
 
@@ -116,8 +111,6 @@ class Shuttle(Robot[ShuttleState]):
         self, uniforms: Float[Array, " noise_size"], state: ShuttleState, u: Float[Array, ""]
     ) -> tuple[ShuttleState, Float[Array, ""], Bool[Array, ""]]:
         """The cart comes up to its speed (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
-
         kept = math.exp(-self.step_s / self.time_constant_s)
         wanted = self.speed_m_per_s * u
         moved = wanted * self.step_s + (state.velocity_m_per_s - wanted) * self.time_constant_s * (1 - kept)
@@ -135,8 +128,6 @@ class Shuttle(Robot[ShuttleState]):
 
     def observe(self, state: ShuttleState) -> Float[Array, " observations"]:
         """Position (m) and velocity (m/s) of the cart, and the cue."""
-        import jax.numpy as jnp
-
         return jnp.stack(state)
 
     def with_goal_of(self, state: ShuttleState, other: ShuttleState) -> ShuttleState:
@@ -196,18 +187,9 @@ class Shuttle(Robot[ShuttleState]):
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """How far the cart was on the cue's side of the middle in each episode, over time."""
-        arrived = 0
-        for path in paths:
-            towards_m = path[:, 0] * path[0, 2]
-            there = bool(abs(towards_m[-1] - self.place_m) <= self.place_radius_m)
-            arrived += there
-            time_s = np.arange(len(path)) * self.step_s
-            axes.plot(time_s, towards_m, color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
-        for edge_m in (self.place_m - self.place_radius_m, self.place_m + self.place_radius_m):
-            axes.axhline(edge_m, color=EDGE, linewidth=0.8, linestyle="--")
-        axes.set_xlim(0, self.episode_limit * self.step_s)
+        towards_m = [path[:, 0] * path[0, 2] for path in paths]
+        arrived = [bool(abs(each[-1] - self.place_m) <= self.place_radius_m) for each in towards_m]
+        edges_m = (self.place_m - self.place_radius_m, self.place_m + self.place_radius_m)
+        told, ylabel = "end at their place", "position on the cue's side (m)"
+        draw_over_time(axes, self, towards_m, arrived, limits=edges_m, told=told, ylabel=ylabel)
         axes.set_ylim(-0.55 * self.track_length_m, 0.55 * self.track_length_m)
-        axes.set(
-            xlabel=f"time (s); {arrived} of {len(paths)} end at their place",
-            ylabel="position on the cue's side (m)",
-        )
