@@ -93,7 +93,7 @@ def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = CONFIDEN
     _check(confidence)
     from scipy.stats import mannwhitneyu
 
-    u_first = float(_won(a, b).sum())
+    u_first = float(np.sum(a[:, None] > b) + np.sum(a[:, None] == b) / 2)
     pooled = np.concatenate([a, b])
     ties = len(np.unique(pooled)) < len(pooled)
     if np.ptp(pooled) == 0:
@@ -226,13 +226,6 @@ def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
 def _check(confidence: float) -> None:
     if not 0 < confidence < 1:
         raise InvalidArgument(f"confidence: expected between 0 and 1, got {confidence:g}")
-
-
-def _won(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "n m"]:
-    """Of each pair, 1 if the first is larger, 1/2 if they are equal."""
-    difference = a[:, None] - b[None, :]
-    won: Float64[np.ndarray, "n m"] = (difference > 0) + 0.5 * (difference == 0)
-    return won
 
 
 def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:

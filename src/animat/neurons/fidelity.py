@@ -66,14 +66,8 @@ class Fidelity:
                 )
                 found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
-            found.append(
-                Finding(
-                    "above-range",
-                    "warning",
-                    f"{self.n_above_range} responses lie above the histogram's range and count into its last bin",
-                    float(self.n_above_range),
-                )
-            )
+            message = f"{self.n_above_range} responses lie above the histogram's range and count into its last bin"
+            found.append(Finding("above-range", "warning", message, float(self.n_above_range)))
         return tuple(found)
 
 
@@ -91,9 +85,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
             for c in range(len(responses.conditions))
         ]
     )
-    x = _evenly_drawn(simulator)
-    if isinstance(simulator, MemorySimulator):
-        x = _drawn_after_each(simulator)
+    x = _drawn_after_each(simulator) if isinstance(simulator, MemorySimulator) else _evenly_drawn(simulator)
     above = 0
     if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
@@ -104,10 +96,8 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
 
 @jax.jit
 def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws *readouts"]:
-    """Evenly spaced quantiles of every condition; compiled once for all simulators of a shape."""
-    uniforms = (jnp.arange(20_000) + 0.5) / 20_000
-    draw = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
-    return draw(jnp.arange(simulator.n_conditions), uniforms)
+    """Compiled once for all simulators of a shape."""
+    return simulator.evenly_drawn(20_000)
 
 
 @jax.jit

@@ -77,6 +77,12 @@ class NeuronSimulator(abc.ABC):
         """
         return Answer(self.quantile(condition, uniform), history)
 
+    def evenly_drawn(self, n: int) -> Float[Array, "conditions n *readouts"]:
+        """The responses to each condition at n evenly spaced quantiles, whatever was before."""
+        uniforms = (jnp.arange(n, dtype=jnp.float32) + 0.5) / n
+        quantile = jax.vmap(jax.vmap(self.quantile, (None, 0)), (0, None))
+        return quantile(jnp.arange(self.n_conditions), uniforms)
+
     @final
     def sample(
         self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = AT_FIRST
@@ -237,9 +243,7 @@ def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
 
     Responses at 512 evenly spaced quantiles stand for each condition, whatever was before.
     """
-    uniforms = (jnp.arange(512, dtype=jnp.float32) + 0.5) / 512
-    n = simulator.n_conditions
-    each = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))(jnp.arange(n), uniforms)
+    each, n = simulator.evenly_drawn(512), simulator.n_conditions
     pooled = each.reshape(-1, *each.shape[2:])
     pooled = pooled[jnp.argsort(pooled if pooled.ndim == 1 else pooled.mean(axis=1))]
     values = jnp.broadcast_to(pooled, (n, *pooled.shape))

@@ -28,7 +28,7 @@ from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import Phase, Pulse
-from animat.tables import UNKNOWN
+from animat.tables import UNKNOWN, padded
 
 HAND_OVER_S = 0.5
 """How long a stop waits for a pulse that is being handed over."""
@@ -336,9 +336,7 @@ def _checked(
                 raise InvalidArgument(f"patterns: expected channels from 0 to 63, got {channel} in number {number}")
     if not rows:
         raise InvalidArgument("patterns: expected at least one, got none")
-    table = np.full((len(rows), max(map(len, rows))), UNKNOWN, dtype=np.int64)
-    for place, row in zip(table, rows, strict=True):
-        place[: len(row)] = row
+    table = padded(rows)
     table.setflags(write=False)
     return table
 

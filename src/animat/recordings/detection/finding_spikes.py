@@ -118,9 +118,7 @@ def _noise_uv(
         for columns in blocks(channels):
             first = median_noise_uv(_filtered(piece.rows(columns), settings, rate_hz)[:, margin:-margin])
             if len(piece.stimulus):
-                rough = np.zeros(channels, np.float32)
-                rough[columns] = first
-                cleaned = piece.cleaned(columns, rough, rate_hz, settings)
+                cleaned = piece.cleaned(columns, first, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
                 first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
             found[columns] = first
@@ -196,7 +194,7 @@ def _of_block(
     rate_hz: float,
     settings: Detection,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    cleaned = piece.cleaned(columns, noise_uv, rate_hz, settings)
+    cleaned = piece.cleaned(columns, noise_uv[columns], rate_hz, settings)
     filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
     if cleaned.is_blank is not None:
         filtered[cleaned.is_blank] = 0.0
@@ -215,43 +213,35 @@ def _findings(
                   f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
     dead = int(np.count_nonzero(is_dead(noise_uv)))
     if dead:
-        yield Finding(
-            "dead-channels",
-            "note" if dead < 0.1 * n else "warning",
+        message = (
             f"{dead:,} of {n:,} channels are dead (less than {DEAD:g} of the median noise): no spike can be found on "
-            "them, and they count in rates per channel; leave them out of the routing next time",
-            float(dead),
+            "them, and they count in rates per channel; leave them out of the routing next time"
         )
+        yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
     noisy = int(np.count_nonzero(noise_uv > NOISY * middle)) if middle > 0 else 0
     if noisy:
-        yield Finding(
-            "noisy-channels",
-            "note" if noisy < 0.1 * n else "warning",
+        message = (
             f"{noisy:,} of {n:,} channels have more than {NOISY:g} times the median noise: only large spikes are found "
-            "on them; look for loose contacts or air bubbles",
-            float(noisy),
+            "on them; look for loose contacts or air bubbles"
         )
+        yield Finding("noisy-channels", "note" if noisy < 0.1 * n else "warning", message, float(noisy))
     if n_stimuli:
         before, after = settings.blank_ms
-        yield Finding(
-            "blanked",
-            "note" if after <= 2.0 else "warning",
+        message = (
             f"from {before:g} ms before to {after:g} ms after each of {n_stimuli:,} stimuli nothing is looked for"
-            + ("" if after <= 2.0 else "; the response window usually begins at 2 ms, so part of it is lost"),
-            after,
+            + ("" if after <= 2.0 else "; the response window usually begins at 2 ms, so part of it is lost")
         )
+        yield Finding("blanked", "note" if after <= 2.0 else "warning", message, after)
     if len(saturation) and saturation[:, 0].any():
         mean, longest = float(saturation[:, 0].mean()), float(np.median(saturation[saturation[:, 0] > 0, 1]))
         share = mean / max(n, 1)
-        yield Finding(
-            "saturated-channels",
-            "note" if share < 0.05 or longest <= 2.0 else "warning",
+        message = (
             f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
             f"{longest:.1f} ms; they are blanked until then"
             + (
                 ": rates in an earlier window are too low, use one that begins later"
                 if share >= 0.05 and longest > 2
                 else ""
-            ),
-            share,
+            )
         )
+        yield Finding("saturated-channels", "note" if share < 0.05 or longest <= 2.0 else "warning", message, share)

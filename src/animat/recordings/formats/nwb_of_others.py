@@ -19,6 +19,7 @@ from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
+from animat.recordings.formats.nwb_layout import SUBJECT
 from animat.recordings.formats.nwb_stimuli import read_stimuli
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -29,13 +30,6 @@ POSITIONS = (("rel_x", "rel_y"), ("x", "y"))
 UNIT_LABELS = ("unit_name", "label", "cluster_id")
 ELECTRODE_LABELS = ("label", "channel_name", "electrode_name")
 TEXTS = ("experiment_description", "session_description", "institution", "lab")
-SUBJECT = {
-    "subject_id": "subject_id",
-    "species": "species",
-    "sex": "sex",
-    "age": "age",
-    "description": "subject_description",
-}
 
 
 def read_other_nwb(file: Hdf5File, path: Path, stimuli: str | None, spikes: bool = True) -> Recording:

@@ -131,15 +131,13 @@ def _artefact_finding(
         if reaches
         else f"the window from {window_ms[0]:g} ms on does not hold them"
     )
-    return Finding(
-        "artefact-spikes",
-        "warning" if reaches else "note",
+    message = (
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
         f"{count[first : last + 1].max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
         f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
-        f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
-        spikes / n_stimuli,
+        f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}"
     )
+    return Finding("artefact-spikes", "warning" if reaches else "note", message, spikes / n_stimuli)
 
 
 def _blank(
@@ -170,10 +168,8 @@ def _blank(
         yield Finding("blanked-window", "note", f"{found}; the window from {window_ms[0]:g} ms on is after it", 0.0)
         return
     remedy = f"use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else "use a window after it"
-    yield Finding(
-        "blanked-window",
-        "note" if lost <= 0.15 else "warning",
+    message = (
         f"{found}: {100 * min(lost, 1):.0f} % of the window from {window_ms[0]:g} to {window_ms[1]:g} ms is lost, and "
-        f"rates are too low by as much: {remedy}",
-        min(lost, 1.0),
+        f"rates are too low by as much: {remedy}"
     )
+    yield Finding("blanked-window", "note" if lost <= 0.15 else "warning", message, min(lost, 1.0))
