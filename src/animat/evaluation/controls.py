@@ -121,12 +121,19 @@ def interventions_of(
     ]
     if not isinstance(environment.robot, HostRobot):
         found.append(control("yoked", "the stimuli of another episode", YokedDelivery(environment)))
-    turned = with_inmost(environment, lambda _: TurnedRound(*fields))
-    found.append(control("turned round", "the opposite of every command", turned))
+    found.append(control("turned round", "the opposite of every command", turned_round(environment)))
     if switch_at is not None and hasattr(environment.robot, "with_goal_of"):
         switched = GoalSwitch(environment, switch_at)
         found.append(control("goal switched", f"another goal after {switch_at} actions", switched))
     return found
+
+
+def turned_round(environment: Environment[Any]) -> Environment[Any]:
+    """The same with the opposite of every command."""
+    animat = unwrapped(environment)
+    assert isinstance(animat, Animat)
+    turned = TurnedRound(animat.robot, animat.mapping, animat.n_conditions)
+    return with_inmost(environment, lambda _: turned)
 
 
 def _without_effect(

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from animat.coding.mapping import Mapping, Thresholds
 from animat.environment import Animat
 from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum, best_returns
 from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Uniform, roll_out
+from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import HistogramSimulator, fit_histogram, pooled_percentiles
 from animat.responses.responses import Responses
 from animat.robots.base import Robot
@@ -89,7 +88,7 @@ def optimal_returns(
     found = []
     for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
         returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
-        error = float(returns.std(ddof=1) / np.sqrt(returns.size))
+        error = standard_error(returns)
         of_coupling = roll_out(*case, best_coupling(*case, seed=seed), 1, episodes=episodes, seed=seed).returns[0]
         gap = context_gap(of_coupling, returns, of_mapping)
         told = replace(of_mapping, left_out=left_out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import reduce
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from jaxtyping import Bool, Float
 from pydantic import Field
@@ -131,10 +131,7 @@ class Ball:
         unit = f" {self.unit}" if self.unit else ""
         return f"{', '.join(self.quantities)} around {centre} radius {number(self.radius)}{unit}"
 
-    @property
-    def has_its_edge(self) -> bool:
-        """Its edge belongs to it."""
-        return True
+    has_its_edge: ClassVar[bool] = True
 
     def bounds(self) -> dict[str, tuple[float, float]]:
         """Of what lies in it."""

@@ -34,9 +34,8 @@ from animat.evaluation.verdict import beside
 from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
-from animat.reality_gap.answered import answered
+from animat.reality_gap.answered import answered, outcomes
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.goals import outcomes
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import (
     BOOTSTRAPS_ON_HOST,

@@ -199,12 +199,12 @@ class Bodies:
         actions = robot.actions(commands)
         reward = np.zeros(len(bodies))
         terminated, truncated = np.zeros(len(bodies), bool), np.zeros(len(bodies), bool)
-        with within(robot, "step"):
-            try:
-                for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
-                    observation[i], reward[i], terminated[i], truncated[i] = body.step(action)
-            except (Exception, SystemExit) as error:
-                raise _failed(robot, "step", error) from error
+
+        def step() -> None:
+            for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
+                observation[i], reward[i], terminated[i], truncated[i] = body.step(action)
+
+        tried(robot, "step", step)
         if kept.shape[1]:
             kept[np.arange(len(bodies)), iterations] = commands
         iterations += 1
