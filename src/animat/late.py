@@ -1,11 +1,14 @@
-"""JAX for files that are read without it: it is imported when something of it is first used, and not before."""
+"""What is heavy, for files that are read without it: JAX is imported when something of it is first used, not before.
+
+`Array` and `Axes` stand in annotations only.
+"""
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["Array", "jax", "jnp"]
+__all__ = ["Array", "Axes", "jax", "jnp"]
 
 
 class _Late:
@@ -22,5 +25,6 @@ if TYPE_CHECKING:
     import jax
     import jax.numpy as jnp
     from jax import Array
+    from matplotlib.axes import Axes
 else:
-    jax, jnp, Array = _Late("jax"), _Late("jax.numpy"), Any
+    jax, jnp, Array, Axes = _Late("jax"), _Late("jax.numpy"), Any, Any

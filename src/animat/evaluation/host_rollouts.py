@@ -54,9 +54,7 @@ def roll_out_on_host(
 
     Args:
         environment: with a robot that is stepped on the host.
-        episodes: of each actor.
-        simulator: the neurons' answers; None without neurons.
-        actors: one kind of actor, its arrays with a leading axis of actors.
+        episodes, simulator, actors: as in `animat.evaluation.rollouts.roll_out`.
         keys: of each actor's draws.
         seed: of the episodes of the bodies.
     """

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -34,11 +34,9 @@ from animat.goals.text import read_goal
 from animat.late import Array, jax, jnp
 from animat.robots.base import Quantity, Robot
 from animat.robots.capabilities import WITHOUT, capability
+from animat.robots.grid import Grid
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
-
-if TYPE_CHECKING:
-    from animat.robots.grid import Grid
 
 FAILED, REACHED = 100.0, 50.0
 """What an episode's end costs and is worth, where all weights are the same."""

@@ -37,7 +37,6 @@ EPISODES = 200
 ROLL_OUTS = 5
 """On the recording's simulator; one on each simulator of bootstrapped responses."""
 
-
 BOOTSTRAPS_ON_HOST = 40
 """Fewer for a robot that is stepped on the host, where an episode takes a thousand times as long."""
 

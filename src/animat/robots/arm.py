@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
-from animat.late import Array, jax, jnp
+from animat.late import Array, Axes, jax, jnp
 from animat.records import record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, draw_over_time
 from animat.robots.motion import cost_of_distance, runge_kutta
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SUBSTEPS = 4
 """Steps of the equations of motion in an iteration: damping settles a light link within a part of one."""

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
-from animat.late import Array, jnp
+from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
 
 FORESIGHT_S = 0.1
 """The heuristic goes by where the pole will lean so much later, at the speed it falls with now."""
@@ -186,8 +182,6 @@ class Cartpole(Robot[CartpoleState]):
         Raises:
             InvalidArgument: for a pole that may swing far.
         """
-        from animat.robots.grid import Axis, Grid
-
         if self.angle_limit_rad > 0.75:
             raise InvalidArgument(
                 f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {self.angle_limit_rad:g}; "

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
 from animat.errors import InvalidArgument
+from animat.late import Axes
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]

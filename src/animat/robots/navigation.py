@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
+from typing import Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.late import Array, jnp
+from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import (
@@ -28,13 +28,9 @@ from animat.robots.drawing import (
     Canvas,
     Picture,
 )
+from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
 
 
 class NavigationState(NamedTuple):
@@ -191,8 +187,6 @@ class Navigation(Robot[NavigationState]):
 
         A hundred headings: turns of u pi/10 with u a multiple of 0.2 lead from one of them to another exactly.
         """
-        from animat.robots.grid import Axis, Grid
-
         return Grid(
             Axis("x", "m", 0.0, self.arena_width_m, 61),
             (

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
-from animat.late import Array, jax, jnp
+from animat.late import Array, Axes, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
 
 BRAKE_S = 0.2
 """Of the heuristic: how far ahead of the cart it looks, in seconds of its present velocity."""
@@ -145,8 +141,6 @@ class Shuttle(Robot[ShuttleState]):
 
         Every command of its own, as one may decide whether an iteration is rewarded.
         """
-        from animat.robots.grid import TAPS, Axis, Grid
-
         half_m, fastest = self.track_length_m / 2, self.speed_m_per_s
         return Grid(
             Axis("cue", "1", -1.0, 1.0, TAPS),

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
+from typing import Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.late import Array, jnp
+from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, Canvas, Picture, draw_over_time
+from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.motion import runge_kutta, within_half_a_turn
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
-
 
 SPARE = 0.07
 """Of the heuristic: how much more energy than it takes to stand, as a part of the largest acceleration by gravity."""
@@ -156,8 +151,6 @@ class SwingUp(Robot[SwingUpState]):
         Each of the two has a part in how the other one moves, and a grid wants a first coordinate that has none: it is
         one that means nothing, with the fewest nodes.
         """
-        from animat.robots.grid import TAPS, Axis, Grid
-
         fastest = self.speed_limit_rad_per_s
         return Grid(
             Axis("nothing", "1", 0.0, 1.0, TAPS),

@@ -145,7 +145,7 @@ def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Rec
     """
     path = Path(path)
     with hdf5_file(path, WHAT) as file:
-        return read_open_nwb(file, path, stimuli)
+        return _read(file, stimuli)
 
 
 def is_nwb(file: Hdf5File) -> bool:
@@ -153,12 +153,12 @@ def is_nwb(file: Hdf5File) -> bool:
     return "nwb_version" in file.file.attrs
 
 
-def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Recording:
-    """Read an open file; see `read_nwb`."""
+def _read(file: Hdf5File, stimuli: str | None) -> Recording:
+    path = file.path
     if not is_nwb(file):
         raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
     if not file.has(RECORDING_TABLE):
-        return read_other_nwb(file, path, stimuli)
+        return read_other_nwb(file, stimuli)
     if stimuli is not None:
         raise InvalidFile(f"{path}: expected no choice of stimuli for a file of animat's own, got {stimuli!r}")
     version = _cell(file, "format_version", int)

@@ -9,7 +9,6 @@ Every unit becomes a channel, silent ones too; a unit on several electrodes take
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -32,12 +31,11 @@ ELECTRODE_LABELS = ("label", "channel_name", "electrode_name")
 TEXTS = ("experiment_description", "session_description", "institution", "lab")
 
 
-def read_other_nwb(file: Hdf5File, path: Path, stimuli: str | None, spikes: bool = True) -> Recording:
+def read_other_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
     """Read a recording that another program wrote.
 
     Args:
         file: open.
-        path: of the file.
         stimuli: the name of the stimuli, where the file holds several that could be meant.
         spikes: whether units must be there; without, channels and stimuli are read, for raw traces beside them.
 
@@ -45,7 +43,7 @@ def read_other_nwb(file: Hdf5File, path: Path, stimuli: str | None, spikes: bool
         InvalidFile: if the file holds no units, or several stimuli and none is chosen.
         UnusableData: if a column is not what it should be.
     """
-    findings: list[Finding] = []
+    path, findings = file.path, list[Finding]()
     columns: dict[str, Any]
     if spikes:
         if not file.has(f"{UNITS}/spike_times"):
