@@ -89,8 +89,7 @@ class Commands:
             part = np.clip((self.levels - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
             hats = np.eye(len(nodes))
             basis = (1 - part)[..., None] * hats[left] + part[..., None] * hats[left + 1]
-        weights: Float64[np.ndarray, "actions nodes"] = np.einsum("al,alk->ak", self.probabilities, basis)
-        return weights
+        return np.asarray(np.einsum("al,alk->ak", self.probabilities, basis))
 
 
 def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> Commands:

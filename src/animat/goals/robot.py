@@ -162,13 +162,11 @@ class RobotWithGoal(Robot[GoalState]):
         return self.started(self.robot.reset(key))
 
     def observe(self, state: GoalState) -> Float[Array, " observations"]:
-        """What is seen of the robot."""
         return self.robot.observe(state.robot)
 
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: GoalState, u: Float[Array, "*commands"]
     ) -> tuple[GoalState, Float[Array, ""], Bool[Array, ""]]:
-        """One iteration of the robot, and what it is worth (see the module)."""
         robot, _, _ = self.robot.advance(uniforms, state.robot, u)
         outside, tally, reward, ended = self._judged(self._seen(robot), state.outside, state.tally)
         return GoalState(robot, outside, tally), reward, ended

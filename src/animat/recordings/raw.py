@@ -87,11 +87,9 @@ class ArrayTraces:
 
     @property
     def samples(self) -> int:
-        """How many each channel has."""
         return int(self.voltage_uv.shape[0])
 
     def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        """The voltage of samples `start` to `stop`."""
         return in_microvolts(self.voltage_uv[start:stop], self.uv_per_step)
 
 

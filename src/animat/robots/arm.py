@@ -142,7 +142,6 @@ class TwoLinkArm(Robot[ArmState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: ArmState, u: Float[Array, " n_commands"]
     ) -> tuple[ArmState, Float[Array, ""], Bool[Array, ""]]:
-        """The links move under the same torques throughout (see `Robot.advance` and the class)."""
         m11, m12, m22, coupling = self._inertia
         torques = self.torque_n_m * jnp.asarray(u)
 
@@ -165,7 +164,6 @@ class TwoLinkArm(Robot[ArmState]):
         return after, reward, jnp.zeros((), bool)
 
     def observe(self, state: ArmState) -> Float[Array, " observations"]:
-        """What `observation_spec` names, in its order."""
         q1, q2, w1, w2, target_x_m, target_y_m = state
         joints = (jnp.cos(q1), jnp.sin(q1), jnp.cos(q2), jnp.sin(q2))
         return jnp.stack([*joints, w1, w2, target_x_m, target_y_m, *self._to_target(state)])

@@ -109,7 +109,6 @@ class Cartpole(Robot[CartpoleState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: CartpoleState, u: Float[Array, ""]
     ) -> tuple[CartpoleState, Float[Array, ""], Bool[Array, ""]]:
-        """One push of the cart (see `Robot.advance` and the class)."""
         position, velocity, angle, angular_velocity = state
         pole_mass, half_length = self.pole_mass_kg, self.pole_length_m / 2
         total_mass = self.cart_mass_kg + pole_mass
@@ -135,7 +134,6 @@ class Cartpole(Robot[CartpoleState]):
         return after, reward, terminated
 
     def observe(self, state: CartpoleState) -> Float[Array, " observations"]:
-        """Cart position (m) and velocity (m/s), pole angle (rad) and angular velocity (rad/s)."""
         return jnp.stack(state)
 
     def caveats(self) -> tuple[str, ...]:

@@ -119,8 +119,7 @@ class Stepped(NamedTuple):
     @property
     def ended(self) -> Bool[np.ndarray, " bodies"]:
         """In either way."""
-        ended: Bool[np.ndarray, " bodies"] = self.terminated | self.truncated
-        return ended
+        return np.asarray(self.terminated | self.truncated)
 
 
 class Standing(NamedTuple):

@@ -134,7 +134,6 @@ class Navigation(Robot[NavigationState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: NavigationState, u: Float[Array, ""]
     ) -> tuple[NavigationState, Float[Array, ""], Bool[Array, ""]]:
-        """One turn and one stride (see `Robot.advance` and the class)."""
         heading = within_half_a_turn(state.heading_rad + self.turn_rad * u)
         x = jnp.clip(state.x_m + self.stride_m * jnp.cos(heading), 0.0, self.arena_width_m)
         y = jnp.clip(state.y_m + self.stride_m * jnp.sin(heading), 0.0, self.arena_height_m)
@@ -146,7 +145,6 @@ class Navigation(Robot[NavigationState]):
         return NavigationState(x, y, heading), reward, terminated
 
     def observe(self, state: NavigationState) -> Float[Array, " observations"]:
-        """Position (m, m) from the top-left corner, and heading (rad)."""
         return jnp.stack(state)
 
     def caveats(self) -> tuple[str, ...]:

@@ -106,7 +106,6 @@ class Shuttle(Robot[ShuttleState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: ShuttleState, u: Float[Array, ""]
     ) -> tuple[ShuttleState, Float[Array, ""], Bool[Array, ""]]:
-        """The cart comes up to its speed (see `Robot.advance` and the class)."""
         kept = math.exp(-self.step_s / self.time_constant_s)
         wanted = self.speed_m_per_s * u
         moved = wanted * self.step_s + (state.velocity_m_per_s - wanted) * self.time_constant_s * (1 - kept)
@@ -123,7 +122,6 @@ class Shuttle(Robot[ShuttleState]):
         return after, reward, jnp.zeros((), bool)
 
     def observe(self, state: ShuttleState) -> Float[Array, " observations"]:
-        """Position (m) and velocity (m/s) of the cart, and the cue."""
         return jnp.stack(state)
 
     def with_goal_of(self, state: ShuttleState, other: ShuttleState) -> ShuttleState:

@@ -100,7 +100,6 @@ class SwingUp(Robot[SwingUpState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: SwingUpState, u: Float[Array, ""]
     ) -> tuple[SwingUpState, Float[Array, ""], Bool[Array, ""]]:
-        """One step with the same torque throughout (see `Robot.advance` and the class)."""
 
         def rates(state: SwingUpState) -> SwingUpState:
             angle, angular_velocity = state
@@ -114,7 +113,6 @@ class SwingUp(Robot[SwingUpState]):
         return after, reward, jnp.zeros((), bool)
 
     def observe(self, state: SwingUpState) -> Float[Array, " observations"]:
-        """Cosine and sine of the angle from upright, and the angular velocity (rad/s)."""
         return jnp.stack([jnp.cos(state.angle_rad), jnp.sin(state.angle_rad), state.angular_velocity_rad_per_s])
 
     def caveats(self) -> tuple[str, ...]:

@@ -151,7 +151,6 @@ class Wheeled(Robot[WheelsState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: WheelsState, u: Float[Array, " n_commands"]
     ) -> tuple[WheelsState, Float[Array, ""], Bool[Array, ""]]:
-        """Both wheels turn at constant speeds (see `Robot.advance` and the class)."""
         left_m, right_m = self.max_speed_m_per_s * self.step_s * jnp.asarray(u)
         turn = (left_m - right_m) / self.wheel_distance_m
         # The chord of the arc, which points half way between the headings at its ends; jnp.sinc has a factor pi.

@@ -138,7 +138,6 @@ class CL1Culture(Culture):
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
-        """Channels of each pattern."""
         return self._patterns
 
     @property
@@ -148,7 +147,6 @@ class CL1Culture(Culture):
 
     @property
     def device_limits(self) -> Limits:
-        """`CL1_LIMITS`."""
         return CL1_LIMITS
 
     @property
@@ -160,7 +158,6 @@ class CL1Culture(Culture):
 
     @property
     def sampling_rate_hz(self) -> float:
-        """25 kHz."""
         return float(FRAMES_PER_S)
 
     @property
@@ -189,7 +186,6 @@ class CL1Culture(Culture):
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Spikes on ground and reference."""
         return {"spikes on ground or reference": self.spikes_not_on_electrodes}
 
     def _open(self) -> None:

@@ -151,15 +151,23 @@ def _detect(
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     depth_uv = depths_uv(noise_uv, settings.threshold)
 
+    def of_block(piece: Piece, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        cleaned = piece.cleaned(columns, noise_uv[columns], rate_hz, settings)
+        filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+        if cleaned.is_blank is not None:
+            filtered[cleaned.is_blank] = 0.0
+        end = margin + piece.stop - piece.start
+        row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
+        saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]
+        return sample - margin + piece.start, row + columns.start, saturation
+
     def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
-        found = [
-            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings) for columns in blocks(len(noise_uv))
-        ]
+        found = [of_block(piece, columns) for columns in blocks(len(noise_uv))]
         saturation = np.zeros((np.count_nonzero(piece.owned), 2))
-        for _, _, of_block in found:
-            saturation[:, 0] += of_block[:, 0]
-            saturation[:, 1] = np.maximum(saturation[:, 1], of_block[:, 1])
+        for _, _, more in found:
+            saturation[:, 0] += more[:, 0]
+            saturation[:, 1] = np.maximum(saturation[:, 1], more[:, 1])
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found]), saturation
 
     samples, channels, saturations = [], [], []
@@ -183,26 +191,6 @@ def _detect(
         np.concatenate([empty, *channels]),
         np.concatenate([np.zeros((0, 2)), *saturations]),
     )
-
-
-def _of_block(
-    piece: Piece,
-    columns: slice,
-    noise_uv: Float32[np.ndarray, " channels"],
-    depth_uv: Float32[np.ndarray, " channels"],
-    apart: int,
-    rate_hz: float,
-    settings: Detection,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    cleaned = piece.cleaned(columns, noise_uv[columns], rate_hz, settings)
-    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
-    if cleaned.is_blank is not None:
-        filtered[cleaned.is_blank] = 0.0
-    row, sample = find_negative_peaks(
-        filtered, depth_uv[columns], apart, piece.margin, piece.margin + piece.stop - piece.start
-    )
-    saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]
-    return sample - piece.margin + piece.start, row + columns.start, saturation
 
 
 def _findings(
