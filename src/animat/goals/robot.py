@@ -129,8 +129,8 @@ class RobotWithGoal(Robot[GoalState]):
 
     @property
     def _cost(self) -> float:
-        """Of every iteration: 1 where there is anything to reach."""
-        return float(self.goal.can_be_reached)
+        """Of every iteration: 1 where there is anything to reach, as an episode that waits then only costs."""
+        return float(any(each.kind == "reach" for each in self._objectives))
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
@@ -247,7 +247,7 @@ class RobotWithGoal(Robot[GoalState]):
 
     def _value_grid(self) -> Grid:
         """The robot's own grid. A goal with `within` has none: how long a robot has been outside is no place on it."""
-        if self.goal.needs_memory:
+        if any(each.within is not None for each in self._objectives):
             raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
         grid: Grid = capability(self.robot, "value_grid")()
         of_goal = replace(
@@ -266,7 +266,8 @@ class RobotWithGoal(Robot[GoalState]):
         def seen_after(row: Array, node: Array, chance: float, u: float) -> Array:
             state = grid.state_at(row, node)
             robot, _, _ = self.robot.advance(jnp.full(self.noise_size, chance), state, jnp.float32(u))
-            ends = [m for each, (m, _) in zip(self._objectives, self._seen(robot), strict=True) if each.can_end]
+            told = zip(self._objectives, self._seen(robot), strict=True)
+            ends = [margin for each, (margin, _) in told if each.can_fail or each.kind == "reach"]
             return jnp.stack(ends) if ends else jnp.zeros(0)
 
         after = jax.vmap(seen_after, (0, 0, None, None))

@@ -19,6 +19,10 @@ LARGEST_LOSS = 0.05
 """A difference in P(x >= P50) between data and simulator above which `findings` warns."""
 
 
+_evenly_drawn = jax.jit(NeuronSimulator.evenly_drawn, static_argnums=1)
+"""Compiled once for all simulators of a shape."""
+
+
 @dataclass(frozen=True)
 class Fidelity:
     """How often each condition passes the pooled median, in the data and in the simulator.
@@ -85,19 +89,13 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
             for c in range(len(responses.conditions))
         ]
     )
-    x = _drawn_after_each(simulator) if isinstance(simulator, MemorySimulator) else _evenly_drawn(simulator)
+    x = _drawn_after_each(simulator) if isinstance(simulator, MemorySimulator) else _evenly_drawn(simulator, 20_000)
     above = 0
     if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
     in_simulator = np.asarray(jnp.mean(x >= median_hz, axis=1), np.float64)
     return Fidelity(labels, in_data, in_simulator, above, responses.readouts.names)
-
-
-@jax.jit
-def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws *readouts"]:
-    """Compiled once for all simulators of a shape."""
-    return simulator.evenly_drawn(20_000)
 
 
 @jax.jit

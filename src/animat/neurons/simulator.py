@@ -224,7 +224,8 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
     room = int(counts.max()) if room is None else room
     if counts.max() > room:
         raise InvalidArgument(f"room: expected at least {counts.max()}, the largest condition's responses, got {room}")
-    table = np.stack([_padded(x, room) for x in values])
+    # Padded with the last one over and over.
+    table = np.stack([np.concatenate([x, np.repeat(x[-1:], room - len(x), axis=0)]) for x in values])
     return EmpiricalSimulator(
         jnp.asarray(table, jnp.float32), jnp.asarray(counts, jnp.int32), pooled_percentiles(responses)
     )
@@ -260,11 +261,6 @@ def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts
     if not len(kept):
         raise UnusableData("responses: expected at least one non-burst response, got none")
     return kept
-
-
-def _padded(values: Float64[np.ndarray, "responses *readouts"], room: int) -> Float64[np.ndarray, "room *readouts"]:
-    """With the last one over and over."""
-    return np.concatenate([values, np.repeat(values[-1:], room - len(values), axis=0)])
 
 
 def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *readouts"]]:

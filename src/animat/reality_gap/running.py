@@ -37,14 +37,7 @@ from animat.progress import Progress, in_phase
 from animat.reality_gap.answered import answered, outcomes
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import (
-    BOOTSTRAPS_ON_HOST,
-    ROLL_OUTS,
-    Predicted,
-    episodes_on_host,
-    predict,
-    together,
-)
+from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Predicted, episodes_on_host, predict, together
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.row import Row, between
 from animat.reality_gap.table import RealityGap

@@ -14,20 +14,7 @@ from animat.errors import InvalidArgument
 from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
-from animat.robots.drawing import (
-    ACCENT,
-    AIM,
-    BODY,
-    DONE,
-    EDGE,
-    FAILED,
-    GOAL,
-    GOAL_FILL,
-    INK,
-    TRAIL,
-    Canvas,
-    Picture,
-)
+from animat.robots.drawing import ACCENT, AIM, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
