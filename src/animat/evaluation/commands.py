@@ -100,7 +100,6 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     equal probability; a continuous action by 21 evenly spaced commands.
 
     Args:
-        environment: robot and mapping.
         simulator: the neurons' answers; None without neurons.
 
     Raises:

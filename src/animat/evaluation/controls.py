@@ -64,7 +64,6 @@ def controls_of(
         environment, simulator: what the policies are evaluated in (no simulator without neurons).
         labels: of discrete actions.
         policies: several side by side; None leaves out what needs them.
-        n_policies: how many.
     """
     controls = [Control("random", "any action, equally likely", environment, simulator, Uniform())]
     for i, label in enumerate(labels):
@@ -99,7 +98,6 @@ def interventions_of(
     Args:
         environment, simulator: what the policies are evaluated in.
         policies: several side by side.
-        n_policies: how many.
         switch_at: the iteration at which the goal is switched; None leaves that out, as a robot with one goal does.
     """
     animat = unwrapped(environment)

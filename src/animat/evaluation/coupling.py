@@ -76,7 +76,6 @@ def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | No
     starts and chances. The best of the four last generations is chosen in fresh episodes.
 
     Args:
-        environment: robot and mapping.
         simulator: the neurons' answers; None without neurons.
         seed: decides every random draw.
 

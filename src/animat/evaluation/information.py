@@ -73,9 +73,7 @@ def goal_information(
     depend on s, as they would where an actor has been on its way to its own.
 
     Args:
-        environment, simulator: that the actors act in.
         actors: one kind of actor, its arrays with a leading axis of actors.
-        n_actors: how many there are.
         draws: actions drawn at each state with each goal; 2 are enough for actors that draw nothing.
         seed: decides every random draw.
 

@@ -62,8 +62,6 @@ def optimal_returns(
     Args:
         responses: of the recording; the simulator is the default one, a histogram of 20 bins. Conditions with fewer
             than 30 non-burst responses are left out, also for the random stimuli.
-        robot: with its task.
-        mappings: from responses to commands.
         resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by 0.8 at most.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`with_intervals`).

@@ -52,8 +52,6 @@ class Counted:
 
         Args:
             environment: with all of its conditions.
-            timeline: with its responses.
-            minute: of the recording.
             are_fixed: whether the mapping's percentiles are those of the first recording.
 
         Raises:
@@ -140,7 +138,6 @@ def with_intervals(
         optima: as `best_returns` gave them.
         environments: that they are of, all of one robot.
         responses: that the simulator in them was made of.
-        fit: makes a simulator of responses.
         resolution: of the optima's grid, which the rough one is not finer than.
         resamples: how often responses are bootstrapped; 0: there are no intervals.
         seed: decides what is drawn.

@@ -155,7 +155,6 @@ def interquartile_mean(
 
     Args:
         samples: numbers, shape (samples,).
-        confidence: of the interval.
         within: what the numbers can be at least and at most; the interval ends there.
 
     Raises:

@@ -89,13 +89,7 @@ def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Find
 
 
 def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, has_memory: bool) -> Iterator[Finding]:
-    """Where the recording shows that the culture remembers, and the simulator that predicts does not.
-
-    Args:
-        noticed: findings on the recording.
-        presentation: of the recording.
-        has_memory: whether the simulator does.
-    """
+    """Where the recording shows that the culture remembers, and the simulator that predicts does not."""
     remembers = next((finding for finding in noticed if finding.name == "memory"), None)
     if remembers is None or has_memory:
         return

@@ -136,9 +136,7 @@ def whose_work(
     The goal is switched in the middle of the median episode of the policies as they are.
 
     Args:
-        environment, simulator: what they act in.
         policies: several side by side.
-        n_policies: how many.
         episodes: of each policy and intervention.
         seed: decides every random draw.
         progress: told after each intervention.

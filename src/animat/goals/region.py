@@ -94,7 +94,6 @@ class Range:
 
         Args:
             seen: the quantities by name, in the units of `spec`, as the region is (`in_units`).
-            spec: what they are.
         """
         value = seen[self.quantity]
         within = [value - self.low] if self.low is not None else []

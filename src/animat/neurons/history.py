@@ -165,7 +165,6 @@ def recorded_states(responses: Responses, memory: Memory) -> Recorded:
     Args:
         responses: that a simulator was fitted to. Ranks are among them; the trials (`Responses.presentations`) may be
             more.
-        memory: the simulator's.
     """
     ranked = Ranked(responses)
     traces, left = ranked.recorded(memory)

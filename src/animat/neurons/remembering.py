@@ -55,7 +55,6 @@ class Remembering:
 
         Args:
             before: the state after the trial before it; `Remembered()` after silence.
-            condition: that was presented.
             rate_hz: the response of all channels, Hz a channel.
             first_s, at_s: its first and its last pulse, s.
             is_burst: whether the response was a burst, after which nothing is known of the trace.

@@ -62,7 +62,6 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
 
     Args:
         session: that ended.
-        loop: its settings.
         policies: their names among the agents.
     """
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]

@@ -92,7 +92,6 @@ def predict(
     Args:
         groups: agents as they will act on the culture; those of a group are policies that are run together.
         environment: robot and mapping, and what policies see besides.
-        calibration: the simulators.
         rule: the heuristic policy, where it is among the agents.
         greedy: whether policies take the most probable action.
         seed: decides every random draw.

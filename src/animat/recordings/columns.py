@@ -69,7 +69,6 @@ class PlainColumns:
         """Check and sort the columns and make a recording of them.
 
         Args:
-            provenance: where the columns came from.
             findings: what was noticed so far; these and what is noticed here go with the recording.
 
         Raises:

@@ -47,7 +47,6 @@ def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np
 
     Args:
         steps: of any number type, in any layout, shape (samples, channels).
-        uv_per_step: microvolts of one step.
     """
     samples, channels = steps.shape
     rows = np.empty((channels, samples), dtype=np.float32)

@@ -60,7 +60,6 @@ def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[
 
     Args:
         stimuli: with any frequencies.
-        has_times: whether their times are known.
     """
     if has_times:
         yield from _contradicted(stimuli)

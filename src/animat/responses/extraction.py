@@ -53,7 +53,6 @@ def extract_responses(
     counted in `findings`, where also everything else is said that makes the responses doubtful.
 
     Args:
-        recording: the spikes and stimuli.
         by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.

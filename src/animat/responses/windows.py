@@ -79,7 +79,6 @@ def count_spikes(
     stimulus' time and the window's edge decides, one sample (0.05 ms at 20 kHz) either way.
 
     Args:
-        recording: the spikes.
         from_s, to_s: the windows, in seconds on the recording's clock, shape (windows,).
     """
     times_s = recording.spike_times_s

@@ -21,9 +21,6 @@ MOST_COMMANDS = 64
 def check_robot(robot: Robot[Any]) -> None:
     """Reset a robot and step it a few times, and refuse it if something comes of it that no environment can use.
 
-    Args:
-        robot: of any class.
-
     Raises:
         InvalidArgument: naming the method or attribute, what was expected and what came.
     """

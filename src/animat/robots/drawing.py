@@ -80,10 +80,8 @@ def draw_over_time(
     """One number of each episode over time, in the colour of how the episode ended.
 
     Args:
-        axes: of Matplotlib.
         robot: whose iterations last `step_s`.
         values: of each episode, a number an iteration.
-        ended_well: each of them.
         limits: of the number, drawn across.
         told: what those that ended well did, in words: `end upright`.
         ylabel: what the number is, with its unit.

@@ -128,7 +128,6 @@ def places_within_reach(
     """The places of a square lattice through the start to which a disc can be moved from there.
 
     Args:
-        around: what stands there.
         start_m: where the disc's centre is at first.
         room_m: how near its centre may come to a wall or an obstacle.
         spacing_m: between neighbours in the lattice, less than twice `room_m`, or it passes through walls; a disc

@@ -177,9 +177,6 @@ def select_electrodes(
     product of spike amplitude and excitatory score, since stimulation is most reliable where the spike is largest.
 
     Args:
-        array: that was scanned.
-        scan: its spontaneous activity.
-        rule: what is asked for.
         seed: decides the patterns.
 
     Raises:

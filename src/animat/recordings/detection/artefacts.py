@@ -65,7 +65,6 @@ def without_artefacts(
         voltage_uv: as recorded, one row a channel; changed.
         stimulus: sample of each pulse in the stretch, rising; may be outside it, by as much as is blanked or followed.
         noise_uv: of each channel, to tell a large deviation from a small one.
-        rate_hz: of the samples.
         settings: how long to blank.
     """
     samples = voltage_uv.shape[1]

@@ -59,7 +59,6 @@ def find_spikes(
     stimuli (`artefacts`).
 
     Args:
-        traces: where the voltage is.
         stimulus_time_s: starts of the pulses on the recording's clock.
         settings: how; by default as in `Detection`.
         workers: threads; by default one a core. Memory grows with them, by some 200 MB each for 1,024 channels.

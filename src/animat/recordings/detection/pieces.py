@@ -54,7 +54,6 @@ def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start
     """Read a piece.
 
     Args:
-        traces: to read from.
         stimulus: sample of every pulse of the recording, rising.
         start, stop: samples of the recording.
         margin: samples more on both sides.

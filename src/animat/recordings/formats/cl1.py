@@ -46,7 +46,6 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
     """Read spikes and stimuli of a CL1 recording.
 
     Args:
-        path: the file.
         spikes: whether spikes must be there; without, stimuli are read, for raw traces beside them.
 
     Raises:

@@ -56,7 +56,6 @@ def read_maxwell(
     """Read spikes, stimuli and electrodes of one recording of a MaxWell file.
 
     Args:
-        path: the file.
         part: which recording, such as `well000/rec0000`, where the file holds several.
         stimuli: the type of the events that are stimuli, as a number, where there are several types.
         spikes: whether spikes must be there; without, channels and stimuli are read, for raw traces beside them.

@@ -55,7 +55,6 @@ def write_nwb(
     """Write a recording as one NWB file, complete or absent.
 
     Args:
-        recording: what to write.
         path: the file; parent folders are made, an old file is replaced only by a complete new one.
         spikes: in place of the recording's own, which are none: more than memory holds, in any order.
         counts: of `spikes`.
@@ -137,7 +136,6 @@ def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Rec
     """Read a recording that `write_nwb` wrote, which equals the one that was written, or that another program wrote.
 
     Args:
-        path: the file.
         stimuli: for another program's file, the name of the stimuli where several could be meant.
 
     Raises:

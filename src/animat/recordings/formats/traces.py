@@ -32,7 +32,6 @@ def open_traces(
     """Raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
     Args:
-        path: the file.
         part: of a MaxWell file that holds several recordings, which; of an NWB file with several series, which.
         stimuli: which of several things are the stimuli, as in `read_recording`.
 

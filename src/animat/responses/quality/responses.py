@@ -41,10 +41,6 @@ def findings_on(
     """Everything there is to say about how far responses can be trusted.
 
     Args:
-        responses: the responses.
-        recording: what they come from.
-        assignment: the condition of every pulse.
-        bursts: the burst separation.
         inside: whether a pulse's window ends within the recording, shape (stimuli,).
     """
     if not len(recording.stimuli):
@@ -68,14 +64,7 @@ def findings_on(
 def findings_without_times(
     responses: Responses, stimuli: Stimuli, assignment: Assignment, bursts: BurstSeparation
 ) -> tuple[Finding, ...]:
-    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told.
-
-    Args:
-        responses: the responses.
-        stimuli: what they are responses to.
-        assignment: the condition of every stimulus.
-        bursts: the burst separation.
-    """
+    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told."""
     return (
         *_without_condition(stimuli, assignment),
         Finding(
