@@ -122,6 +122,10 @@ def test_loading_a_policy_needs_no_jax() -> None:
     assert "jax" not in modules_after("import animat.training.policy")
 
 
+def test_robots_and_goals_are_read_without_what_moves_and_draws_them() -> None:
+    assert not modules_after("import animat.robots, animat.robots.grid, animat.goals.robot") & {"jax", "matplotlib"}
+
+
 def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
     import animat
 

@@ -34,9 +34,6 @@ class Control:
     Attributes:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`.
         meaning: what it does, in a few words.
-        environment, simulator: that it is run in.
-        actor: who acts.
-        n_actors: how many they are.
     """
 
     name: str
@@ -97,7 +94,6 @@ def interventions_of(
 
     Args:
         environment, simulator: what the policies are evaluated in.
-        policies: several side by side.
         switch_at: the iteration at which the goal is switched; None leaves that out, as a robot with one goal does.
     """
     animat = unwrapped(environment)

@@ -23,9 +23,7 @@ class OptimalReturn:
     """What could be had through one mapping.
 
     Attributes:
-        robot, mapping: their names.
         random: mean return of random stimuli.
-        random_standard_error: of that.
         best: the optimal return of any controller.
         context: how much of that a coupling from sensors to stimuli leaves undone.
     """

@@ -46,7 +46,6 @@ class Networks(Actor):
     """Trained policies: their networks, stacked; drawn from, or the most probable action taken.
 
     Attributes:
-        network: their layers.
         scales: what each was trained to see observations divided by, whatever robot it now drives.
         greedy: whether the most probable action is taken.
     """

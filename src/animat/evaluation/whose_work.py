@@ -136,7 +136,6 @@ def whose_work(
     The goal is switched in the middle of the median episode of the policies as they are.
 
     Args:
-        policies: several side by side.
         episodes: of each policy and intervention.
         seed: decides every random draw.
         progress: told after each intervention.

@@ -51,7 +51,6 @@ class GoalState(NamedTuple):
     Attributes:
         robot: the state of the body.
         outside: of each objective with `within`, for how many iterations in a row the robot has been outside.
-        tally: what the episode has come to.
     """
 
     robot: Any
@@ -66,7 +65,6 @@ class RobotWithGoal(Robot[GoalState]):
 
     Attributes:
         robot: the body; its own rewards and ends are not used.
-        goal: what is wanted of it.
 
     Raises:
         InvalidArgument: for a robot that is stepped on the host or has a goal already, and for a goal of other

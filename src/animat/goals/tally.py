@@ -20,7 +20,6 @@ class Tally(NamedTuple):
     """What an episode has come to so far, its start apart; nothing in it decides how it goes on.
 
     Attributes:
-        iterations: how many are done.
         inside: of each objective, in how many the robot was in its region.
         is_inside: of each, whether it is in the last state.
         margins: of each: to avoid, the least distance from the region; to reach, the nearest to it or farthest within;

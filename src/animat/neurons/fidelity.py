@@ -28,7 +28,6 @@ class Fidelity:
     """How often each condition passes the pooled median, in the data and in the simulator.
 
     Attributes:
-        labels: the conditions.
         in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,); of several readouts
             (conditions, readouts).
         in_simulator: the same from the simulator, the same shape.

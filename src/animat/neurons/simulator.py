@@ -102,7 +102,6 @@ class HistogramSimulator(NeuronSimulator):
     Attributes:
         cumulative: share of a condition's responses below each edge, shape (conditions, bins + 1).
         edges_hz: the bins' edges, shape (bins + 1,).
-        percentiles: as in `NeuronSimulator`.
     """
 
     __repr__ = briefly
@@ -142,7 +141,6 @@ class EmpiricalSimulator(NeuronSimulator):
         values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses); of several
             readouts (conditions, most responses, readouts).
         counts: how many of them there are, shape (conditions,).
-        percentiles: as in `NeuronSimulator`.
     """
 
     __repr__ = briefly

@@ -35,7 +35,6 @@ class Evidence:
     """What is known of policies whose measured return differs from the predicted one.
 
     Attributes:
-        answered: what the culture answered them.
         calibration: the recording that predicted.
         predicted: of all policies together.
         gap: the sign of their gap: -1 where less was measured.

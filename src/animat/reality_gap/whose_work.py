@@ -31,7 +31,6 @@ class Replaced:
     Attributes:
         name, meaning: what.
         is_measured: whether in closed loop on the culture; else on its simulator.
-        mean_return: of it.
         lost: how much less that is than the policies' measured return, with its interval over episodes.
     """
 

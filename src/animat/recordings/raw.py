@@ -19,7 +19,6 @@ class RawTraces(Protocol):
     Attributes:
         channels: the table of channels, one a column.
         samples: how many each channel has.
-        sampling_rate_hz: of the samples.
         start_s: time of the first sample on the recording's clock.
     """
 
@@ -67,7 +66,6 @@ class ArrayTraces:
     Attributes:
         voltage_uv: shape (samples, channels), any number type.
         channels: one a column.
-        sampling_rate_hz: of the samples.
         start_s: time of the first sample.
         uv_per_step: what one step of `voltage_uv` is, 1 for microvolts.
     """
@@ -102,7 +100,6 @@ class Hdf5Traces:
         channels_first: whether the dataset is (channels, samples) and not (samples, channels).
         channels: one a column.
         samples, sampling_rate_hz, start_s: as in `RawTraces`.
-        uv_per_step: microvolts of one step.
     """
 
     path: Path

@@ -29,7 +29,6 @@ class ConditionSummary:
     """The responses to one condition in a few numbers.
 
     Attributes:
-        label: the condition.
         n_responses: all responses, bursts included.
         n_non_burst: responses that are no bursts; the other numbers are theirs.
         median_rate_hz: median of x, NaN without responses.
@@ -167,7 +166,6 @@ def inspect_recording(
     """Look at a recording as training would use it, and say what is in it and what is wrong with it.
 
     Args:
-        recording: the recording, or a table of responses.
         by: what makes a condition; by frequency where it is known, else all stimuli in one.
         window_ms: start and end of the window that responses are read in, after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.

@@ -19,7 +19,6 @@ def measured_scales(robot: HostRobot, bounds: Sequence[float], steps: int, seed:
     Args:
         bounds: how large each number can be; 0 where that is not known.
         steps: iterations, in episodes one after the other.
-        seed: of episodes and commands.
 
     Raises:
         BodyFailed: as `Bodies.step`.

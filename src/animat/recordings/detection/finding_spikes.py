@@ -35,7 +35,6 @@ class FoundSpikes:
         time_s: at their negative peaks, on the recording's clock, shape (spikes,).
         channel: row of the channel table, shape (spikes,).
         noise_uv: standard deviation of each channel's noise, shape (channels,).
-        findings: what was noticed.
     """
 
     time_s: Float64[np.ndarray, " spikes"]
