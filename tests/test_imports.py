@@ -21,6 +21,7 @@ GROUND = (
     "differences",
     "errors",
     "extras",
+    "late",
     "lined_up",
     "plain_file",
     "progress",
@@ -119,6 +120,10 @@ def test_reading_the_command_line_imports_nothing_heavy() -> None:
 
 def test_loading_a_policy_needs_no_jax() -> None:
     assert "jax" not in modules_after("import animat.training.policy")
+
+
+def test_robots_and_goals_are_read_without_what_moves_and_draws_them() -> None:
+    assert not modules_after("import animat.robots, animat.robots.grid, animat.goals.robot") & {"jax", "matplotlib"}
 
 
 def test_every_public_name_is_there_and_stands_for_one_thing() -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
 
@@ -30,6 +31,14 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
         length = len(array)
         array.setflags(write=False)
         object.__setattr__(table, attribute, array)
+
+
+def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]:
+    """Lists of electrodes as one table, padded with `UNKNOWN`."""
+    table = np.full((len(lists), max([1, *map(len, lists)])), UNKNOWN, dtype=np.int64)
+    for row, electrodes in zip(table, lists, strict=True):
+        row[: len(electrodes)] = electrodes
+    return table
 
 
 def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:

@@ -13,7 +13,7 @@ from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.schedule import Schedule
 from animat.stimulation.stimulus import Stimuli, Stimulus
-from animat.tables import UNKNOWN
+from animat.tables import padded
 
 
 class Spikes(NamedTuple):
@@ -47,14 +47,11 @@ class Observed:
 
 def stimulus_table(stimuli: Sequence[Stimulus], time_s: Float64[np.ndarray, " stimuli"]) -> Stimuli:
     """Delivered stimuli as a recording's table, at the times they really began."""
-    electrodes = np.full((len(stimuli), max(len(s.electrodes) for s in stimuli)), UNKNOWN, dtype=np.int64)
-    for row, stimulus in zip(electrodes, stimuli, strict=True):
-        row[: len(stimulus.electrodes)] = stimulus.electrodes
     return Stimuli(
         time_s=time_s,
         frequency_hz=np.array([stimulus.frequency_hz for stimulus in stimuli]),
         pattern=np.array([stimulus.pattern for stimulus in stimuli]),
-        electrodes=electrodes,
+        electrodes=padded([stimulus.electrodes for stimulus in stimuli]),
         presentation=np.array([stimulus.presentation for stimulus in stimuli]),
     )
 

@@ -89,8 +89,7 @@ class Commands:
             part = np.clip((self.levels - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
             hats = np.eye(len(nodes))
             basis = (1 - part)[..., None] * hats[left] + part[..., None] * hats[left + 1]
-        weights: Float64[np.ndarray, "actions nodes"] = np.einsum("al,alk->ak", self.probabilities, basis)
-        return weights
+        return np.asarray(np.einsum("al,alk->ak", self.probabilities, basis))
 
 
 def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> Commands:
@@ -101,7 +100,6 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     equal probability; a continuous action by 21 evenly spaced commands.
 
     Args:
-        environment: robot and mapping.
         simulator: the neurons' answers; None without neurons.
 
     Raises:
@@ -137,7 +135,7 @@ def mean_commands(
     """
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
-        commands = decoded(animat.mapping, _responses(simulator), jnp.asarray(simulator.percentiles))
+        commands = decoded(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
         return np.arange(animat.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
     of_one = commands_of(environment, simulator)
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
@@ -221,13 +219,6 @@ def _histories(simulator: MemorySimulator) -> Float[Array, "classes histories 2"
     return recorded[np.minimum(rows, len(recorded) - 1)]
 
 
-def _responses(simulator: NeuronSimulator) -> Float[Array, "conditions responses *readouts"]:
-    """Responses to each condition at evenly spaced quantiles, whatever was before."""
-    uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
-    quantile = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
-    return quantile(jnp.arange(simulator.n_conditions), uniforms)
-
-
 @partial(jax.jit, static_argnums=0)
 def _answers(
     environment: Animat[Any], simulator: MemorySimulator, history: Float[Array, "classes histories 2"]
@@ -292,5 +283,5 @@ def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Arra
 
 def _quantiles(mapping: Mapping, simulator: NeuronSimulator) -> tuple[np.ndarray, np.ndarray]:
     """The commands at evenly spaced quantiles of each condition."""
-    levels = np.asarray(mapping.command(_responses(simulator), simulator.percentiles), np.float64)
+    levels = np.asarray(mapping.command(simulator.evenly_drawn(_QUANTILES), simulator.percentiles), np.float64)
     return levels, np.full(levels.shape, 1 / _QUANTILES)

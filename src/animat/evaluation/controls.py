@@ -34,9 +34,6 @@ class Control:
     Attributes:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`.
         meaning: what it does, in a few words.
-        environment, simulator: that it is run in.
-        actor: who acts.
-        n_actors: how many they are.
     """
 
     name: str
@@ -64,7 +61,6 @@ def controls_of(
         environment, simulator: what the policies are evaluated in (no simulator without neurons).
         labels: of discrete actions.
         policies: several side by side; None leaves out what needs them.
-        n_policies: how many.
     """
     controls = [Control("random", "any action, equally likely", environment, simulator, Uniform())]
     for i, label in enumerate(labels):
@@ -98,8 +94,6 @@ def interventions_of(
 
     Args:
         environment, simulator: what the policies are evaluated in.
-        policies: several side by side.
-        n_policies: how many.
         switch_at: the iteration at which the goal is switched; None leaves that out, as a robot with one goal does.
     """
     animat = unwrapped(environment)
@@ -121,12 +115,19 @@ def interventions_of(
     ]
     if not isinstance(environment.robot, HostRobot):
         found.append(control("yoked", "the stimuli of another episode", YokedDelivery(environment)))
-    turned = with_inmost(environment, lambda _: TurnedRound(*fields))
-    found.append(control("turned round", "the opposite of every command", turned))
+    found.append(control("turned round", "the opposite of every command", turned_round(environment)))
     if switch_at is not None and hasattr(environment.robot, "with_goal_of"):
         switched = GoalSwitch(environment, switch_at)
         found.append(control("goal switched", f"another goal after {switch_at} actions", switched))
     return found
+
+
+def turned_round(environment: Environment[Any]) -> Environment[Any]:
+    """The same with the opposite of every command."""
+    animat = unwrapped(environment)
+    assert isinstance(animat, Animat)
+    turned = TurnedRound(animat.robot, animat.mapping, animat.n_conditions)
+    return with_inmost(environment, lambda _: turned)
 
 
 def _without_effect(

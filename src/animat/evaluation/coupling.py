@@ -18,7 +18,7 @@ from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
-from animat.evaluation.statistics import CONFIDENCE, Interval
+from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import HostRobot
 
@@ -76,7 +76,6 @@ def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | No
     starts and chances. The best of the four last generations is chosen in fresh episodes.
 
     Args:
-        environment: robot and mapping.
         simulator: the neurons' answers; None without neurons.
         seed: decides every random draw.
 
@@ -183,7 +182,7 @@ class ContextGap:
         """
         if not self.needs_context or len(returns) < 2:
             return None
-        mean, error = float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(len(returns)))
+        mean, error = float(returns.mean()), standard_error(returns)
         best, grid_error = (self.highest, 0.0) if optimum is None else (optimum.value, optimum.grid_error)
         if not np.isfinite(best):
             return None
@@ -237,7 +236,7 @@ def context_gap(
     coupling: Float64[np.ndarray, " episodes"], random: Float64[np.ndarray, " episodes"], optimum: Optimum
 ) -> ContextGap:
     """The context gap of a task, from returns of the best coupling and of random stimuli in fresh episodes."""
-    means, errors = ([float(f(x)) for x in (coupling, random)] for f in (np.mean, _standard_error))
+    means, errors = ([float(f(x)) for x in (coupling, random)] for f in (np.mean, standard_error))
     best, span = optimum.value, optimum.value - means[1]
     gap = None
     if span > 0 and np.isfinite(errors).all():
@@ -269,16 +268,12 @@ def least_context_gap(
     half = known.shape[1] // 2 if len(known) > 1 else 0
     best = known[known[:, : max(half, 1)].mean(axis=1).argmax(), half:]
     means = [float(each.mean()) for each in (best, coupling, random)]
-    error, span = _standard_error(best), means[0] - means[2]
+    error, span = standard_error(best), means[0] - means[2]
     gap = None
-    if span > 0 and np.isfinite([error, _standard_error(coupling)]).all():
+    if span > 0 and np.isfinite([error, standard_error(coupling)]).all():
         value = (means[0] - means[1]) / span
         # As above; coupling and random stimuli, which meet the same starts, pair by pair.
-        spread = _Z * float(np.hypot((1 - value) * error, _standard_error(value * random - coupling)) / span)
+        spread = _Z * float(np.hypot((1 - value) * error, standard_error(value * random - coupling)) / span)
         value, low, high = (float(np.clip(each, 0, 1)) for each in (value, value - spread, value + spread))
         gap = Interval(value, low, high, CONFIDENCE)
-    return ContextGap(means[1], _standard_error(coupling), gap, means[0], highest)
-
-
-def _standard_error(returns: Float64[np.ndarray, " episodes"]) -> float:
-    return float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else float("nan")
+    return ContextGap(means[1], standard_error(coupling), gap, means[0], highest)

@@ -54,24 +54,13 @@ def roll_out_on_host(
 
     Args:
         environment: with a robot that is stepped on the host.
-        episodes: of each actor.
-        simulator: the neurons' answers; None without neurons.
-        actors: one kind of actor, its arrays with a leading axis of actors.
+        episodes, simulator, actors: as in `animat.evaluation.rollouts.roll_out`.
         keys: of each actor's draws.
         seed: of the episodes of the bodies.
     """
     robot = environment.robot
     assert isinstance(robot, HostRobot)
-    n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    readouts = () if simulator is None else simulator.percentiles.shape[:-1]
-    shape = (len(keys), episodes)
-    counts = Counts(
-        np.zeros(shape),
-        np.zeros(shape, np.int64),
-        np.zeros(shape, bool),
-        np.zeros((len(keys), n_conditions), np.int64),
-        np.zeros((len(keys), n_conditions, *readouts), np.int64),
-    )
+    counts = _nothing(environment, simulator, (len(keys), episodes))
     side_by_side = min(AT_ONCE, episodes)
     actors_at_once = max(1, AT_ONCE // side_by_side)
     for begin in range(0, len(keys), actors_at_once):
@@ -144,19 +133,18 @@ def _wave(
 
     state = _started(environment, keys, shape[1])._replace(robot=seen(bodies.begin()))
     going = np.broadcast_to(np.arange(shape[1]) < counted, shape).copy()
-    returns, lengths, terminated = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool)
-    presented, passed = _nothing(environment, simulator, len(keys))
+    counts = _nothing(environment, simulator, shape)
     of_actor = np.indices(shape)[0]
     for iteration in range(robot.episode_limit):
         command, state, delivered, passes = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
         stepped = bodies.step(np.asarray(command).reshape(len(seeds), -1))
-        returns += np.where(going, stepped.reward.reshape(shape), 0.0)
-        lengths += going
-        terminated |= going & stepped.terminated.reshape(shape)
-        if presented.size:
+        counts.returns[:] += np.where(going, stepped.reward.reshape(shape), 0.0)
+        counts.lengths[:] += going
+        counts.terminated[:] |= going & stepped.terminated.reshape(shape)
+        if counts.presented.size:
             at = of_actor[going], np.asarray(delivered)[going]
-            np.add.at(presented, at, 1)
-            np.add.at(passed, at, np.asarray(passes)[going])
+            np.add.at(counts.presented, at, 1)
+            np.add.at(counts.passed, at, np.asarray(passes)[going])
         going &= ~stepped.ended.reshape(shape)
         if not going.any():
             break
@@ -164,7 +152,7 @@ def _wave(
             # What has ended moves on and counts no further: a body may not be stepped after its end.
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
         state = state._replace(robot=seen(bodies.observation))
-    return Counts(returns, lengths, terminated, presented, passed)
+    return counts
 
 
 def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
@@ -176,12 +164,17 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
     return bodies
 
 
-def _nothing(
-    environment: Environment[Any], simulator: NeuronSimulator | None, n_actors: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _nothing(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
+    """Of so many actors and episodes."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     readouts = () if simulator is None else simulator.percentiles.shape[:-1]
-    return np.zeros((n_actors, n), np.int64), np.zeros((n_actors, n, *readouts), np.int64)
+    return Counts(
+        np.zeros(shape),
+        np.zeros(shape, np.int64),
+        np.zeros(shape, bool),
+        np.zeros((shape[0], n), np.int64),
+        np.zeros((shape[0], n, *readouts), np.int64),
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 2), compiler_options=COMPILER_OPTIONS)

@@ -73,9 +73,7 @@ def goal_information(
     depend on s, as they would where an actor has been on its way to its own.
 
     Args:
-        environment, simulator: that the actors act in.
         actors: one kind of actor, its arrays with a leading axis of actors.
-        n_actors: how many there are.
         draws: actions drawn at each state with each goal; 2 are enough for actors that draw nothing.
         seed: decides every random draw.
 
@@ -134,8 +132,7 @@ def conditional_information(
     without = (goals * mixture[:, None] - shares) / (goals - 1)
     entropy = goals * _entropy(mixture) - (goals - 1) * _entropy(without).mean(axis=1)
     with_goal = _entropy(shares) + ((shares > 0).sum(axis=-1) - 1) / (2 * draws * np.log(2))
-    information: Float64[np.ndarray, " states"] = entropy - with_goal.mean(axis=1)
-    return information
+    return np.asarray(entropy - with_goal.mean(axis=1))
 
 
 def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
@@ -151,8 +148,7 @@ def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
 
 def _plug_in(actions: Int[np.ndarray, "states goals draws"], n_actions: int) -> Float64[np.ndarray, " states"]:
     shares = _shares(actions, n_actions)
-    information: Float64[np.ndarray, " states"] = _entropy(shares.mean(axis=1)) - _entropy(shares).mean(axis=1)
-    return information
+    return np.asarray(_entropy(shares.mean(axis=1)) - _entropy(shares).mean(axis=1))
 
 
 def _shares(actions: Int[np.ndarray, "*any draws"], n_actions: int) -> Float64[np.ndarray, "*any actions"]:
@@ -160,8 +156,7 @@ def _shares(actions: Int[np.ndarray, "*any draws"], n_actions: int) -> Float64[n
 
 
 def _entropy(shares: Float64[np.ndarray, "*any actions"]) -> Float64[np.ndarray, "*any"]:
-    entropy: Float64[np.ndarray, "*any"] = -(shares * np.log2(np.where(shares > 0, shares, 1.0))).sum(axis=-1)
-    return entropy
+    return np.asarray(-(shares * np.log2(np.where(shares > 0, shares, 1.0))).sum(axis=-1))
 
 
 @partial(jax.jit, static_argnums=(0, 1))

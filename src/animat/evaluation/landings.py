@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +19,7 @@ ENDED, ENDS_NEXT = -1, -2
 _NODES_AT_ONCE = 1 << 18
 
 
-@dataclass(frozen=True, eq=False)
-class Landings:
+class Landings(NamedTuple):
     """Where one iteration leads, for each of a few commands and draws of the robot's noise.
 
     Attributes:
@@ -127,10 +125,6 @@ class Motion:
                 raise InvalidArgument(
                     f"grid: expected a first coordinate that has no part in how the others move, got {grid.along.name}"
                 )
-            for whole, part in zip(_fields(landings), parts, strict=True):
+            for whole, part in zip(landings, parts, strict=True):
                 whole[:, start : start + at_once] = part
         return landings
-
-
-def _fields(landings: Landings) -> tuple[np.ndarray, ...]:
-    return landings.rows, landings.row_places, landings.nodes, landings.places, landings.rewards

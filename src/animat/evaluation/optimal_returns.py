@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from animat.coding.mapping import Mapping, Thresholds
 from animat.environment import Animat
 from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum, best_returns
 from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
 from animat.evaluation.rollouts import Uniform, roll_out
+from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import HistogramSimulator, fit_histogram, pooled_percentiles
 from animat.responses.responses import Responses
 from animat.robots.base import Robot
@@ -24,9 +23,7 @@ class OptimalReturn:
     """What could be had through one mapping.
 
     Attributes:
-        robot, mapping: their names.
         random: mean return of random stimuli.
-        random_standard_error: of that.
         best: the optimal return of any controller.
         context: how much of that a coupling from sensors to stimuli leaves undone.
     """
@@ -63,8 +60,6 @@ def optimal_returns(
     Args:
         responses: of the recording; the simulator is the default one, a histogram of 20 bins. Conditions with fewer
             than 30 non-burst responses are left out, also for the random stimuli.
-        robot: with its task.
-        mappings: from responses to commands.
         resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by 0.8 at most.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`with_intervals`).
@@ -89,7 +84,7 @@ def optimal_returns(
     found = []
     for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
         returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
-        error = float(returns.std(ddof=1) / np.sqrt(returns.size))
+        error = standard_error(returns)
         of_coupling = roll_out(*case, best_coupling(*case, seed=seed), 1, episodes=episodes, seed=seed).returns[0]
         gap = context_gap(of_coupling, returns, of_mapping)
         told = replace(of_mapping, left_out=left_out)

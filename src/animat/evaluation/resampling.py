@@ -15,7 +15,6 @@ from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Progress
 from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.responses.responses import Responses
@@ -53,8 +52,6 @@ class Counted:
 
         Args:
             environment: with all of its conditions.
-            timeline: with its responses.
-            minute: of the recording.
             are_fixed: whether the mapping's percentiles are those of the first recording.
 
         Raises:
@@ -126,7 +123,6 @@ def with_intervals(
     resolution: float = 1.0,
     resamples: int = RESAMPLES,
     seed: int = 1,
-    progress: Progress | None = None,
 ) -> tuple[Optimum, ...]:
     """Optimal returns with intervals for those that the distributions of all responses would give.
 
@@ -142,11 +138,9 @@ def with_intervals(
         optima: as `best_returns` gave them.
         environments: that they are of, all of one robot.
         responses: that the simulator in them was made of.
-        fit: makes a simulator of responses.
         resolution: of the optima's grid, which the rough one is not finer than.
         resamples: how often responses are bootstrapped; 0: there are no intervals.
         seed: decides what is drawn.
-        progress: told after each optimum.
     """
     from scipy.stats import kruskal
 
@@ -168,8 +162,6 @@ def with_intervals(
         error = optimum.grid_error
         ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
         known.append(replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE)))
-        if progress is not None:
-            progress.update(len(known), len(optima), "how well it is known")
     return tuple(known)
 
 

@@ -46,7 +46,6 @@ class Networks(Actor):
     """Trained policies: their networks, stacked; drawn from, or the most probable action taken.
 
     Attributes:
-        network: their layers.
         scales: what each was trained to see observations divided by, whatever robot it now drives.
         greedy: whether the most probable action is taken.
     """
@@ -175,10 +174,8 @@ def roll_out(
     Every actor gets random numbers of its own, decided by `seed` and its place; or all meet the same.
 
     Args:
-        environment: robot and mapping.
         simulator: the neurons' answers; None without neurons.
         actors: one kind of actor, its arrays with a leading axis of actors.
-        n_actors: how many there are.
         episodes: of each.
         seed: decides every random draw.
         alike: whether all actors meet the same random numbers, so that they differ by what they do alone.

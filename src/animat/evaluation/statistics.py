@@ -35,6 +35,11 @@ class Interval:
         """Everything as plain data."""
         return asdict(self)
 
+    @property
+    def ends(self) -> str:
+        """From where to where it goes, for a table."""
+        return f"{self.low:.1f} to {self.high:.1f}" if math.isfinite(self.low) else "unknown"
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -65,7 +70,7 @@ class Comparison:
         return asdict(self)
 
 
-def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = CONFIDENCE) -> Comparison:
+def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     """The two-sided Mann-Whitney U test of two groups, by the normal approximation and exactly, and its effect size.
 
         U_1 = #(first > second) + #(first = second) / 2,    U = min(U_1, n_1 n_2 - U_1),    effect = 1 - 2 U_1 / n_1 n_2
@@ -81,19 +86,17 @@ def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = CONFIDEN
 
     Args:
         first, second: one number a policy, such as its mean return.
-        confidence: of the effect's interval.
 
     Raises:
-        InvalidArgument: for an empty group, numbers that are not finite, or a confidence outside 0 to 1.
+        InvalidArgument: for an empty group, or numbers that are not finite.
 
     Source: Mann and Whitney 1947, doi:10.1214/aoms/1177730491; Newcombe 2006, doi:10.1002/sim.2324; the paper's table
         of comparisons.
     """
     a, b = _samples("first", first), _samples("second", second)
-    _check(confidence)
     from scipy.stats import mannwhitneyu
 
-    u_first = float(_won(a, b).sum())
+    u_first = float(np.sum(a[:, None] > b) + np.sum(a[:, None] == b) / 2)
     pooled = np.concatenate([a, b])
     ties = len(np.unique(pooled)) < len(pooled)
     if np.ptp(pooled) == 0:
@@ -104,7 +107,7 @@ def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = CONFIDEN
         p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
 
     total = len(a) * len(b)
-    low, high = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b), confidence))
+    low, high = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
     return Comparison(
         u=min(u_first, total - u_first),
         u_first=u_first,
@@ -112,7 +115,7 @@ def compare(first: ArrayLike, second: ArrayLike, *, confidence: float = CONFIDEN
         n_second=len(b),
         p_normal=p_normal,
         p_exact=p_exact,
-        effect=Interval(1 - 2 * u_first / total, high, low, confidence),
+        effect=Interval(1 - 2 * u_first / total, high, low, CONFIDENCE),
         ties=ties,
     )
 
@@ -152,7 +155,6 @@ def interquartile_mean(
 
     Args:
         samples: numbers, shape (samples,).
-        confidence: of the interval.
         within: what the numbers can be at least and at most; the interval ends there.
 
     Raises:
@@ -161,7 +163,8 @@ def interquartile_mean(
     Source: Agarwal et al. 2021, arXiv:2108.13264 (rliable); the interval: Tukey and McLaughlin 1963, Sankhya A 25, 331.
     """
     x = np.sort(_samples("samples", samples))
-    _check(confidence)
+    if not 0 < confidence < 1:
+        raise InvalidArgument(f"confidence: expected between 0 and 1, got {confidence:g}")
     n = len(x)
     cut = n // 4
     kept = n - 2 * cut
@@ -214,6 +217,11 @@ def normalised_score(policy: float, random: float, optimum: float) -> float:
     return (policy - random) / (optimum - random)
 
 
+def standard_error(samples: Float64[np.ndarray, " samples"]) -> float:
+    """Of their mean; NaN of one."""
+    return float(samples.std(ddof=1) / math.sqrt(len(samples))) if len(samples) > 1 else math.nan
+
+
 def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
     samples: Float64[np.ndarray, " samples"] = np.asarray(values, np.float64)
     if samples.ndim != 1 or not len(samples):
@@ -221,18 +229,6 @@ def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
     if not np.all(np.isfinite(samples)):
         raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones")
     return samples
-
-
-def _check(confidence: float) -> None:
-    if not 0 < confidence < 1:
-        raise InvalidArgument(f"confidence: expected between 0 and 1, got {confidence:g}")
-
-
-def _won(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "n m"]:
-    """Of each pair, 1 if the first is larger, 1/2 if they are equal."""
-    difference = a[:, None] - b[None, :]
-    won: Float64[np.ndarray, "n m"] = (difference > 0) + 0.5 * (difference == 0)
-    return won
 
 
 def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
@@ -255,12 +251,12 @@ def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"])
     return float(ways[n, distance >= distance[ranks[:n].sum()]].sum() / ways[n].sum())
 
 
-def _shares_within(share: float, n_first: int, n_second: int, confidence: float) -> tuple[float, float]:
+def _shares_within(share: float, n_first: int, n_second: int) -> tuple[float, float]:
     """The smallest and the largest true share of pairs won that the share seen does not speak against."""
     from scipy.optimize import brentq
     from scipy.stats import norm
 
-    z = float(norm.ppf((1 + confidence) / 2))
+    z = float(norm.ppf((1 + CONFIDENCE) / 2))
     more = (n_first + n_second) / 2 - 1
 
     def against(true: float) -> float:

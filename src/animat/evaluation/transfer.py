@@ -89,13 +89,7 @@ def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Find
 
 
 def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, has_memory: bool) -> Iterator[Finding]:
-    """Where the recording shows that the culture remembers, and the simulator that predicts does not.
-
-    Args:
-        noticed: findings on the recording.
-        presentation: of the recording.
-        has_memory: whether the simulator does.
-    """
+    """Where the recording shows that the culture remembers, and the simulator that predicts does not."""
     remembers = next((finding for finding in noticed if finding.name == "memory"), None)
     if remembers is None or has_memory:
         return
@@ -140,24 +134,16 @@ def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding
         )
     found = []
     if policy.window_ms != timeline.window_ms:
-        found.append(
-            Finding(
-                "other-window",
-                "warning",
-                f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}",
-            )
-        )
+        message = f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}"
+        found.append(Finding("other-window", "warning", message))
     found += other_simulator(policy.fitted, timeline.fitted)
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
-        found.append(
-            Finding(
-                "other-percentiles",
-                "warning",
-                f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
-                f"of these: here they are fixed from {timeline.start_min[0]:g} min",
-            )
+        message = (
+            f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
+            f"of these: here they are fixed from {timeline.start_min[0]:g} min"
         )
+        found.append(Finding("other-percentiles", "warning", message))
     return tuple(found)
 
 

@@ -104,10 +104,7 @@ class WhoseWork:
         """A table for a terminal."""
         cells = []
         for row in self.rows:
-            lost = ["", ""]
-            if row.name != AS_THEY_ARE:
-                low, high = row.lost.low, row.lost.high
-                lost = [f"{row.lost.value:.1f}", f"{low:.1f} to {high:.1f}" if np.isfinite(low) else "unknown"]
+            lost = ["", ""] if row.name == AS_THEY_ARE else [f"{row.lost.value:.1f}", row.lost.ends]
             bits = "" if row.information is None else f"{row.information.bits.value:.2f}"
             cells.append([row.name, f"{row.returns.mean():.1f}", *lost, bits, row.meaning])
         lines = [
@@ -139,9 +136,6 @@ def whose_work(
     The goal is switched in the middle of the median episode of the policies as they are.
 
     Args:
-        environment, simulator: what they act in.
-        policies: several side by side.
-        n_policies: how many.
         episodes: of each policy and intervention.
         seed: decides every random draw.
         progress: told after each intervention.

@@ -55,11 +55,6 @@ class Objective:
         """Whether it may end an episode as failed."""
         return self.kind == "avoid" or self.within is not None
 
-    @property
-    def can_end(self) -> bool:
-        """Whether it may end an episode at all."""
-        return self.can_fail or self.kind == "reach"
-
 
 @record
 class Goal:
@@ -73,13 +68,3 @@ class Goal:
 
     def __str__(self) -> str:
         return "; ".join(map(str, self.objectives))
-
-    @property
-    def can_be_reached(self) -> bool:
-        """Whether there is anything to reach: then an episode that waits only costs."""
-        return any(each.kind == "reach" for each in self.objectives)
-
-    @property
-    def needs_memory(self) -> bool:
-        """Whether more than the robot's state decides how an episode goes on."""
-        return any(each.within is not None for each in self.objectives)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import reduce
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, ClassVar
 
 from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument, did_you_mean
+from animat.late import Array, jnp
 from animat.records import Flag, Number, Positive, record
 from animat.robots.base import Quantity
-
-if TYPE_CHECKING:
-    from jax import Array
 
 Name = Annotated[str, Field(min_length=1)]
 
@@ -96,10 +94,7 @@ class Range:
 
         Args:
             seen: the quantities by name, in the units of `spec`, as the region is (`in_units`).
-            spec: what they are.
         """
-        import jax.numpy as jnp
-
         value = seen[self.quantity]
         within = [value - self.low] if self.low is not None else []
         within += [self.high - value] if self.high is not None else []
@@ -135,10 +130,7 @@ class Ball:
         unit = f" {self.unit}" if self.unit else ""
         return f"{', '.join(self.quantities)} around {centre} radius {number(self.radius)}{unit}"
 
-    @property
-    def has_its_edge(self) -> bool:
-        """Its edge belongs to it."""
-        return True
+    has_its_edge: ClassVar[bool] = True
 
     def bounds(self) -> dict[str, tuple[float, float]]:
         """Of what lies in it."""
@@ -158,8 +150,6 @@ class Ball:
 
     def margin(self, seen: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
         """As `Range.margin`, in the largest of the scales."""
-        import jax.numpy as jnp
-
         apart = [(seen[name] - at) ** 2 for name, at in zip(self.quantities, self.centre, strict=True)]
         scale = max(spec[name].scale for name in self.quantities)
         return (self.radius - jnp.sqrt(sum(apart[1:], apart[0]))) / scale
@@ -173,8 +163,6 @@ def margin_of(
     region: tuple[Range | Ball, ...], seen: Mapping[str, Array], spec: Mapping[str, Quantity]
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """How far within a region a robot is: the least of its parts' margins, in [-1, 1]; and whether it is in it."""
-    import jax.numpy as jnp
-
     margins = [part.margin(seen, spec) for part in region]
     inside = [m >= 0 if part.has_its_edge else m > 0 for part, m in zip(region, margins, strict=True)]
     return jnp.clip(reduce(jnp.minimum, margins), -1.0, 1.0), reduce(jnp.logical_and, inside)

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,15 +31,12 @@ from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Outcome, Seen, Tally, counted, nothing_yet, outcome
 from animat.goals.text import read_goal
+from animat.late import Array, jax, jnp
 from animat.robots.base import Quantity, Robot
 from animat.robots.capabilities import WITHOUT, capability
+from animat.robots.grid import Grid
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
-
-if TYPE_CHECKING:
-    from jax import Array
-
-    from animat.robots.grid import Grid
 
 FAILED, REACHED = 100.0, 50.0
 """What an episode's end costs and is worth, where all weights are the same."""
@@ -54,7 +51,6 @@ class GoalState(NamedTuple):
     Attributes:
         robot: the state of the body.
         outside: of each objective with `within`, for how many iterations in a row the robot has been outside.
-        tally: what the episode has come to.
     """
 
     robot: Any
@@ -69,7 +65,6 @@ class RobotWithGoal(Robot[GoalState]):
 
     Attributes:
         robot: the body; its own rewards and ends are not used.
-        goal: what is wanted of it.
 
     Raises:
         InvalidArgument: for a robot that is stepped on the host or has a goal already, and for a goal of other
@@ -132,8 +127,8 @@ class RobotWithGoal(Robot[GoalState]):
 
     @property
     def _cost(self) -> float:
-        """Of every iteration: 1 where there is anything to reach."""
-        return float(self.goal.can_be_reached)
+        """Of every iteration: 1 where there is anything to reach, as an episode that waits then only costs."""
+        return float(any(each.kind == "reach" for each in self._objectives))
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
@@ -152,8 +147,6 @@ class RobotWithGoal(Robot[GoalState]):
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and where episodes start in a region that ends them."""
-        import jax
-
         start = self.robot.reset(jax.random.key(0))
         told = zip(self.goal.objectives, self._objectives, self._seen(start), strict=True)
         in_it = [str(given) for given, each, (_, inside) in told if inside and each.kind in ("avoid", "reach")]
@@ -167,13 +160,11 @@ class RobotWithGoal(Robot[GoalState]):
         return self.started(self.robot.reset(key))
 
     def observe(self, state: GoalState) -> Float[Array, " observations"]:
-        """What is seen of the robot."""
         return self.robot.observe(state.robot)
 
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: GoalState, u: Float[Array, "*commands"]
     ) -> tuple[GoalState, Float[Array, ""], Bool[Array, ""]]:
-        """One iteration of the robot, and what it is worth (see the module)."""
         robot, _, _ = self.robot.advance(uniforms, state.robot, u)
         outside, tally, reward, ended = self._judged(self._seen(robot), state.outside, state.tally)
         return GoalState(robot, outside, tally), reward, ended
@@ -182,8 +173,6 @@ class RobotWithGoal(Robot[GoalState]):
         self, seen: Seen, outside: tuple[Int[Array, ""], ...], tally: Tally
     ) -> tuple[tuple[Int[Array, ""], ...], Tally, Float[Array, ""], Bool[Array, ""]]:
         """What an iteration comes to after which this is seen, and its reward and whether it ends the episode."""
-        import jax.numpy as jnp
-
         outside = self._outside(seen, outside)
         late = iter(outside)
         no = jnp.bool_(False)
@@ -208,8 +197,6 @@ class RobotWithGoal(Robot[GoalState]):
 
         What else is wanted pays on the way.
         """
-        import jax.numpy as jnp
-
         found: Array = jnp.float32(0.0)
         seen = self._seen(state.robot)
         for each, share, (margin, _) in zip(self._objectives, self._shares, seen, strict=True):
@@ -231,8 +218,6 @@ class RobotWithGoal(Robot[GoalState]):
         Args:
             observations: at its start, and after each iteration.
         """
-        import jax
-
         # All of one length, for one compilation: what comes after the end is not counted.
         missing = self.episode_limit + 1 - len(observations)
         came_to: Outcome = jax.device_get(_outcome_along(self)(np.pad(observations, ((0, missing), (0, 0)), "edge")))
@@ -246,8 +231,6 @@ class RobotWithGoal(Robot[GoalState]):
         return [margin_of(each.region, seen, self._spec) for each in self._objectives]
 
     def _outside(self, seen: Seen, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
-        import jax.numpy as jnp
-
         timed = [inside for each, (_, inside) in zip(self._objectives, seen, strict=True) if each.within is not None]
         before = [jnp.int32(0)] * len(timed) if before is None else before
         return tuple(jnp.where(inside, 0, of + 1).astype(jnp.int32) for inside, of in zip(timed, before, strict=True))
@@ -258,13 +241,11 @@ class RobotWithGoal(Robot[GoalState]):
 
     def _largest(self, flags: Sequence[Bool[Array, ""]]) -> Float[Array, ""]:
         """The largest share of the objectives that a flag is up for."""
-        import jax.numpy as jnp
-
         return reduce(jnp.maximum, (flag * share for flag, share in zip(flags, self._shares, strict=True)))
 
     def _value_grid(self) -> Grid:
         """The robot's own grid. A goal with `within` has none: how long a robot has been outside is no place on it."""
-        if self.goal.needs_memory:
+        if any(each.within is not None for each in self._objectives):
             raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
         grid: Grid = capability(self.robot, "value_grid")()
         of_goal = replace(
@@ -278,15 +259,13 @@ class RobotWithGoal(Robot[GoalState]):
 
     def _is_decided(self, grid: Grid) -> bool:
         """Whether a state alone decides if the next iteration ends the episode, whatever the command, tried on some."""
-        import jax
-        import jax.numpy as jnp
-
         nodes = jax.random.randint(jax.random.key(0), (2, 256), 0, jnp.array([[grid.n_rows], [grid.along.stored]]))
 
         def seen_after(row: Array, node: Array, chance: float, u: float) -> Array:
             state = grid.state_at(row, node)
             robot, _, _ = self.robot.advance(jnp.full(self.noise_size, chance), state, jnp.float32(u))
-            ends = [m for each, (m, _) in zip(self._objectives, self._seen(robot), strict=True) if each.can_end]
+            told = zip(self._objectives, self._seen(robot), strict=True)
+            ends = [margin for each, (margin, _) in told if each.can_fail or each.kind == "reach"]
             return jnp.stack(ends) if ends else jnp.zeros(0)
 
         after = jax.vmap(seen_after, (0, 0, None, None))
@@ -297,7 +276,6 @@ class RobotWithGoal(Robot[GoalState]):
 @lru_cache(maxsize=8)
 def _outcome_along(robot: RobotWithGoal) -> Callable[[Any], Outcome]:
     """`RobotWithGoal.outcome_of` episodes of the limit, compiled."""
-    import jax
 
     def along(observations: Float[Array, "iterations observations"]) -> Outcome:
         def iteration(carry: Any, observation: Array) -> tuple[Any, None]:

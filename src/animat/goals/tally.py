@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from animat.goals.goal import Objective
-
-if TYPE_CHECKING:
-    from jax import Array
+from animat.late import Array, jax, jnp
 
 Seen = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
 """Of each objective the margin in [-1, 1], and whether the robot is in its region."""
@@ -22,7 +20,6 @@ class Tally(NamedTuple):
     """What an episode has come to so far, its start apart; nothing in it decides how it goes on.
 
     Attributes:
-        iterations: how many are done.
         inside: of each objective, in how many the robot was in its region.
         is_inside: of each, whether it is in the last state.
         margins: of each: to avoid, the least distance from the region; to reach, the nearest to it or farthest within;
@@ -85,8 +82,6 @@ def told_satisfaction(objectives: Sequence[str], means: Mapping[str, Any]) -> st
 
 def nothing_yet(objectives: Sequence[Objective]) -> Tally:
     """Of an episode at its start."""
-    import jax.numpy as jnp
-
     margins = tuple(jnp.float32(1.0 if each.kind == "avoid" else -1.0) for each in objectives)
     none, no = jnp.int32(0), jnp.bool_(False)
     return Tally(none, tuple(none for _ in objectives), tuple(no for _ in objectives), margins, no, no)
@@ -96,8 +91,6 @@ def counted(
     objectives: Sequence[Objective], tally: Tally, seen: Seen, failed: Bool[Array, ""], reached: Bool[Array, ""]
 ) -> Tally:
     """With one more iteration, where the episode has not ended before it."""
-    import jax
-    import jax.numpy as jnp
 
     def margin(kind: str, before: Array, now: Array) -> Array:
         if kind == "avoid":
@@ -119,8 +112,6 @@ def counted(
 
 def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -> Outcome:
     """What a tally says at the end of an episode."""
-    import jax.numpy as jnp
-
     out_of = jnp.maximum(jnp.where(tally.failed, episode_limit, tally.iterations), 1)
 
     def satisfaction(kind: str, inside: Array, margin: Array) -> Array:

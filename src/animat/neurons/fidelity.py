@@ -19,12 +19,15 @@ LARGEST_LOSS = 0.05
 """A difference in P(x >= P50) between data and simulator above which `findings` warns."""
 
 
+_evenly_drawn = jax.jit(NeuronSimulator.evenly_drawn, static_argnums=1)
+"""Compiled once for all simulators of a shape."""
+
+
 @dataclass(frozen=True)
 class Fidelity:
     """How often each condition passes the pooled median, in the data and in the simulator.
 
     Attributes:
-        labels: the conditions.
         in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,); of several readouts
             (conditions, readouts).
         in_simulator: the same from the simulator, the same shape.
@@ -66,14 +69,8 @@ class Fidelity:
                 )
                 found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
-            found.append(
-                Finding(
-                    "above-range",
-                    "warning",
-                    f"{self.n_above_range} responses lie above the histogram's range and count into its last bin",
-                    float(self.n_above_range),
-                )
-            )
+            message = f"{self.n_above_range} responses lie above the histogram's range and count into its last bin"
+            found.append(Finding("above-range", "warning", message, float(self.n_above_range)))
         return tuple(found)
 
 
@@ -91,23 +88,13 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
             for c in range(len(responses.conditions))
         ]
     )
-    x = _evenly_drawn(simulator)
-    if isinstance(simulator, MemorySimulator):
-        x = _drawn_after_each(simulator)
+    x = _drawn_after_each(simulator) if isinstance(simulator, MemorySimulator) else _evenly_drawn(simulator, 20_000)
     above = 0
     if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
     in_simulator = np.asarray(jnp.mean(x >= median_hz, axis=1), np.float64)
     return Fidelity(labels, in_data, in_simulator, above, responses.readouts.names)
-
-
-@jax.jit
-def _evenly_drawn(simulator: NeuronSimulator) -> Float[Array, "conditions draws *readouts"]:
-    """Evenly spaced quantiles of every condition; compiled once for all simulators of a shape."""
-    uniforms = (jnp.arange(20_000) + 0.5) / 20_000
-    draw = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))
-    return draw(jnp.arange(simulator.n_conditions), uniforms)
 
 
 @jax.jit

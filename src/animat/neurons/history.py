@@ -78,16 +78,12 @@ class Ranked:
     def __init__(self, responses: Responses) -> None:
         self._presented, self._place = responses.presentations
         self.sorted_hz = np.sort(responses.non_burst_rate_hz)
-        self.rank = self._ranks(responses.rate_hz)
+        self.rank = ranks_among(self.sorted_hz, responses.rate_hz)
         conditions = range(len(responses.conditions))
         usable = [np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in conditions]
         self.means = np.array([self.rank[rows].mean() for rows in usable])
         known = ~np.isnan(responses.last_hz)
         self.rows = [rows[known[rows]] if known[rows].any() else rows for rows in usable]
-
-    def _ranks(self, rate_hz: Float64[np.ndarray, " values"]) -> Float64[np.ndarray, " values"]:
-        below, no_larger = (np.searchsorted(self.sorted_hz, rate_hz, side=side) for side in ("left", "right"))
-        return np.asarray((below + no_larger) / (2 * len(self.sorted_hz)))
 
     def traces(self, memory: Memory) -> Float64[np.ndarray, " responses"]:
         """The trace before each response."""
@@ -100,7 +96,7 @@ class Ranked:
         presented: Presented = self._presented
         # Of what has no condition of its own the middle one's is as good as any.
         means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
-        left = left_by(self._ranks(presented.rate_hz), means, memory)
+        left = left_by(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
         trace, traces = 0.0, []
         for is_rested, is_burst, more in zip(
             presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
@@ -135,6 +131,14 @@ class Ranked:
         return Loads(every, every[self._place], after, np.exp(-np.array(usual_s) / load_s), added)
 
 
+def ranks_among(
+    sorted_hz: Float64[np.ndarray, " others"], rate_hz: Float64[np.ndarray, " values"]
+) -> Float64[np.ndarray, " values"]:
+    """The share of some responses, which are sorted, that lies below each of others; ties half."""
+    below, no_larger = (np.searchsorted(sorted_hz, rate_hz, side=side) for side in ("left", "right"))
+    return np.asarray((below + no_larger) / (2 * len(sorted_hz)))
+
+
 def left_by(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
@@ -161,7 +165,6 @@ def recorded_states(responses: Responses, memory: Memory) -> Recorded:
     Args:
         responses: that a simulator was fitted to. Ranks are among them; the trials (`Responses.presentations`) may be
             more.
-        memory: the simulator's.
     """
     ranked = Ranked(responses)
     traces, left = ranked.recorded(memory)

@@ -72,8 +72,7 @@ def fit_joint_histogram(
     Args:
         responses: of several readouts.
         bins, range_hz: as in `fit_histogram`.
-        room: how many trials a condition has room for, so that simulators of several recordings stack; None: as many
-            as the largest condition needs.
+        room: as in `fit_empirical`.
 
     Raises:
         InvalidArgument, UnusableData: as `fit_histogram` does.

@@ -124,8 +124,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     Args:
         responses: of one recording, every condition with at least one non-burst response. Those that came after a
             burst, which the simulator never answers itself, are only drawn where a condition has no others.
-        room: how many values a condition has room for, so that simulators of several recordings stack; None: as many
-            as the largest condition needs.
+        room: as in `fit_empirical`.
         memory: to be used in place of the one that is found: for responses that are drawn from others.
 
     Raises:

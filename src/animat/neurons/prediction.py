@@ -215,9 +215,7 @@ def command_probabilities(
     as a coarser prediction has them: p = (n p_n + 10 prior) / (n + 10).
 
     Args:
-        prediction: of the responses.
         prior: the coarser one's probabilities; a number for all.
-        halves: of the recording.
         thresholds_hz: P10, P20, ..., P90 of the first half.
     """
     of_value = np.searchsorted(thresholds_hz, halves.values_hz, side="right")

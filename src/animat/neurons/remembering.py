@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by
+from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by, ranks_among
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.extraction import SILENCE_S
@@ -55,14 +55,12 @@ class Remembering:
 
         Args:
             before: the state after the trial before it; `Remembered()` after silence.
-            condition: that was presented.
             rate_hz: the response of all channels, Hz a channel.
             first_s, at_s: its first and its last pulse, s.
             is_burst: whether the response was a burst, after which nothing is known of the trace.
         """
         trace = 0.0 if first_s - before.at_s > SILENCE_S else before.trace
-        below, no_larger = (np.searchsorted(self.sorted_hz, rate_hz, side=side) for side in ("left", "right"))
-        rank = np.array([(below + no_larger) / (2 * len(self.sorted_hz))])
+        rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         (more,) = left_by(rank, float(self.mean_ranks[condition]), self.memory).tolist()
         trace = 0.5 if is_burst else self.memory.decay * trace + more
         load_s = self.memory.load_s

@@ -77,6 +77,12 @@ class NeuronSimulator(abc.ABC):
         """
         return Answer(self.quantile(condition, uniform), history)
 
+    def evenly_drawn(self, n: int) -> Float[Array, "conditions n *readouts"]:
+        """The responses to each condition at n evenly spaced quantiles, whatever was before."""
+        uniforms = (jnp.arange(n, dtype=jnp.float32) + 0.5) / n
+        quantile = jax.vmap(jax.vmap(self.quantile, (None, 0)), (0, None))
+        return quantile(jnp.arange(self.n_conditions), uniforms)
+
     @final
     def sample(
         self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = AT_FIRST
@@ -96,7 +102,6 @@ class HistogramSimulator(NeuronSimulator):
     Attributes:
         cumulative: share of a condition's responses below each edge, shape (conditions, bins + 1).
         edges_hz: the bins' edges, shape (bins + 1,).
-        percentiles: as in `NeuronSimulator`.
     """
 
     __repr__ = briefly
@@ -136,7 +141,6 @@ class EmpiricalSimulator(NeuronSimulator):
         values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses); of several
             readouts (conditions, most responses, readouts).
         counts: how many of them there are, shape (conditions,).
-        percentiles: as in `NeuronSimulator`.
     """
 
     __repr__ = briefly
@@ -218,7 +222,8 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
     room = int(counts.max()) if room is None else room
     if counts.max() > room:
         raise InvalidArgument(f"room: expected at least {counts.max()}, the largest condition's responses, got {room}")
-    table = np.stack([_padded(x, room) for x in values])
+    # Padded with the last one over and over.
+    table = np.stack([np.concatenate([x, np.repeat(x[-1:], room - len(x), axis=0)]) for x in values])
     return EmpiricalSimulator(
         jnp.asarray(table, jnp.float32), jnp.asarray(counts, jnp.int32), pooled_percentiles(responses)
     )
@@ -237,9 +242,7 @@ def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
 
     Responses at 512 evenly spaced quantiles stand for each condition, whatever was before.
     """
-    uniforms = (jnp.arange(512, dtype=jnp.float32) + 0.5) / 512
-    n = simulator.n_conditions
-    each = jax.vmap(jax.vmap(simulator.quantile, (None, 0)), (0, None))(jnp.arange(n), uniforms)
+    each, n = simulator.evenly_drawn(512), simulator.n_conditions
     pooled = each.reshape(-1, *each.shape[2:])
     pooled = pooled[jnp.argsort(pooled if pooled.ndim == 1 else pooled.mean(axis=1))]
     values = jnp.broadcast_to(pooled, (n, *pooled.shape))
@@ -256,11 +259,6 @@ def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts
     if not len(kept):
         raise UnusableData("responses: expected at least one non-burst response, got none")
     return kept
-
-
-def _padded(values: Float64[np.ndarray, "responses *readouts"], room: int) -> Float64[np.ndarray, "room *readouts"]:
-    """With the last one over and over."""
-    return np.concatenate([values, np.repeat(values[-1:], room - len(values), axis=0)])
 
 
 def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *readouts"]]:

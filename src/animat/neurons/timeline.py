@@ -42,7 +42,6 @@ class SimulatorTimeline:
         simulators: one pytree whose arrays have a leading axis of recordings.
         start_min: minutes on the culture's clock, rising, shape (recordings,).
         conditions: what the agent picks from, the same in every recording.
-        window_ms: the response window.
         presentation: how stimuli were presented, None where it is not known.
         fidelities: what each simulator keeps of its responses.
         fitted: how the simulators were made of responses, for whoever comes later: `kind`, `bins`, `range_hz`; `by`,

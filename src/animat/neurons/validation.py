@@ -102,7 +102,6 @@ class Validation:
     """All kinds of simulators on one recording: fitted to its first half, scored on its second.
 
     Attributes:
-        labels: the conditions.
         n_fitted, n_held: non-burst responses to each in the first and in the second half, shape (conditions,).
         medians_hz: of these, shape (2, conditions).
         above: P(x >= P50) of the held-out responses to each, P50 that of the first half, shape (conditions,).

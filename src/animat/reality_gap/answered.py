@@ -1,9 +1,10 @@
-"""What the culture answered the policies in a session: the responses that moved their robots."""
+"""What a session's log says of its episodes: the responses that moved the policies' robots, and what goals came to."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -11,9 +12,12 @@ from jaxtyping import Bool, Float64, Int64
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session
 from animat.coding.mapping import N_PERCENTILES
+from animat.goals.robot import RobotWithGoal
+from animat.goals.tally import Outcome
 from animat.reality_gap.passes import Passes
 from animat.responses.extraction import SILENCE_S
 from animat.responses.responses import Presented, Responses
+from animat.robots.base import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +62,6 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
 
     Args:
         session: that ended.
-        loop: its settings.
         policies: their names among the agents.
     """
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
@@ -109,6 +112,17 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     returns = np.array([each.total for each in whole], np.float64)
     passed = np.array(passes, bool).reshape(len(acted), *loop.decoder.percentiles_shape[:-1])
     return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), passed, returns)
+
+
+def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:
+    """Of each episode that came to its end, by its number, what it came to; none of a robot without a goal."""
+    if not isinstance(robot, RobotWithGoal):
+        return {}
+    observed = {episode.number: [episode.start] for episode in session.episodes if episode.is_whole}
+    for tick in session.ticks:
+        if tick.reward is not None and tick.episode in observed:
+            observed[tick.episode].append(tick.observation)
+    return {number: robot.outcome_of(np.array(path, np.float32)) for number, path in observed.items()}
 
 
 def _columns(rows: Sequence[tuple[float, ...]], n: int) -> Float64[np.ndarray, "columns rows"]:

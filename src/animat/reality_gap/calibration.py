@@ -31,18 +31,13 @@ class Calibration:
     """What a closed loop takes from a recording, and what its prediction is made with.
 
     Attributes:
-        simulator: of the recording.
         bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
         responses_hz: non-burst responses of each condition, in the order of time, shape (responses,); of several
             readouts (responses, readouts).
         burst_threshold: ratio of active channels above which its responses were bursts.
-        burst_share: of its responses.
         drift: of the recordings up to it; None where one recording tells none.
         start_min: of the recording on the culture's clock.
-        conditions, window_ms, presentation: of the recording.
-        findings: what was noticed.
         fitted: how the simulators were made, as `Policy.fitted`.
-        readouts: that they answer for.
         remembering: how a loop's responses become the history state of its simulator.
     """
 

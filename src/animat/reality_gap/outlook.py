@@ -64,11 +64,9 @@ def outlook(
     """How long a session will be and can be.
 
     Args:
-        loop: its settings.
         calibration: whose recordings' drift is gone on with.
         episodes: of each agent how many, how often each condition is presented in one of them, and whether the
             culture gets pulses then.
-        account: of the budget.
         now_min: on the culture's clock.
     """
     interval_s = loop.pulses * np.array([condition.interval_s for condition in loop.conditions])

@@ -22,20 +22,20 @@ from animat.closed_loop.agents import (
     InTurn,
     OneCondition,
 )
-from animat.environment import Animat, Environment
+from animat.environment import Environment
+from animat.evaluation.controls import turned_round
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.passes import Passes
 from animat.robots.host import HostRobot
-from animat.wrappers import GoalSwitch, TurnedRound, YokedDelivery, with_inmost
+from animat.wrappers import GoalSwitch, YokedDelivery
 
 EPISODES = 200
 """Of each policy and control in one roll-out."""
 ROLL_OUTS = 5
 """On the recording's simulator; one on each simulator of bootstrapped responses."""
-
 
 BOOTSTRAPS_ON_HOST = 40
 """Fewer for a robot that is stepped on the host, where an episode takes a thousand times as long."""
@@ -92,7 +92,6 @@ def predict(
     Args:
         groups: agents as they will act on the culture; those of a group are policies that are run together.
         environment: robot and mapping, and what policies see besides.
-        calibration: the simulators.
         rule: the heuristic policy, where it is among the agents.
         greedy: whether policies take the most probable action.
         seed: decides every random draw.
@@ -165,15 +164,10 @@ def _changed(
     if agent.delivery == "yoked":
         changed = YokedDelivery(environment)
     if agent.is_turned_round:
-        changed = with_inmost(environment, _turned_round)
+        changed = turned_round(environment)
     if agent.switch_at is not None:
         changed = GoalSwitch(changed, agent.switch_at)
     return changed, simulator
-
-
-def _turned_round(inmost: Environment[Any]) -> Environment[Any]:
-    assert isinstance(inmost, Animat)
-    return TurnedRound(inmost.robot, inmost.mapping, inmost.n_conditions)
 
 
 def _actor(group: Sequence[Agent], rule: Actor | None, *, greedy: bool) -> tuple[Actor, int]:

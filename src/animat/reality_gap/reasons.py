@@ -35,7 +35,6 @@ class Evidence:
     """What is known of policies whose measured return differs from the predicted one.
 
     Attributes:
-        answered: what the culture answered them.
         calibration: the recording that predicted.
         predicted: of all policies together.
         gap: the sign of their gap: -1 where less was measured.
@@ -57,7 +56,8 @@ def presentation(evidence: Evidence) -> Finding | None:
     recorded, presented = evidence.calibration.presentation, evidence.answered.responses.presentation
     if recorded == presented:
         return None
-    return _reason("presentation", f"the recording was presented {recorded or 'as is not known'}, the loop {presented}")
+    message = f"the recording was presented {recorded or 'as is not known'}, the loop {presented}"
+    return Finding("presentation", "note", message)
 
 
 def few_samples(evidence: Evidence) -> Finding | None:
@@ -66,7 +66,7 @@ def few_samples(evidence: Evidence) -> Finding | None:
     if min(n) >= FEW_SAMPLES:
         return None
     few = [f"{n[i]} of {condition.label}" for i, condition in enumerate(_conditions(evidence)) if n[i] < FEW_SAMPLES]
-    return _reason("few-samples", f"the recording has few responses: {', '.join(few)}", min(n))
+    return Finding("few-samples", "note", f"the recording has few responses: {', '.join(few)}", min(n))
 
 
 def lateness(evidence: Evidence) -> Finding | None:
@@ -82,7 +82,7 @@ def lateness(evidence: Evidence) -> Finding | None:
             f"{condition.label} in {100 * share:.0f} % of its trials, by {late_ms:.2g} ms of its "
             f"{1000 * condition.interval_s:.3g} on average"
         )
-    return _reason("lateness", f"pulses came late: {', '.join(told)}", most) if told else None
+    return Finding("lateness", "note", f"pulses came late: {', '.join(told)}", most) if told else None
 
 
 def bursts(evidence: Evidence) -> Finding | None:
@@ -95,7 +95,7 @@ def bursts(evidence: Evidence) -> Finding | None:
         f"{100 * count / n:.0f} % of {n} responses were bursts ({100 * evidence.calibration.burst_share:.0f} % in the "
         "recording), which the prediction leaves out"
     )
-    return _reason("bursts", message, count / n)
+    return Finding("bursts", "note", message, count / n)
 
 
 def trend(evidence: Evidence) -> Finding | None:
@@ -138,7 +138,7 @@ def trend(evidence: Evidence) -> Finding | None:
         f"the culture changed over the session's {answers.span_min:.0f} min: responses {', '.join(told)} (of their "
         f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
-    return _reason("trend", message, most)
+    return Finding("trend", "note", message, most)
 
 
 def memory(evidence: Evidence) -> Finding | None:
@@ -146,7 +146,7 @@ def memory(evidence: Evidence) -> Finding | None:
     if evidence.calibration.simulator.has_memory:
         return None
     found = next(memory_findings(evidence.answered.responses), None)
-    return None if found is None else _reason("memory", found.message, found.value)
+    return None if found is None else Finding("memory", "note", found.message, found.value)
 
 
 def answers(evidence: Evidence) -> Finding | None:
@@ -189,7 +189,7 @@ def answers(evidence: Evidence) -> Finding | None:
             )
     if not told:
         return None
-    return _reason("answers", f"responses pass P50 more or less often than predicted: {', '.join(told)}", most)
+    return Finding("answers", "note", f"responses pass P50 more or less often than predicted: {', '.join(told)}", most)
 
 
 CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
@@ -211,7 +211,3 @@ def _variance(share: float, n: int) -> float:
 
 def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
     return evidence.answered.responses.conditions
-
-
-def _reason(name: str, message: str, value: float | None = None) -> Finding:
-    return Finding(name, "note", message, value)

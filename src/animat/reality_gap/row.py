@@ -107,5 +107,4 @@ def resampled_means(
     """Means of returns drawn anew, with replacement."""
     n = len(returns)
     often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
-    means: Float64[np.ndarray, " resamples"] = often @ returns / n
-    return means
+    return np.asarray(often @ returns / n)

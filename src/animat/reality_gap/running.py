@@ -34,18 +34,10 @@ from animat.evaluation.verdict import beside
 from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
-from animat.reality_gap.answered import answered
+from animat.reality_gap.answered import answered, outcomes
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.goals import outcomes
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import (
-    BOOTSTRAPS_ON_HOST,
-    ROLL_OUTS,
-    Predicted,
-    episodes_on_host,
-    predict,
-    together,
-)
+from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Predicted, episodes_on_host, predict, together
 from animat.reality_gap.reasons import Evidence, reasons
 from animat.reality_gap.row import Row, between
 from animat.reality_gap.table import RealityGap
@@ -95,7 +87,6 @@ def run_policies(
         policies: by name, of one robot, mapping and set of conditions.
         culture: open.
         calibration: percentiles, burst threshold and prediction.
-        folder: for the session.
         episodes: of each policy, and at most of each control.
         with_controls: all of them; if not, only the random one.
         with_coupling: the best coupling on the calibration's simulator too, which is searched for first.
@@ -106,7 +97,6 @@ def run_policies(
             calibration left them, or are fixed.
         seed: decides every random draw, but what the culture does.
         pulses: of a trial; None: as in the policies' recordings.
-        account: of a stimulation budget.
         progress: told of each phase how far it is, and of the closed loop the returns so far.
         report: is given lines before the session: the warnings, and how long it will and can be.
         noticed: findings to be reported beside those made here.

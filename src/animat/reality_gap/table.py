@@ -28,14 +28,10 @@ class RealityGap:
     """Policies and controls, predicted and measured.
 
     Attributes:
-        robot, mapping: names.
-        loop: the settings of the closed loop.
         calibrated_at_min: of the recording that predicted.
         optimum: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
-        session: as it ran.
-        account: of the stimulation.
         findings: where loop, recording and policy differ, and what was noticed.
         responses: that the recording has, without bursts.
         outlook: how long the session would be and could be, as it was known beforehand.

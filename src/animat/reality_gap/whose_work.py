@@ -31,7 +31,6 @@ class Replaced:
     Attributes:
         name, meaning: what.
         is_measured: whether in closed loop on the culture; else on its simulator.
-        mean_return: of it.
         lost: how much less that is than the policies' measured return, with its interval over episodes.
     """
 
@@ -94,10 +93,9 @@ def told_replaced(policies: Row, found: Sequence[Replaced]) -> list[str]:
     """The table as lines for a terminal."""
     cells = []
     for each in found:
-        low, high = each.lost.low, each.lost.high
-        between = f"{low:.1f} to {high:.1f}" if np.isfinite(low) else "unknown"
         where = "measured" if each.is_measured else "simulator"
-        cells.append([each.name, f"{each.mean_return:.1f}", f"{each.lost.value:.1f}", between, where, each.meaning])
+        lost = f"{each.lost.value:.1f}", each.lost.ends
+        cells.append([each.name, f"{each.mean_return:.1f}", *lost, where, each.meaning])
     usual = f"{policies.measured.mean():.1f}"
     return [
         f"whose work is it: return with the culture replaced, and the loss from the measured {usual}",

@@ -69,7 +69,6 @@ class PlainColumns:
         """Check and sort the columns and make a recording of them.
 
         Args:
-            provenance: where the columns came from.
             findings: what was noticed so far; these and what is noticed here go with the recording.
 
         Raises:
@@ -121,15 +120,11 @@ class PlainColumns:
         }
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
-            noted.append(
-                Finding(
-                    "silent-channels-unknown",
-                    "warning",
-                    f"no table of channels: the {len(fired):,} that fired are taken for all; silent ones are not "
-                    "known, so rates per channel may be too high",
-                    float(len(fired)),
-                )
+            message = (
+                f"no table of channels: the {len(fired):,} that fired are taken for all; silent ones are not "
+                "known, so rates per channel may be too high"
             )
+            noted.append(Finding("silent-channels-unknown", "warning", message, float(len(fired))))
             return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
         if len(set(lengths.values())) > 1:
             raise UnusableData(
@@ -212,6 +207,15 @@ class PlainColumns:
         return start_s, duration_s
 
 
+def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, float]:
+    """`start_s` and `duration_s` of so many frames from 0 on and all events, some of which may lie outside."""
+    every_s = np.concatenate(times_s)
+    start_s = float(every_s.min(initial=0.0))
+    # Half a frame more than the last event, so that no rounding puts it outside.
+    stop_s = max(frames / rate_hz, float(every_s.max(initial=0.0)) + 0.5 / rate_hz)
+    return {"start_s": start_s, "duration_s": stop_s - start_s}
+
+
 def _in_time(
     name: str, column: Column, events: str, noted: list[Finding]
 ) -> tuple[Float64[np.ndarray, " events"], Int64[np.ndarray, " events"]]:
@@ -224,14 +228,8 @@ def _in_time(
     # Later than one that stands anywhere before it, not only just before it.
     early = np.count_nonzero(times_s < np.maximum.accumulate(times_s)) if len(times_s) else 0
     if early:
-        noted.append(
-            Finding(
-                f"unsorted-{events}",
-                "note",
-                f"{early:,} of {len(times_s):,} {events} stand behind a later one in the file: sorted by time",
-                float(early),
-            )
-        )
+        message = f"{early:,} of {len(times_s):,} {events} stand behind a later one in the file: sorted by time"
+        noted.append(Finding(f"unsorted-{events}", "note", message, float(early)))
     return times_s[order], order
 
 

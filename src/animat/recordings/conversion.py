@@ -96,9 +96,7 @@ def convert_recording(
     """Read a recording in any format and write it as NWB.
 
     Args:
-        path: the recording.
         out: the NWB file, complete or absent.
-        origin: who recorded what.
         detection: find the spikes in raw traces, in this way; None: take the spikes that the file has.
         reader: the format's name for SpikeInterface; the spikes are then found in its traces.
         stimuli_path, stimuli, part, start_min: as in `read_recording`.

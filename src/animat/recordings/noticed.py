@@ -37,12 +37,11 @@ def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
 def _in_data(recording: Recording) -> Iterable[Finding]:
     channels, stimuli = recording.channels, recording.stimuli
     if not len(stimuli):
-        yield Finding(
-            "no-stimuli",
-            "refuse",
+        message = (
             f"{len(recording.spike_times_s):,} spikes but no stimulus: there are no responses to learn from; "
-            "bring the stimulus times too",
+            "bring the stimulus times too"
         )
+        yield Finding("no-stimuli", "refuse", message)
     if not len(recording.spike_times_s):
         yield Finding("no-spikes", "refuse", f"no spike on any of {len(channels):,} channels: nothing can be learned")
     else:
@@ -54,12 +53,11 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
-        yield Finding(
-            "presentation-unknown",
-            "note",
+        message = (
             "how the stimuli were presented (blocked or mixed, pulses per trial) is not known; a closed loop "
-            "cannot check that it presents them in the same way",
+            "cannot check that it presents them in the same way"
         )
+        yield Finding("presentation-unknown", "note", message)
 
 
 def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
@@ -67,19 +65,13 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
     n_spikes, times_s = len(recording.spike_times_s), recording.stimuli.time_s
     if len(times_s) >= MANY_STIMULI and 0 < n_spikes < len(times_s):
         ratio = len(times_s) / n_spikes
-        yield Finding(
-            "more-stimuli-than-spikes",
-            "refuse" if ratio >= STIMULI_A_SPIKE else "note",
-            f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?",
-            ratio,
-        )
+        message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
+        yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_A_SPIKE else "note", message, ratio)
     last = recording.stimuli.is_last_of_presentation
     same = int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1]))
     if same:
-        yield Finding(
-            "simultaneous-stimuli",
-            "refuse",
+        message = (
             f"{same:,} of {len(times_s):,} stimuli come at the very time of the one before, and the response is "
-            "counted for each: where they are the electrodes of one stimulus, put these into one row",
-            float(same),
+            "counted for each: where they are the electrodes of one stimulus, put these into one row"
         )
+        yield Finding("simultaneous-stimuli", "refuse", message, float(same))

@@ -19,7 +19,6 @@ class RawTraces(Protocol):
     Attributes:
         channels: the table of channels, one a column.
         samples: how many each channel has.
-        sampling_rate_hz: of the samples.
         start_s: time of the first sample on the recording's clock.
     """
 
@@ -47,7 +46,6 @@ def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np
 
     Args:
         steps: of any number type, in any layout, shape (samples, channels).
-        uv_per_step: microvolts of one step.
     """
     samples, channels = steps.shape
     rows = np.empty((channels, samples), dtype=np.float32)
@@ -68,7 +66,6 @@ class ArrayTraces:
     Attributes:
         voltage_uv: shape (samples, channels), any number type.
         channels: one a column.
-        sampling_rate_hz: of the samples.
         start_s: time of the first sample.
         uv_per_step: what one step of `voltage_uv` is, 1 for microvolts.
     """
@@ -87,11 +84,9 @@ class ArrayTraces:
 
     @property
     def samples(self) -> int:
-        """How many each channel has."""
         return int(self.voltage_uv.shape[0])
 
     def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        """The voltage of samples `start` to `stop`."""
         return in_microvolts(self.voltage_uv[start:stop], self.uv_per_step)
 
 
@@ -105,7 +100,6 @@ class Hdf5Traces:
         channels_first: whether the dataset is (channels, samples) and not (samples, channels).
         channels: one a column.
         samples, sampling_rate_hz, start_s: as in `RawTraces`.
-        uv_per_step: microvolts of one step.
     """
 
     path: Path

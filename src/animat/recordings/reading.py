@@ -58,7 +58,6 @@ def read_recording(
     """Read one recording: NWB, MaxWell, CL1 (HDF5), NPZ (zip) or CSV (text, gzipped or not), known by its content.
 
     Args:
-        path: the file.
         stimuli_path: the file of stimuli, for CSV only; by default the one beside the spikes.
         stimuli: which of several things in a file are the stimuli: NWB of other programs, the name; MaxWell, the
             events' type.
@@ -116,7 +115,6 @@ def read_source(
     """Read what responses can be had from: a recording, or a table of responses without spikes.
 
     Args:
-        path: the file.
         stimuli, part: as in `read_recording`.
 
     Raises:

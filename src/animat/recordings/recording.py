@@ -89,8 +89,6 @@ class Recording:
         spike_times_s: times of all spikes, rising, shape (spikes,).
         spike_channels: the row in `channels` of each spike, shape (spikes,). Spikes given at one and the same time
             are put in the order of their channels, so that one set of spikes has one order.
-        channels: the channel table.
-        stimuli: the stimulus table.
         sampling_rate_hz: of the raw signal the spikes were detected in, NaN where it is not known.
         start_s: start of the recording on its own clock.
         duration_s: from `start_s`; all spikes and stimuli lie within.

@@ -27,8 +27,6 @@ def read_traces(
     """Find the spikes in a file's raw traces (MaxWell, CL1, NWB) and make a recording of them.
 
     Args:
-        path: the file.
-        settings: how spikes are found.
         part, stimuli: as in `read_recording`.
         progress: told after each piece.
 
@@ -52,7 +50,6 @@ def with_spikes_of(
     Args:
         traces: of the recording's channels.
         base: channels (those of the traces), stimuli, span and provenance.
-        settings: how spikes are found.
         progress: told after each piece.
     """
     settings = settings or Detection()

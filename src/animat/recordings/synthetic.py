@@ -244,9 +244,7 @@ def write_synthetic_series(
     stopped.
 
     Args:
-        seed: of the culture.
         folder: where the files go; made if it is missing.
-        sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
         progress: told after each recording.
         settings: attributes of `SyntheticCulture`.

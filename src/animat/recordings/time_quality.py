@@ -60,19 +60,17 @@ def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[
 
     Args:
         stimuli: with any frequencies.
-        has_times: whether their times are known.
     """
     if has_times:
         yield from _contradicted(stimuli)
         return
     stated_hz = np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)])
     if len(stated_hz) > 1 and stated_hz[-1] < 1:
-        yield Finding(
-            CONTRADICTED,
-            "warning",
+        message = (
             f"all frequencies are below 1 Hz, {stated_hz[0]:g} to {stated_hz[-1]:g}: if they are periods in seconds, "
-            f"write 1 divided by each, {1 / stated_hz[-1]:g} to {1 / stated_hz[0]:g}",
+            f"write 1 divided by each, {1 / stated_hz[-1]:g} to {1 / stated_hz[0]:g}"
         )
+        yield Finding(CONTRADICTED, "warning", message)
 
 
 def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
@@ -89,14 +87,13 @@ def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
         if np.all(np.abs(multiples / multiple - 1) < AGREE) and not 1 / FAR < multiple < FAR:
             example_s = float(np.median(interval_s[known & (frequency_hz == distinct[0])]))
             unit = _unit(multiple, sampling_rate_hz)
-            return Finding(
-                NAME,
-                "refuse" if unit else "warning",
+            message = (
                 f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those of {distinct[0]:g} Hz would be "
                 f"{example_s:g} s apart, not {1 / distinct[0]:g} s, and those of others are off by the same factor of "
                 f"{_plain(multiple)}: "
-                + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?"),
+                + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?")
             )
+            return Finding(NAME, "refuse" if unit else "warning", message)
     return None
 
 
@@ -119,13 +116,11 @@ def _contradicted(stimuli: Stimuli) -> Iterator[Finding]:
         if is_period
         else "correct the frequencies, or sort the stimuli by their times (--conditions interval:5,10)"
     )
-    yield Finding(
-        CONTRADICTED,
-        "warning",
+    message = (
         f"stimuli that are said to come at {stated_hz:g} Hz are {interval_s:.3g} s apart (median), not "
-        f"{1 / stated_hz:.3g} s: {remedy}",
-        least,
+        f"{1 / stated_hz:.3g} s: {remedy}"
     )
+    yield Finding(CONTRADICTED, "warning", message, least)
 
 
 def _unit(multiple: float, sampling_rate_hz: float) -> str | None:

@@ -53,7 +53,6 @@ def extract_responses(
     counted in `findings`, where also everything else is said that makes the responses doubtful.
 
     Args:
-        recording: the spikes and stimuli.
         by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
@@ -97,11 +96,9 @@ def responses_of_table(
 
     Args:
         table: what each channel did after each stimulus.
-        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
         window_ms: the window that was counted in, where the table does not say; one that it says goes before the
             default one.
-        burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
-        readouts: groups of channels whose x is read too, in the same windows; bursts are told by all channels.
+        by, burst_threshold, readouts: as in `extract_responses`.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
@@ -182,10 +179,9 @@ def _sorted(
 
 
 def _assumed(window_ms: tuple[float, float]) -> Finding:
-    return Finding(
-        "window-assumed",
-        "warning",
+    message = (
         f"the table does not say in which window its spikes were counted: {window_ms[0]:g} to {window_ms[1]:g} ms "
         "after the stimulus are assumed, in which a closed loop would count them; say it with --window-ms, or in "
-        "the file",
+        "the file"
     )
+    return Finding("window-assumed", "warning", message)

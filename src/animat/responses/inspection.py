@@ -29,7 +29,6 @@ class ConditionSummary:
     """The responses to one condition in a few numbers.
 
     Attributes:
-        label: the condition.
         n_responses: all responses, bursts included.
         n_non_burst: responses that are no bursts; the other numbers are theirs.
         median_rate_hz: median of x, NaN without responses.
@@ -167,7 +166,6 @@ def inspect_recording(
     """Look at a recording as training would use it, and say what is in it and what is wrong with it.
 
     Args:
-        recording: the recording, or a table of responses.
         by: what makes a condition; by frequency where it is known, else all stimuli in one.
         window_ms: start and end of the window that responses are read in, after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
@@ -195,20 +193,13 @@ def inspect_recording(
     return Inspection(
         name=name or recording.provenance.get("source", "recording"),
         n_spikes=len(recording.spike_times_s),
-        n_channels=len(recording.channels),
-        n_stimuli=len(recording.stimuli),
-        n_trials=int(np.count_nonzero(read)),
-        presentation=None if recording.presentation is None else str(recording.presentation),
-        start_min=recording.start_min,
         duration_s=recording.duration_s,
-        by=str(chosen),
         by_default=by is None,
         mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
         spontaneous_rate_hz=rate_hz,
         response=find_response(recording),
-        responses=responses,
-        findings=_gravest_first(recording, responses),
         network_bursts=bursts,
+        **_of_any(recording, chosen, responses),
     )
 
 
@@ -229,20 +220,27 @@ def _of_table(
     return Inspection(
         name=name or table.provenance.get("source", "table"),
         n_spikes=int(table.values.sum()) if table.kind == "count" else None,
-        n_channels=len(table.channels),
-        n_stimuli=len(table.stimuli),
-        n_trials=int(np.count_nonzero(read)),
-        presentation=None if table.presentation is None else str(table.presentation),
-        start_min=table.start_min,
         duration_s=float(np.ptp(times_s)) if table.has_times and len(times_s) else math.nan,
-        by=str(chosen),
         by_default=by is None,
         mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
         spontaneous_rate_hz=math.nan,
         response=None,
-        responses=responses,
-        findings=_gravest_first(table, responses),
+        **_of_any(table, chosen, responses),
     )
+
+
+def _of_any(source: Recording | ResponseTable, by: Conditions, responses: Responses) -> dict[str, Any]:
+    """What is found alike in recordings and tables."""
+    return {
+        "n_channels": len(source.channels),
+        "n_stimuli": len(source.stimuli),
+        "n_trials": int(np.count_nonzero(source.stimuli.is_last_of_presentation)),
+        "presentation": None if source.presentation is None else str(source.presentation),
+        "start_min": source.start_min,
+        "by": str(by),
+        "responses": responses,
+        "findings": _gravest_first(source, responses),
+    }
 
 
 def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> tuple[Finding, ...]:

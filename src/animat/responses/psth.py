@@ -69,7 +69,6 @@ def post_stimulus_histogram(
     """Count spikes by their time from the stimulus.
 
     Args:
-        recording: the spikes and stimuli.
         from_ms, to_ms: the span, from the stimulus; negative is before it. It grows to a whole number of bins.
         bin_ms: width of the bins, which are half-open and compared as in `count_spikes`, so that bins inside a window
             add up to the spikes of that window.
@@ -101,7 +100,6 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
     than a second of quiet tells nothing: a single burst might fill it.
 
     Args:
-        recording: the spikes and stimuli.
         after_ms: quiet begins this long after the previous pulse where that is more than 100 ms.
 
     Returns:
@@ -131,7 +129,6 @@ def find_response(
     search is shortened to the upper quarter of the intervals.
 
     Args:
-        recording: the spikes and stimuli.
         up_to_ms: how far after the stimulus is searched.
         stimuli: which pulses to take, shape (stimuli,); None for those that end a presentation.
     """

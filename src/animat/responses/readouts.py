@@ -98,7 +98,6 @@ class Readouts:
         Edges are as in `animat.responses.windows.count_spikes`.
 
         Args:
-            recording: the spikes.
             members: of its channels (`members`).
             after_s: of the pulses, in seconds on the clock of the spikes.
             window_ms: start and end of the window after each.

@@ -66,7 +66,6 @@ class Responses:
             threshold makes; NaN where that leaves one (see `animat.responses.bursts`).
         presentation: how stimuli were presented, None where it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
-        findings: what was noticed about them.
         time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
             responses that come from elsewhere.
         presented: all trials of the recording, also those without a condition; None: these responses are all,

@@ -18,19 +18,20 @@ _BLOCK = 1 << 26
 
 
 class Spiking(Protocol):
-    """Spikes on channels, in the order of time: a `Recording`, or the piece of one that a closed loop has just seen."""
+    """Spikes on channels, in the order of time: a `Recording`, or the piece of one that a closed loop has just seen.
+
+    Attributes:
+        spike_times_s: rising.
+        spike_channels: of each spike.
+        channels: the channel table.
+    """
 
     @property
-    def spike_times_s(self) -> Float64[np.ndarray, " spikes"]:
-        """Times of the spikes, rising."""
-
+    def spike_times_s(self) -> Float64[np.ndarray, " spikes"]: ...
     @property
-    def spike_channels(self) -> Int64[np.ndarray, " spikes"]:
-        """The channel of each spike."""
-
+    def spike_channels(self) -> Int64[np.ndarray, " spikes"]: ...
     @property
-    def channels(self) -> Sized:
-        """The channel table."""
+    def channels(self) -> Sized: ...
 
 
 def read_windows(
@@ -78,7 +79,6 @@ def count_spikes(
     stimulus' time and the window's edge decides, one sample (0.05 ms at 20 kHz) either way.
 
     Args:
-        recording: the spikes.
         from_s, to_s: the windows, in seconds on the recording's clock, shape (windows,).
     """
     times_s = recording.spike_times_s

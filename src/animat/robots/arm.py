@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
+from animat.late import Array, Axes, jax, jnp
 from animat.records import record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
-from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, draw_over_time
 from animat.robots.motion import cost_of_distance, runge_kutta
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from jax import Array
-    from matplotlib.axes import Axes
 
 SUBSTEPS = 4
 """Steps of the equations of motion in an iteration: damping settles a light link within a part of one."""
@@ -91,7 +88,6 @@ class TwoLinkArm(Robot[ArmState]):
 
     name: ClassVar[str] = "arm"
     n_commands: ClassVar[int] = 2
-    noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 2_000_000
 
     def __post_init__(self) -> None:
@@ -135,9 +131,6 @@ class TwoLinkArm(Robot[ArmState]):
 
     def reset(self, key: Array) -> ArmState:
         """At rest, the upper link to the right and the elbow bent downwards; the target drawn."""
-        import jax
-        import jax.numpy as jnp
-
         outwards, around = jax.random.uniform(key, (2,))
         nearest_m, farthest_m = self._target_distances_m
         distance_m = jnp.sqrt(nearest_m**2 + outwards * (farthest_m**2 - nearest_m**2))
@@ -149,9 +142,6 @@ class TwoLinkArm(Robot[ArmState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: ArmState, u: Float[Array, " n_commands"]
     ) -> tuple[ArmState, Float[Array, ""], Bool[Array, ""]]:
-        """The links move under the same torques throughout (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
-
         m11, m12, m22, coupling = self._inertia
         torques = self.torque_n_m * jnp.asarray(u)
 
@@ -174,9 +164,6 @@ class TwoLinkArm(Robot[ArmState]):
         return after, reward, jnp.zeros((), bool)
 
     def observe(self, state: ArmState) -> Float[Array, " observations"]:
-        """What `observation_spec` names, in its order."""
-        import jax.numpy as jnp
-
         q1, q2, w1, w2, target_x_m, target_y_m = state
         joints = (jnp.cos(q1), jnp.sin(q1), jnp.cos(q2), jnp.sin(q2))
         return jnp.stack([*joints, w1, w2, target_x_m, target_y_m, *self._to_target(state)])
@@ -220,21 +207,13 @@ class TwoLinkArm(Robot[ArmState]):
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """How far the tip was from the target in each episode, over time."""
-        arrived = 0
-        for path in paths:
-            distance_m = np.hypot(path[:, 8], path[:, 9])
-            there = bool(distance_m[-1] <= self.target_radius_m)
-            arrived += there
-            time_s = np.arange(len(path)) * self.step_s
-            axes.plot(time_s, distance_m, color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
-        axes.axhline(self.target_radius_m, color=EDGE, linewidth=0.8, linestyle="--")
-        axes.set_xlim(0, self.episode_limit * self.step_s)
+        distances_m, radius_m = [np.hypot(path[:, 8], path[:, 9]) for path in paths], self.target_radius_m
+        arrived = [bool(each[-1] <= radius_m) for each in distances_m]
+        told, ylabel = "end at the target", "tip to target (m)"
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], told=told, ylabel=ylabel)
         axes.set_ylim(bottom=0)
-        axes.set(xlabel=f"time (s); {arrived} of {len(paths)} end at the target", ylabel="tip to target (m)")
 
     def _to_target(self, state: ArmState) -> tuple[Array, Array]:
-        import jax.numpy as jnp
-
         both = state.shoulder_rad + state.elbow_rad
         x_m = self.upper_length_m * jnp.cos(state.shoulder_rad) + self.lower_length_m * jnp.cos(both)
         y_m = self.upper_length_m * jnp.sin(state.shoulder_rad) + self.lower_length_m * jnp.sin(both)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, final
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, final
 
 from jaxtyping import Bool, Float
 from pydantic import BeforeValidator, Field
 
+from animat.late import Array, jax
 from animat.records import Number, Whole
-
-if TYPE_CHECKING:
-    from jax import Array
 
 State = TypeVar("State")
 """A robot's state: a NamedTuple of float32 scalars; batches of robots are `jax.vmap` outside."""
@@ -137,8 +135,6 @@ class Robot(abc.ABC, Generic[State]):
         self, key: Array, state: State, u: Float[Array, "*commands"]
     ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
         """One iteration, its random numbers drawn from `key`; arguments and results as in `advance`."""
-        import jax
-
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, u)
 
     def caveats(self) -> tuple[str, ...]:

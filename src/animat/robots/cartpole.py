@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
+from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
-from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, INK, PAPER, RAIL, Canvas, Picture
+from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from jax import Array
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
 
 FORESIGHT_S = 0.1
 """The heuristic goes by where the pole will lean so much later, at the speed it falls with now."""
@@ -107,17 +103,12 @@ class Cartpole(Robot[CartpoleState]):
 
     def reset(self, key: Array) -> CartpoleState:
         """At rest, upright, centred; `key` is not used."""
-        import jax.numpy as jnp
-
         zero = jnp.zeros((), jnp.float32)
         return CartpoleState(zero, zero, zero, zero)
 
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: CartpoleState, u: Float[Array, ""]
     ) -> tuple[CartpoleState, Float[Array, ""], Bool[Array, ""]]:
-        """One push of the cart (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
-
         position, velocity, angle, angular_velocity = state
         pole_mass, half_length = self.pole_mass_kg, self.pole_length_m / 2
         total_mass = self.cart_mass_kg + pole_mass
@@ -143,9 +134,6 @@ class Cartpole(Robot[CartpoleState]):
         return after, reward, terminated
 
     def observe(self, state: CartpoleState) -> Float[Array, " observations"]:
-        """Cart position (m) and velocity (m/s), pole angle (rad) and angular velocity (rad/s)."""
-        import jax.numpy as jnp
-
         return jnp.stack(state)
 
     def caveats(self) -> tuple[str, ...]:
@@ -192,8 +180,6 @@ class Cartpole(Robot[CartpoleState]):
         Raises:
             InvalidArgument: for a pole that may swing far.
         """
-        from animat.robots.grid import Axis, Grid
-
         if self.angle_limit_rad > 0.75:
             raise InvalidArgument(
                 f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {self.angle_limit_rad:g}; "
@@ -262,17 +248,10 @@ class Cartpole(Robot[CartpoleState]):
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """How far the pole leaned in each episode, over time."""
-        limit_deg = math.degrees(self.angle_limit_rad)
-        for path in paths:
-            colour = DONE if len(path) > self.episode_limit else FAILED
-            time_s, angle_deg = np.arange(len(path)) * self.step_s, np.degrees(path[:, 2])
-            axes.plot(time_s, angle_deg, color=colour, linewidth=0.7, alpha=0.8)
-        for sign in (-1, 1):
-            axes.axhline(sign * limit_deg, color=EDGE, linewidth=0.8, linestyle="--")
-        axes.set_xlim(0, self.episode_limit * self.step_s)
+        limit_deg, angles_deg = math.degrees(self.angle_limit_rad), [np.degrees(path[:, 2]) for path in paths]
+        stayed, limits = [len(path) > self.episode_limit for path in paths], (-limit_deg, limit_deg)
+        draw_over_time(axes, self, angles_deg, stayed, limits=limits, told="to the end", ylabel="pole angle (deg)")
         axes.set_ylim(-1.25 * limit_deg, 1.25 * limit_deg)
-        stayed = sum(len(path) > self.episode_limit for path in paths)
-        axes.set(xlabel=f"time (s); {stayed} of {len(paths)} to the end", ylabel="pole angle (deg)")
 
     def _bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Bounds of (position, velocity) of the cart and of the pole over whole episodes that start at rest.

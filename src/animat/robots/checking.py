@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from animat.errors import AnimatError, InvalidArgument, first_line, shown
+from animat.late import jax, jnp
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
 from animat.robots.host import Bodies, HostRobot
 
@@ -20,15 +21,9 @@ MOST_COMMANDS = 64
 def check_robot(robot: Robot[Any]) -> None:
     """Reset a robot and step it a few times, and refuse it if something comes of it that no environment can use.
 
-    Args:
-        robot: of any class.
-
     Raises:
         InvalidArgument: naming the method or attribute, what was expected and what came.
     """
-    import jax
-    import jax.numpy as jnp
-
     name = _named(robot)
     if isinstance(robot, HostRobot):
         _check_on_host(robot)
@@ -126,8 +121,6 @@ def _tried(what: str, call: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _expect_shape(what: str, value: Any, shape: tuple[int, ...], words: str, kind: type = float) -> None:
-    import jax.numpy as jnp
-
     try:
         array = jnp.asarray(value)
     except TypeError as error:
@@ -140,9 +133,6 @@ def _expect_shape(what: str, value: Any, shape: tuple[int, ...], words: str, kin
 
 def _expect_alike(what: str, after: Any, before: Any) -> None:
     """A state keeps its form: it is carried through a loop that is compiled once."""
-    import jax
-    import jax.numpy as jnp
-
     forms = [
         (jax.tree.structure(state), [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(state)])
         for state in (before, after)

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
 from animat.errors import InvalidArgument
+from animat.late import Axes
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 
@@ -64,6 +65,34 @@ def draw_robot(
         got = f"{picture.dtype} of shape {picture.shape}"
         raise InvalidArgument(f"{robot.name}.draw: expected uint8 of shape (height, width, 3), got {got}")
     return picture
+
+
+def draw_over_time(
+    axes: Axes,
+    robot: Any,
+    values: Sequence[np.ndarray],
+    ended_well: Sequence[bool],
+    *,
+    limits: Sequence[float],
+    told: str,
+    ylabel: str,
+) -> None:
+    """One number of each episode over time, in the colour of how the episode ended.
+
+    Args:
+        robot: whose iterations last `step_s`.
+        values: of each episode, a number an iteration.
+        limits: of the number, drawn across.
+        told: what those that ended well did, in words: `end upright`.
+        ylabel: what the number is, with its unit.
+    """
+    for course, is_good in zip(values, ended_well, strict=True):
+        time_s = np.arange(len(course)) * robot.step_s
+        axes.plot(time_s, course, color=DONE if is_good else FAILED, linewidth=0.7, alpha=0.8)
+    for limit in limits:
+        axes.axhline(limit, color=EDGE, linewidth=0.8, linestyle="--")
+    axes.set_xlim(0, robot.episode_limit * robot.step_s)
+    axes.set(xlabel=f"time (s); {sum(ended_well)} of {len(values)} {told}", ylabel=ylabel)
 
 
 class Canvas:

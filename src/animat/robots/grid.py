@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int32
+from jaxtyping import Int32
 
 from animat.errors import InvalidArgument, first_line, shown
+from animat.late import Array, jnp
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 

@@ -8,16 +8,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 
 from animat.errors import AnimatError, BodyFailed, InvalidArgument, first_line
+from animat.late import Array, jnp
 from animat.robots.base import Robot
-
-if TYPE_CHECKING:
-    from jax import Array
 
 Answer = TypeVar("Answer")
 
@@ -89,8 +87,6 @@ class HostRobot(Robot[Any]):
 
     def reset(self, key: Array) -> Float[Array, " observations"]:
         """Nothing was observed yet."""
-        import jax.numpy as jnp
-
         return jnp.zeros(len(self.observation_spec), jnp.float32)
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> Any:
@@ -123,8 +119,7 @@ class Stepped(NamedTuple):
     @property
     def ended(self) -> Bool[np.ndarray, " bodies"]:
         """In either way."""
-        ended: Bool[np.ndarray, " bodies"] = self.terminated | self.truncated
-        return ended
+        return np.asarray(self.terminated | self.truncated)
 
 
 class Standing(NamedTuple):
@@ -203,12 +198,12 @@ class Bodies:
         actions = robot.actions(commands)
         reward = np.zeros(len(bodies))
         terminated, truncated = np.zeros(len(bodies), bool), np.zeros(len(bodies), bool)
-        with within(robot, "step"):
-            try:
-                for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
-                    observation[i], reward[i], terminated[i], truncated[i] = body.step(action)
-            except (Exception, SystemExit) as error:
-                raise _failed(robot, "step", error) from error
+
+        def step() -> None:
+            for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
+                observation[i], reward[i], terminated[i], truncated[i] = body.step(action)
+
+        tried(robot, "step", step)
         if kept.shape[1]:
             kept[np.arange(len(bodies)), iterations] = commands
         iterations += 1

@@ -17,10 +17,8 @@ def measured_scales(robot: HostRobot, bounds: Sequence[float], steps: int, seed:
     To two digits, so that it is the same where a processor rounds otherwise; 1 for what is always 0.
 
     Args:
-        robot: of any scales.
         bounds: how large each number can be; 0 where that is not known.
         steps: iterations, in episodes one after the other.
-        seed: of episodes and commands.
 
     Raises:
         BodyFailed: as `Bodies.step`.

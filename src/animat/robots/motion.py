@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from jaxtyping import Float
 
-if TYPE_CHECKING:
-    from jax import Array
+from animat.late import Array, jax, jnp
 
 Numbers = TypeVar("Numbers")
 
 
 def within_half_a_turn(angle_rad: Float[Array, ""]) -> Float[Array, ""]:
     """The same direction in (-pi, pi], of an angle in (-3 pi, 3 pi]."""
-    import jax.numpy as jnp
-
     least = jnp.where(angle_rad > math.pi, angle_rad - 2 * math.pi, angle_rad)
     return jnp.where(angle_rad <= -math.pi, angle_rad + 2 * math.pi, least)
 
 
 def cost_of_distance(distance_m: Float[Array, ""], radius_m: float) -> Float[Array, ""]:
     """R / d - 1 with R the radius of a goal and d the distance to its centre: 0 within it, towards -1 far away."""
-    import jax.numpy as jnp
-
     # At the goal the distance may be zero; the larger of the two keeps R / d finite there.
     return radius_m / jnp.maximum(distance_m, radius_m) - 1
 
@@ -41,7 +36,6 @@ def runge_kutta(rates: Callable[[Numbers], Numbers], state: Numbers, step_s: flo
         state: y, a pytree.
         step_s: h.
     """
-    import jax
 
     def after(rate: Numbers, share: float) -> Numbers:
         moved: Numbers = jax.tree.map(lambda y, k: y + share * step_s * k, state, rate)

@@ -4,37 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
+from typing import Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
+from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
-from animat.robots.drawing import (
-    ACCENT,
-    AIM,
-    BODY,
-    DONE,
-    EDGE,
-    FAILED,
-    GOAL,
-    GOAL_FILL,
-    INK,
-    TRAIL,
-    Canvas,
-    Picture,
-)
+from animat.robots.drawing import ACCENT, AIM, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
+from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from jax import Array
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
 
 
 class NavigationState(NamedTuple):
@@ -85,7 +68,6 @@ class Navigation(Robot[NavigationState]):
     episode_limit: Iterations = 100
 
     name: ClassVar[str] = "navigation"
-    noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 500_000
 
     def __post_init__(self) -> None:
@@ -133,17 +115,12 @@ class Navigation(Robot[NavigationState]):
 
     def reset(self, key: Array) -> NavigationState:
         """In the top-left corner, facing right; `key` is not used."""
-        import jax.numpy as jnp
-
         zero = jnp.zeros((), jnp.float32)
         return NavigationState(zero, zero, zero)
 
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: NavigationState, u: Float[Array, ""]
     ) -> tuple[NavigationState, Float[Array, ""], Bool[Array, ""]]:
-        """One turn and one stride (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
-
         heading = within_half_a_turn(state.heading_rad + self.turn_rad * u)
         x = jnp.clip(state.x_m + self.stride_m * jnp.cos(heading), 0.0, self.arena_width_m)
         y = jnp.clip(state.y_m + self.stride_m * jnp.sin(heading), 0.0, self.arena_height_m)
@@ -155,9 +132,6 @@ class Navigation(Robot[NavigationState]):
         return NavigationState(x, y, heading), reward, terminated
 
     def observe(self, state: NavigationState) -> Float[Array, " observations"]:
-        """Position (m, m) from the top-left corner, and heading (rad)."""
-        import jax.numpy as jnp
-
         return jnp.stack(state)
 
     def caveats(self) -> tuple[str, ...]:
@@ -198,8 +172,6 @@ class Navigation(Robot[NavigationState]):
 
         A hundred headings: turns of u pi/10 with u a multiple of 0.2 lead from one of them to another exactly.
         """
-        from animat.robots.grid import Axis, Grid
-
         return Grid(
             Axis("x", "m", 0.0, self.arena_width_m, 61),
             (

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
+from animat.late import Array, Axes, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size
-from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from jax import Array
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
 
 BRAKE_S = 0.2
 """Of the heuristic: how far ahead of the cart it looks, in seconds of its present velocity."""
@@ -74,8 +70,6 @@ class Shuttle(Robot[ShuttleState]):
     episode_limit: Iterations = 120
 
     name: ClassVar[str] = "shuttle"
-    noise_size: ClassVar[int] = 0
-    paper_iterations: ClassVar[int] = 500_000
 
     def __post_init__(self) -> None:
         if self.place_radius_m >= self.place_m:
@@ -106,18 +100,12 @@ class Shuttle(Robot[ShuttleState]):
 
     def reset(self, key: Array) -> ShuttleState:
         """At rest in the middle; the cue is drawn."""
-        import jax
-        import jax.numpy as jnp
-
         zero = jnp.zeros((), jnp.float32)
         return ShuttleState(zero, zero, jnp.where(jax.random.uniform(key) < 0.5, 1.0, -1.0).astype(jnp.float32))
 
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: ShuttleState, u: Float[Array, ""]
     ) -> tuple[ShuttleState, Float[Array, ""], Bool[Array, ""]]:
-        """The cart comes up to its speed (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
-
         kept = math.exp(-self.step_s / self.time_constant_s)
         wanted = self.speed_m_per_s * u
         moved = wanted * self.step_s + (state.velocity_m_per_s - wanted) * self.time_constant_s * (1 - kept)
@@ -134,9 +122,6 @@ class Shuttle(Robot[ShuttleState]):
         return after, reward, jnp.zeros((), bool)
 
     def observe(self, state: ShuttleState) -> Float[Array, " observations"]:
-        """Position (m) and velocity (m/s) of the cart, and the cue."""
-        import jax.numpy as jnp
-
         return jnp.stack(state)
 
     def with_goal_of(self, state: ShuttleState, other: ShuttleState) -> ShuttleState:
@@ -154,8 +139,6 @@ class Shuttle(Robot[ShuttleState]):
 
         Every command of its own, as one may decide whether an iteration is rewarded.
         """
-        from animat.robots.grid import TAPS, Axis, Grid
-
         half_m, fastest = self.track_length_m / 2, self.speed_m_per_s
         return Grid(
             Axis("cue", "1", -1.0, 1.0, TAPS),
@@ -196,18 +179,9 @@ class Shuttle(Robot[ShuttleState]):
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """How far the cart was on the cue's side of the middle in each episode, over time."""
-        arrived = 0
-        for path in paths:
-            towards_m = path[:, 0] * path[0, 2]
-            there = bool(abs(towards_m[-1] - self.place_m) <= self.place_radius_m)
-            arrived += there
-            time_s = np.arange(len(path)) * self.step_s
-            axes.plot(time_s, towards_m, color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
-        for edge_m in (self.place_m - self.place_radius_m, self.place_m + self.place_radius_m):
-            axes.axhline(edge_m, color=EDGE, linewidth=0.8, linestyle="--")
-        axes.set_xlim(0, self.episode_limit * self.step_s)
+        towards_m = [path[:, 0] * path[0, 2] for path in paths]
+        arrived = [bool(abs(each[-1] - self.place_m) <= self.place_radius_m) for each in towards_m]
+        edges_m = (self.place_m - self.place_radius_m, self.place_m + self.place_radius_m)
+        told, ylabel = "end at their place", "position on the cue's side (m)"
+        draw_over_time(axes, self, towards_m, arrived, limits=edges_m, told=told, ylabel=ylabel)
         axes.set_ylim(-0.55 * self.track_length_m, 0.55 * self.track_length_m)
-        axes.set(
-            xlabel=f"time (s); {arrived} of {len(paths)} end at their place",
-            ylabel="position on the cue's side (m)",
-        )

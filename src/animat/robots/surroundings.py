@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
+from animat.late import Array, jnp
 from animat.records import Number
 from animat.robots.base import Size
-
-if TYPE_CHECKING:
-    from jax import Array
 
 Wall = tuple[Number, Number, Number, Number]
 """From (x, y) to (x, y), in metres; it has no thickness."""
@@ -93,8 +91,6 @@ class Surroundings(NamedTuple):
         that is at least 0 and s = (a - p) x d / d x (b - a) lies in [0, 1]; and the circle about c with radius r at
         t = h - sqrt(h^2 - |c - p|^2 + r^2) with h = (c - p) . d, at 0 from within.
         """
-        import jax.numpy as jnp
-
         dx, dy = jnp.cos(directions_rad), jnp.sin(directions_rad)
         nearest = jnp.full(directions_rad.shape, math.inf, dx.dtype)
         if self.walls:
@@ -132,7 +128,6 @@ def places_within_reach(
     """The places of a square lattice through the start to which a disc can be moved from there.
 
     Args:
-        around: what stands there.
         start_m: where the disc's centre is at first.
         room_m: how near its centre may come to a wall or an obstacle.
         spacing_m: between neighbours in the lattice, less than twice `room_m`, or it passes through walls; a disc

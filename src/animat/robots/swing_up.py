@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
+from typing import Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
+from animat.late import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
-from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, Canvas, Picture
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, Canvas, Picture, draw_over_time
+from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.motion import runge_kutta, within_half_a_turn
 from animat.robots.registry import register_robot
-
-if TYPE_CHECKING:
-    from jax import Array
-    from matplotlib.axes import Axes
-
-    from animat.robots.grid import Grid
-
 
 SPARE = 0.07
 """Of the heuristic: how much more energy than it takes to stand, as a part of the largest acceleration by gravity."""
@@ -71,7 +66,6 @@ class SwingUp(Robot[SwingUpState]):
     episode_limit: Iterations = 200
 
     name: ClassVar[str] = "swing-up"
-    noise_size: ClassVar[int] = 0
     paper_iterations: ClassVar[int] = 1_000_000
     # Full power either way swings highest, and is what random commands come near to swinging it up with.
     baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
@@ -101,15 +95,11 @@ class SwingUp(Robot[SwingUpState]):
 
     def reset(self, key: Array) -> SwingUpState:
         """At rest, hanging; `key` is not used."""
-        import jax.numpy as jnp
-
         return SwingUpState(jnp.float32(math.pi), jnp.zeros((), jnp.float32))
 
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: SwingUpState, u: Float[Array, ""]
     ) -> tuple[SwingUpState, Float[Array, ""], Bool[Array, ""]]:
-        """One step with the same torque throughout (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
 
         def rates(state: SwingUpState) -> SwingUpState:
             angle, angular_velocity = state
@@ -123,9 +113,6 @@ class SwingUp(Robot[SwingUpState]):
         return after, reward, jnp.zeros((), bool)
 
     def observe(self, state: SwingUpState) -> Float[Array, " observations"]:
-        """Cosine and sine of the angle from upright, and the angular velocity (rad/s)."""
-        import jax.numpy as jnp
-
         return jnp.stack([jnp.cos(state.angle_rad), jnp.sin(state.angle_rad), state.angular_velocity_rad_per_s])
 
     def caveats(self) -> tuple[str, ...]:
@@ -162,10 +149,6 @@ class SwingUp(Robot[SwingUpState]):
         Each of the two has a part in how the other one moves, and a grid wants a first coordinate that has none: it is
         one that means nothing, with the fewest nodes.
         """
-        import jax.numpy as jnp
-
-        from animat.robots.grid import TAPS, Axis, Grid
-
         fastest = self.speed_limit_rad_per_s
         return Grid(
             Axis("nothing", "1", 0.0, 1.0, TAPS),
@@ -202,16 +185,11 @@ class SwingUp(Robot[SwingUpState]):
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """How far from upright the pendulum was in each episode, over time."""
         limit_deg = math.degrees(self.upright_rad)
-        stood = 0
-        for path in paths:
-            time_s, off_deg = np.arange(len(path)) * self.step_s, np.degrees(np.arccos(np.clip(path[:, 0], -1, 1)))
-            ends_upright = bool(off_deg[-1] <= limit_deg)
-            stood += ends_upright
-            axes.plot(time_s, off_deg, color=DONE if ends_upright else FAILED, linewidth=0.7, alpha=0.8)
-        axes.axhline(limit_deg, color=EDGE, linewidth=0.8, linestyle="--")
-        axes.set_xlim(0, self.episode_limit * self.step_s)
+        off_deg = [np.degrees(np.arccos(np.clip(path[:, 0], -1, 1))) for path in paths]
+        stood = [bool(each[-1] <= limit_deg) for each in off_deg]
+        ylabel = "angle from upright (deg)"
+        draw_over_time(axes, self, off_deg, stood, limits=[limit_deg], told="end upright", ylabel=ylabel)
         axes.set_ylim(0, 185)
-        axes.set(xlabel=f"time (s); {stood} of {len(paths)} end upright", ylabel="angle from upright (deg)")
 
     @property
     def _gravity_per_s2(self) -> float:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
+from animat.late import Array, Axes, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size
-from animat.robots.drawing import ACCENT, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture
+from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Walls, places_within_reach
-
-if TYPE_CHECKING:
-    from jax import Array
-    from matplotlib.axes import Axes
 
 SENSORS_DEG = (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0)
 """Where the e-puck's proximity sensors look, IR0 to IR7, clockwise from straight ahead."""
@@ -106,8 +103,6 @@ class Wheeled(Robot[WheelsState]):
     episode_limit: Iterations = 100
 
     n_commands: ClassVar[int] = 2
-    noise_size: ClassVar[int] = 0
-    paper_iterations: ClassVar[int] = 500_000
 
     def __post_init__(self) -> None:
         stride_m = self.max_speed_m_per_s * self.step_s
@@ -148,9 +143,6 @@ class Wheeled(Robot[WheelsState]):
 
     def reset(self, key: Array) -> WheelsState:
         """At the start, looking anywhere; the goal drawn."""
-        import jax
-        import jax.numpy as jnp
-
         for_goal, for_heading = jax.random.split(key)
         goal = jnp.asarray(self._goals_m, jnp.float32)[jax.random.randint(for_goal, (), 0, len(self._goals_m))]
         heading = math.pi * (1 - 2 * jax.random.uniform(for_heading))
@@ -159,9 +151,6 @@ class Wheeled(Robot[WheelsState]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: WheelsState, u: Float[Array, " n_commands"]
     ) -> tuple[WheelsState, Float[Array, ""], Bool[Array, ""]]:
-        """Both wheels turn at constant speeds (see `Robot.advance` and the class)."""
-        import jax.numpy as jnp
-
         left_m, right_m = self.max_speed_m_per_s * self.step_s * jnp.asarray(u)
         turn = (left_m - right_m) / self.wheel_distance_m
         # The chord of the arc, which points half way between the headings at its ends; jnp.sinc has a factor pi.
@@ -183,8 +172,6 @@ class Wheeled(Robot[WheelsState]):
 
         The bearing is 0 straight ahead and positive to the right, in [-pi, pi].
         """
-        import jax.numpy as jnp
-
         x_m, y_m, heading, goal_x_m, goal_y_m = state
         directions = heading + jnp.radians(jnp.asarray(SENSORS_DEG, x_m.dtype))
         free_m = self._around.along_rays_m(x_m, y_m, directions) - self.body_radius_m
@@ -229,16 +216,11 @@ class Wheeled(Robot[WheelsState]):
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
         """How far the goal was in each episode, over time."""
-        arrived = 0
-        for path in paths:
-            there = bool(path[-1, 8] <= self.goal_radius_m)
-            arrived += there
-            time_s = np.arange(len(path)) * self.step_s
-            axes.plot(time_s, path[:, 8], color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
-        axes.axhline(self.goal_radius_m, color=EDGE, linewidth=0.8, linestyle="--")
-        axes.set_xlim(0, self.episode_limit * self.step_s)
+        distances_m, radius_m = [path[:, 8] for path in paths], self.goal_radius_m
+        arrived = [bool(each[-1] <= radius_m) for each in distances_m]
+        ylabel = "distance to the goal (m)"
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], told="arrived", ylabel=ylabel)
         axes.set_ylim(bottom=0)
-        axes.set(xlabel=f"time (s); {arrived} of {len(paths)} arrived", ylabel="distance to the goal (m)")
 
     @property
     def _around(self) -> Surroundings:

@@ -86,9 +86,7 @@ def electrodes_of(
     electrodes spread over the left half, as many over the right one, both together, and one of the left.
 
     Args:
-        places: named or listed.
         electrodes: that can be stimulated.
-        x_um, y_um: where they are.
 
     Raises:
         InvalidArgument: for named places of electrodes that are too few, or whose positions are not known.

@@ -72,7 +72,6 @@ class Selection:
         recording: electrodes that are recorded, channel by channel, shape (channels,).
         stimulation: electrodes that stimulate, shape (sites,).
         patterns: electrodes pulsed together, all of them stimulation sites, shape (patterns, size).
-        rule: what was asked for.
         seed: that decided the patterns.
         scanned: electrodes that were scanned.
         passed: electrodes that passed the threshold and the spacing.
@@ -177,9 +176,6 @@ def select_electrodes(
     product of spike amplitude and excitatory score, since stimulation is most reliable where the spike is largest.
 
     Args:
-        array: that was scanned.
-        scan: its spontaneous activity.
-        rule: what is asked for.
         seed: decides the patterns.
 
     Raises:

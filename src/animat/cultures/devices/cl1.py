@@ -28,7 +28,7 @@ from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import Phase, Pulse
-from animat.tables import UNKNOWN
+from animat.tables import UNKNOWN, padded
 
 HAND_OVER_S = 0.5
 """How long a stop waits for a pulse that is being handed over."""
@@ -138,7 +138,6 @@ class CL1Culture(Culture):
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
-        """Channels of each pattern."""
         return self._patterns
 
     @property
@@ -148,7 +147,6 @@ class CL1Culture(Culture):
 
     @property
     def device_limits(self) -> Limits:
-        """`CL1_LIMITS`."""
         return CL1_LIMITS
 
     @property
@@ -160,7 +158,6 @@ class CL1Culture(Culture):
 
     @property
     def sampling_rate_hz(self) -> float:
-        """25 kHz."""
         return float(FRAMES_PER_S)
 
     @property
@@ -189,7 +186,6 @@ class CL1Culture(Culture):
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Spikes on ground and reference."""
         return {"spikes on ground or reference": self.spikes_not_on_electrodes}
 
     def _open(self) -> None:
@@ -336,9 +332,7 @@ def _checked(
                 raise InvalidArgument(f"patterns: expected channels from 0 to 63, got {channel} in number {number}")
     if not rows:
         raise InvalidArgument("patterns: expected at least one, got none")
-    table = np.full((len(rows), max(map(len, rows))), UNKNOWN, dtype=np.int64)
-    for place, row in zip(table, rows, strict=True):
-        place[: len(row)] = row
+    table = padded(rows)
     table.setflags(write=False)
     return table
 

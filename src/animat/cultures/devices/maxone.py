@@ -156,12 +156,10 @@ class MaxOneCulture(Culture):
 
     @property
     def sampling_rate_hz(self) -> float:
-        """20 kHz."""
         return float(FRAMES_PER_S)
 
     @property
     def provenance(self) -> dict[str, str]:
-        """How it was wired."""
         wiring = self._wired()
         units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
         return {

@@ -75,7 +75,6 @@ class ZmqSpikes:
         self.lost_frames = 0
 
     def start(self) -> None:
-        """Listen from now on."""
         try:
             import zmq
         except ImportError as error:
@@ -91,14 +90,12 @@ class ZmqSpikes:
         self.wait(0)
 
     def stop(self) -> None:
-        """Listen no more."""
         self._going.clear()
         if self._thread is not None:
             self._thread.join(timeout=5)
             self._thread = None
 
     def frame(self) -> int:
-        """The newest frame."""
         return self._frame
 
     def wait(self, frame: int) -> None:
@@ -116,7 +113,6 @@ class ZmqSpikes:
             time.sleep(1e-4)
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-        """The spikes between two frames."""
         self.forget(start)
         taken = []
         while self._spikes and self._spikes[0][0] < stop:
@@ -125,7 +121,6 @@ class ZmqSpikes:
         return table[:, 0], table[:, 1]
 
     def forget(self, before: int) -> None:
-        """Let go of spikes before a frame."""
         while self._spikes and self._spikes[0][0] < before:
             self._spikes.popleft()
 

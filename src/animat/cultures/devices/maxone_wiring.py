@@ -40,7 +40,6 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
 
     Args:
         mx: the vendor's module, initialised.
-        selection: what is wanted.
         wait: called with the name of the time that the vendor says to wait after a step.
 
     Raises:

@@ -65,7 +65,6 @@ def without_artefacts(
         voltage_uv: as recorded, one row a channel; changed.
         stimulus: sample of each pulse in the stretch, rising; may be outside it, by as much as is blanked or followed.
         noise_uv: of each channel, to tell a large deviation from a small one.
-        rate_hz: of the samples.
         settings: how long to blank.
     """
     samples = voltage_uv.shape[1]
@@ -84,7 +83,7 @@ def without_artefacts(
             continue
         if stop <= end:
             # The next pulse comes before this one is over: nothing but blanking can be done.
-            _bridge(voltage_uv, is_blank, np.arange(len(voltage_uv)), start, np.full(len(voltage_uv), end))
+            _bridge(voltage_uv, is_blank, start, np.full(len(voltage_uv), end))
             continue
         rest_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
         # From the pulse on: what stands still at the blank's end did so before.
@@ -97,7 +96,7 @@ def without_artefacts(
         saturated[i] = np.count_nonzero(late)
         longest_ms[i] = (int(until.max()) - at) / per_ms if saturated[i] else 0.0
         _take_away_recovery(voltage_uv, until, stop, rest_uv, noise_uv, per_ms)
-        _bridge(voltage_uv, is_blank, np.arange(len(voltage_uv)), start, until)
+        _bridge(voltage_uv, is_blank, start, until)
     return Cleaned(voltage_uv, is_blank, saturated, longest_ms)
 
 
@@ -136,15 +135,14 @@ def _saturated_until(
 def _bridge(
     voltage_uv: Float32[np.ndarray, "channels samples"],
     is_blank: Bool[np.ndarray, "channels samples"],
-    rows: Int64[np.ndarray, " rows"],
     start: int,
-    until: Int64[np.ndarray, " rows"],
+    until: Int64[np.ndarray, " channels"],
 ) -> None:
-    """A straight line over the blanked stretch of each row, between the means of half a millisecond or so beside it."""
+    """A straight line over the blanked stretch of each channel, between means of half a millisecond or so beside it."""
     for stop in np.unique(until).tolist():
-        chosen = rows[until == stop]
         if stop <= start:
             continue
+        chosen = np.flatnonzero(until == stop)
         left = voltage_uv[chosen, max(start - 10, 0) : start]
         right = voltage_uv[chosen, stop : stop + 10]
         ends = [side.mean(axis=1) if side.shape[1] else None for side in (left, right)]

@@ -40,7 +40,6 @@ def band_pass(
     Args:
         voltage_uv: one row a channel.
         band_hz: at which |H|^2 is a half.
-        rate_hz: of the samples.
     """
     samples = voltage_uv.shape[1]
     length = fft.next_fast_len(samples, real=True)

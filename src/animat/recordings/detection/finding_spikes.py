@@ -35,7 +35,6 @@ class FoundSpikes:
         time_s: at their negative peaks, on the recording's clock, shape (spikes,).
         channel: row of the channel table, shape (spikes,).
         noise_uv: standard deviation of each channel's noise, shape (channels,).
-        findings: what was noticed.
     """
 
     time_s: Float64[np.ndarray, " spikes"]
@@ -59,7 +58,6 @@ def find_spikes(
     stimuli (`artefacts`).
 
     Args:
-        traces: where the voltage is.
         stimulus_time_s: starts of the pulses on the recording's clock.
         settings: how; by default as in `Detection`.
         workers: threads; by default one a core. Memory grows with them, by some 200 MB each for 1,024 channels.
@@ -118,9 +116,7 @@ def _noise_uv(
         for columns in blocks(channels):
             first = median_noise_uv(_filtered(piece.rows(columns), settings, rate_hz)[:, margin:-margin])
             if len(piece.stimulus):
-                rough = np.zeros(channels, np.float32)
-                rough[columns] = first
-                cleaned = piece.cleaned(columns, rough, rate_hz, settings)
+                cleaned = piece.cleaned(columns, first, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
                 first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
             found[columns] = first
@@ -153,15 +149,23 @@ def _detect(
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     depth_uv = depths_uv(noise_uv, settings.threshold)
 
+    def of_block(piece: Piece, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        cleaned = piece.cleaned(columns, noise_uv[columns], rate_hz, settings)
+        filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+        if cleaned.is_blank is not None:
+            filtered[cleaned.is_blank] = 0.0
+        end = margin + piece.stop - piece.start
+        row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
+        saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]
+        return sample - margin + piece.start, row + columns.start, saturation
+
     def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
-        found = [
-            _of_block(piece, columns, noise_uv, depth_uv, apart, rate_hz, settings) for columns in blocks(len(noise_uv))
-        ]
+        found = [of_block(piece, columns) for columns in blocks(len(noise_uv))]
         saturation = np.zeros((np.count_nonzero(piece.owned), 2))
-        for _, _, of_block in found:
-            saturation[:, 0] += of_block[:, 0]
-            saturation[:, 1] = np.maximum(saturation[:, 1], of_block[:, 1])
+        for _, _, more in found:
+            saturation[:, 0] += more[:, 0]
+            saturation[:, 1] = np.maximum(saturation[:, 1], more[:, 1])
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found]), saturation
 
     samples, channels, saturations = [], [], []
@@ -187,26 +191,6 @@ def _detect(
     )
 
 
-def _of_block(
-    piece: Piece,
-    columns: slice,
-    noise_uv: Float32[np.ndarray, " channels"],
-    depth_uv: Float32[np.ndarray, " channels"],
-    apart: int,
-    rate_hz: float,
-    settings: Detection,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    cleaned = piece.cleaned(columns, noise_uv, rate_hz, settings)
-    filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
-    if cleaned.is_blank is not None:
-        filtered[cleaned.is_blank] = 0.0
-    row, sample = find_negative_peaks(
-        filtered, depth_uv[columns], apart, piece.margin, piece.margin + piece.stop - piece.start
-    )
-    saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]
-    return sample - piece.margin + piece.start, row + columns.start, saturation
-
-
 def _findings(
     noise_uv: Float32[np.ndarray, " channels"], n_stimuli: int, saturation: np.ndarray, settings: Detection
 ) -> Iterator[Finding]:
@@ -215,43 +199,35 @@ def _findings(
                   f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
     dead = int(np.count_nonzero(is_dead(noise_uv)))
     if dead:
-        yield Finding(
-            "dead-channels",
-            "note" if dead < 0.1 * n else "warning",
+        message = (
             f"{dead:,} of {n:,} channels are dead (less than {DEAD:g} of the median noise): no spike can be found on "
-            "them, and they count in rates per channel; leave them out of the routing next time",
-            float(dead),
+            "them, and they count in rates per channel; leave them out of the routing next time"
         )
+        yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
     noisy = int(np.count_nonzero(noise_uv > NOISY * middle)) if middle > 0 else 0
     if noisy:
-        yield Finding(
-            "noisy-channels",
-            "note" if noisy < 0.1 * n else "warning",
+        message = (
             f"{noisy:,} of {n:,} channels have more than {NOISY:g} times the median noise: only large spikes are found "
-            "on them; look for loose contacts or air bubbles",
-            float(noisy),
+            "on them; look for loose contacts or air bubbles"
         )
+        yield Finding("noisy-channels", "note" if noisy < 0.1 * n else "warning", message, float(noisy))
     if n_stimuli:
         before, after = settings.blank_ms
-        yield Finding(
-            "blanked",
-            "note" if after <= 2.0 else "warning",
+        message = (
             f"from {before:g} ms before to {after:g} ms after each of {n_stimuli:,} stimuli nothing is looked for"
-            + ("" if after <= 2.0 else "; the response window usually begins at 2 ms, so part of it is lost"),
-            after,
+            + ("" if after <= 2.0 else "; the response window usually begins at 2 ms, so part of it is lost")
         )
+        yield Finding("blanked", "note" if after <= 2.0 else "warning", message, after)
     if len(saturation) and saturation[:, 0].any():
         mean, longest = float(saturation[:, 0].mean()), float(np.median(saturation[saturation[:, 0] > 0, 1]))
         share = mean / max(n, 1)
-        yield Finding(
-            "saturated-channels",
-            "note" if share < 0.05 or longest <= 2.0 else "warning",
+        message = (
             f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
             f"{longest:.1f} ms; they are blanked until then"
             + (
                 ": rates in an earlier window are too low, use one that begins later"
                 if share >= 0.05 and longest > 2
                 else ""
-            ),
-            share,
+            )
         )
+        yield Finding("saturated-channels", "note" if share < 0.05 or longest <= 2.0 else "warning", message, share)

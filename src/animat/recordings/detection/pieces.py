@@ -38,12 +38,12 @@ class Piece:
     def cleaned(
         self, columns: slice, noise_uv: Float32[np.ndarray, " channels"], rate_hz: float, settings: Detection
     ) -> Cleaned:
-        """Some of its channels without artefacts, one a row; `noise_uv` is of all channels."""
+        """Some of its channels without artefacts, one a row; `noise_uv` is of these."""
         rows = self.rows(columns)
         if len(self.stimulus):
             # What removes artefacts changes what it is given.
             rows = rows.copy()
-        return without_artefacts(rows, self.stimulus, noise_uv[columns], rate_hz, settings)
+        return without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings)
 
     def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
         """Some of its channels as they were recorded, one a row; not to be changed."""
@@ -54,7 +54,6 @@ def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start
     """Read a piece.
 
     Args:
-        traces: to read from.
         stimulus: sample of every pulse of the recording, rising.
         start, stop: samples of the recording.
         margin: samples more on both sides.

@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from animat.errors import InvalidFile
-from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
-from animat.recordings.formats.stimulus_text import LONGEST, padded, stimulus_columns
+from animat.recordings.formats.stimulus_text import LONGEST, stimulus_columns
 from animat.recordings.recording import Recording
+from animat.tables import padded
 
 WHAT = "CL1 recording"
 USUAL_RATE_HZ = 25_000.0
@@ -45,7 +46,6 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
     """Read spikes and stimuli of a CL1 recording.
 
     Args:
-        path: the file.
         spikes: whether spikes must be there; without, stimuli are read, for raw traces beside them.
 
     Raises:
@@ -82,21 +82,12 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         names = ", ".join(
             f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in np.unique(channel[~on_electrode]).tolist()
         )
-        findings.append(
-            Finding(
-                "spikes-not-on-electrodes",
-                "note",
-                f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes; left out",
-                float(stray),
-            )
-        )
+        message = f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes; left out"
+        findings.append(Finding("spikes-not-on-electrodes", "note", message, float(stray)))
     frame, channel = frame[on_electrode], channel[on_electrode]
     spike_time_s, stimulus_time_s = (frame - start) / rate_hz, (stimulus_frame - start) / rate_hz
-    times = np.concatenate([spike_time_s, stimulus_time_s])
     if isinstance(frames, int) and frames > 0:
-        start_s = float(min(0.0, times.min(initial=0.0)))
-        stop_s = max(frames / rate_hz, float(times.max(initial=0.0)) + 0.5 / rate_hz)
-        columns |= {"start_s": start_s, "duration_s": stop_s - start_s}
+        columns |= recorded_span(frames, rate_hz, spike_time_s, stimulus_time_s)
     provenance = {"source": path.name, "format": "CL1"}
     if isinstance(created, str) and created and created.isprintable():
         provenance["recorded_at"] = created

@@ -24,9 +24,9 @@ import numpy as np
 from animat.errors import InvalidFile, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_of
-from animat.recordings.formats.stimulus_text import padded
 from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
+from animat.tables import padded
 
 SPIKE_COLUMNS = {
     "spike_time_s": ("spike_time_s", "time_s", "time"),

@@ -208,7 +208,6 @@ def hdf5_file(path: Path, what: str) -> Iterator[Hdf5File]:
     """Open a file for checked reading; whatever goes wrong inside is one `InvalidFile` that names it.
 
     Args:
-        path: the file.
         what: the kind of file in words, such as "NWB recording".
     """
     try:

@@ -28,7 +28,6 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
     """Read a recording in any of the formats.
 
     Args:
-        path: the file.
         part: which recording of a MaxWell file that holds several.
         stimuli: the name of the stimuli where several could be meant.
 

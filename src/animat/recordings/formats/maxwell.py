@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from animat.errors import InvalidFile
-from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
 from animat.recordings.formats.choice import choose
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file, unavailable_filters
@@ -56,7 +56,6 @@ def read_maxwell(
     """Read spikes, stimuli and electrodes of one recording of a MaxWell file.
 
     Args:
-        path: the file.
         part: which recording, such as `well000/rec0000`, where the file holds several.
         stimuli: the type of the events that are stimuli, as a number, where there are several types.
         spikes: whether spikes must be there; without, channels and stimuli are read, for raw traces beside them.
@@ -113,21 +112,16 @@ class _Found:
         if self.first_frame is None:
             frames = [int(np.min(f)) for f in (spike_frame, event_frame) if len(f)]
             self.first_frame = min(frames, default=0)
-            self._note(
-                "clock-from-first-event",
-                "the first frame's number is not in the file: the clock starts at the first spike or stimulus",
-                "note",
-            )
+            message = "the first frame's number is not in the file: the clock starts at the first spike or stimulus"
+            self._note("clock-from-first-event", message, "note")
         labels, electrode, xy_um = self._channels(file, spike_channel)
         routed = np.isin(spike_channel, labels)
         if not np.all(routed):
             lost = int(np.count_nonzero(~routed))
-            self._note(
-                "spikes-not-routed",
-                f"{lost:,} of {len(routed):,} spikes are on channels that no electrode is routed to, and are left out",
-                "note" if lost < 0.01 * len(routed) else "warning",
-                float(lost),
+            message = (
+                f"{lost:,} of {len(routed):,} spikes are on channels that no electrode is routed to, and are left out"
             )
+            self._note("spikes-not-routed", message, "note" if lost < 0.01 * len(routed) else "warning", float(lost))
         self.columns |= {
             "spike_time_s": self._seconds(spike_frame[routed]),
             "spike_channel": spike_channel[routed],
@@ -139,13 +133,8 @@ class _Found:
             **event_columns,
         }
         if self.frames is not None:
-            latest = [t.max() for t in (self.columns["spike_time_s"], self.columns["stimulus_time_s"]) if len(t)]
-            earliest = [t.min() for t in (self.columns["spike_time_s"], self.columns["stimulus_time_s"]) if len(t)]
-            start_s = float(min([0.0, *earliest]))
-            self.columns["start_s"] = start_s
-            # Half a frame more than the last event, so that no rounding puts it outside.
-            stop_s = max([self.frames / self.rate_hz, *(t + 0.5 / self.rate_hz for t in latest)])
-            self.columns["duration_s"] = float(stop_s - start_s)
+            times_s = self.columns["spike_time_s"], self.columns["stimulus_time_s"]
+            self.columns |= recorded_span(self.frames, self.rate_hz, *times_s)
 
     def recording(self, path: Path) -> Recording:
         """What was read as a recording."""
@@ -162,12 +151,8 @@ class _Found:
             chosen = frame[rises]
             n_falls = int(np.count_nonzero(~rises))
             if n_falls:
-                self._note(
-                    "bits-not-rising",
-                    f"{n_falls:,} of {len(bits):,} entries of /bits end a pulse and are no stimuli",
-                    "note",
-                    float(n_falls),
-                )
+                message = f"{n_falls:,} of {len(bits):,} entries of /bits end a pulse and are no stimuli"
+                self._note("bits-not-rising", message, "note", float(n_falls))
             columns = {"stimulus_pattern": bits[rises]} if len(np.unique(bits[rises])) > 1 else {}
             return chosen, columns
         names = file.fields(self.events_at)
@@ -181,9 +166,8 @@ class _Found:
             is_stimulus = types.astype(np.str_) == which
             if len(counts) > 1:
                 left = int(np.count_nonzero(~is_stimulus))
-                self._note(
-                    "events-left-out", f"{left:,} events of other types than {which} are left out", "note", float(left)
-                )
+                message = f"{left:,} events of other types than {which} are left out"
+                self._note("events-left-out", message, "note", float(left))
         columns = {}
         if "eventmessage" in names:
             columns = stimulus_columns(file.read(self.events_at, "eventmessage")[is_stimulus].tolist())
@@ -199,13 +183,12 @@ class _Found:
         if not file.has(self.mapping_at):
             labels = np.unique(spike_channel if self.recorded_channels is None else self.recorded_channels)
             severity = "warning" if self.recorded_channels is None else "note"
-            self._note(
-                "mapping-missing",
+            message = (
                 f"the file has no /{self.mapping_at}: which electrode a channel reads is not "
                 f"known; {len(labels):,} channels are taken from "
-                + ("those that fired" if self.recorded_channels is None else "its groups"),
-                severity,
+                + ("those that fired" if self.recorded_channels is None else "its groups")
             )
+            self._note("mapping-missing", message, severity)
             return labels, np.full(len(labels), UNKNOWN), np.full((len(labels), 2), np.nan)
         channel = file.read(self.mapping_at, "channel").astype(np.int64)
         electrode = file.read(self.mapping_at, "electrode").astype(np.int64)
@@ -218,26 +201,15 @@ class _Found:
         if repeated:
             rows = np.unique(np.column_stack([channel[used], electrode[used]]), axis=0)
             twice = len(rows) - len(labels)
-            self._note(
-                "duplicate-channels",
-                f"the file's mapping names {repeated:,} channels again; each is one channel here"
-                + (
-                    f", and where it names another electrode ({twice:,} times) the first named is taken"
-                    if twice
-                    else ""
-                ),
-                "note",
-                float(repeated),
+            message = f"the file's mapping names {repeated:,} channels again; each is one channel here" + (
+                f", and where it names another electrode ({twice:,} times) the first named is taken" if twice else ""
             )
+            self._note("duplicate-channels", message, "note", float(repeated))
         if self.recorded_channels is not None:
             unmapped = np.setdiff1d(self.recorded_channels, labels)
             if len(unmapped):
-                self._note(
-                    "channels-not-routed",
-                    f"{len(unmapped):,} recorded channels have no electrode in the mapping and are left out",
-                    "note",
-                    float(len(unmapped)),
-                )
+                message = f"{len(unmapped):,} recorded channels have no electrode in the mapping and are left out"
+                self._note("channels-not-routed", message, "note", float(len(unmapped)))
         return labels, electrode[used][first], xy_um[used][first]
 
     def _seconds(self, frame: Column) -> Column:

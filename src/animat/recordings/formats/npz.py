@@ -84,7 +84,6 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
     """What an archive holds: values by our names, the array's routing, and the names of what is left out.
 
     Args:
-        path: the file.
         others: keys that are known besides those of a recording.
 
     Raises:

@@ -55,7 +55,6 @@ def write_nwb(
     """Write a recording as one NWB file, complete or absent.
 
     Args:
-        recording: what to write.
         path: the file; parent folders are made, an old file is replaced only by a complete new one.
         spikes: in place of the recording's own, which are none: more than memory holds, in any order.
         counts: of `spikes`.
@@ -137,7 +136,6 @@ def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Rec
     """Read a recording that `write_nwb` wrote, which equals the one that was written, or that another program wrote.
 
     Args:
-        path: the file.
         stimuli: for another program's file, the name of the stimuli where several could be meant.
 
     Raises:
@@ -145,7 +143,7 @@ def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Rec
     """
     path = Path(path)
     with hdf5_file(path, WHAT) as file:
-        return read_open_nwb(file, path, stimuli)
+        return _read(file, stimuli)
 
 
 def is_nwb(file: Hdf5File) -> bool:
@@ -153,12 +151,12 @@ def is_nwb(file: Hdf5File) -> bool:
     return "nwb_version" in file.file.attrs
 
 
-def read_open_nwb(file: Hdf5File, path: Path, stimuli: str | None = None) -> Recording:
-    """Read an open file; see `read_nwb`."""
+def _read(file: Hdf5File, stimuli: str | None) -> Recording:
+    path = file.path
     if not is_nwb(file):
         raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
     if not file.has(RECORDING_TABLE):
-        return read_other_nwb(file, path, stimuli)
+        return read_other_nwb(file, stimuli)
     if stimuli is not None:
         raise InvalidFile(f"{path}: expected no choice of stimuli for a file of animat's own, got {stimuli!r}")
     version = _cell(file, "format_version", int)

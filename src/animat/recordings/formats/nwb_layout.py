@@ -20,3 +20,12 @@ PROVENANCE_TABLE = "processing/ecephys/animat_provenance"
 UNITS_TABLE = "units"
 ELECTRODES_TABLE = "general/extracellular_ephys/electrodes"
 STIMULI_TABLE = "stimulus/presentation/stimuli"
+
+SUBJECT = {
+    "subject_id": "subject_id",
+    "species": "species",
+    "sex": "sex",
+    "age": "age",
+    "description": "subject_description",
+}
+"""NWB's fields of a subject, and where a recording's provenance has them."""

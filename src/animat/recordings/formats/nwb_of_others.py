@@ -9,7 +9,6 @@ Every unit becomes a channel, silent ones too; a unit on several electrodes take
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -19,6 +18,7 @@ from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
+from animat.recordings.formats.nwb_layout import SUBJECT
 from animat.recordings.formats.nwb_stimuli import read_stimuli
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -29,21 +29,13 @@ POSITIONS = (("rel_x", "rel_y"), ("x", "y"))
 UNIT_LABELS = ("unit_name", "label", "cluster_id")
 ELECTRODE_LABELS = ("label", "channel_name", "electrode_name")
 TEXTS = ("experiment_description", "session_description", "institution", "lab")
-SUBJECT = {
-    "subject_id": "subject_id",
-    "species": "species",
-    "sex": "sex",
-    "age": "age",
-    "description": "subject_description",
-}
 
 
-def read_other_nwb(file: Hdf5File, path: Path, stimuli: str | None, spikes: bool = True) -> Recording:
+def read_other_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
     """Read a recording that another program wrote.
 
     Args:
         file: open.
-        path: of the file.
         stimuli: the name of the stimuli, where the file holds several that could be meant.
         spikes: whether units must be there; without, channels and stimuli are read, for raw traces beside them.
 
@@ -51,7 +43,7 @@ def read_other_nwb(file: Hdf5File, path: Path, stimuli: str | None, spikes: bool
         InvalidFile: if the file holds no units, or several stimuli and none is chosen.
         UnusableData: if a column is not what it should be.
     """
-    findings: list[Finding] = []
+    path, findings = file.path, list[Finding]()
     columns: dict[str, Any]
     if spikes:
         if not file.has(f"{UNITS}/spike_times"):

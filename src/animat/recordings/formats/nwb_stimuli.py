@@ -25,7 +25,7 @@ from animat.recordings.columns import Column
 from animat.recordings.findings import Finding
 from animat.recordings.formats.choice import choose
 from animat.recordings.formats.hdf5 import Hdf5File
-from animat.recordings.formats.stimulus_text import padded
+from animat.tables import padded
 
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")

@@ -17,7 +17,7 @@ from pynwb.file import Subject
 from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
-from animat.recordings.formats.nwb_layout import FORMAT_VERSION
+from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.told import in_words
 from animat.stimulation.stimulus import Stimuli
@@ -33,13 +33,6 @@ UNKNOWN_SUBJECT = {
     "description": "neuronal culture; nothing more was said of it",
 }
 """Sex U is unknown, and an age from 0 days on, without an upper end, is any."""
-_SUBJECT_KEYS = {
-    "subject_id": "subject_id",
-    "species": "species",
-    "sex": "sex",
-    "age": "age",
-    "subject_description": "description",
-}
 _FILE_KEYS = ("experiment_description", "lab", "institution")
 
 
@@ -64,7 +57,7 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
         **{key: words[key] for key in _FILE_KEYS if key in words},
     )
     # NWB's checkers demand a subject; of one that nothing is said of, that is what is written.
-    known = {field: words[key] for key, field in _SUBJECT_KEYS.items() if key in words}
+    known = {field: words[key] for field, key in SUBJECT.items() if key in words}
     nwb.subject = Subject(**(UNKNOWN_SUBJECT | known))
     if len(recording.channels):
         _add_electrodes(nwb, recording.channels)
@@ -133,7 +126,6 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
 
 
 def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
-
     # A row keeps its electrodes up to the last known one, so that padding between known ones survives too.
     known, columns = stimuli.electrodes != UNKNOWN, stimuli.electrodes.shape[1]
     lengths = np.zeros(len(stimuli), np.int64)
@@ -166,7 +158,6 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
 
 
 def _recording_table(recording: Recording) -> DynamicTable:
-
     presentation = recording.presentation
     cells: dict[str, tuple[object, str]] = {
         "format_version": (FORMAT_VERSION, "of the tables that animat writes"),
@@ -187,7 +178,6 @@ def _recording_table(recording: Recording) -> DynamicTable:
 
 
 def _provenance_table(words: Mapping[str, str]) -> DynamicTable:
-
     return DynamicTable(
         name="animat_provenance",
         description="Where the recording came from, and what was noticed when it was read.",

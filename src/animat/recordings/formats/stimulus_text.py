@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.recordings.columns import Column
-from animat.tables import UNKNOWN
+from animat.tables import UNKNOWN, padded
 
 LONGEST = 4096
 """Characters of a line; what is longer says nothing that is understood here."""
@@ -91,14 +90,6 @@ def stimulus_columns(lines: Sequence[str]) -> dict[str, Any]:
         if n_pulses == 1 or (n_pulses > 1 and has_presentation):
             columns |= {"presentation_order": next(iter(orders)), "presentation_pulses": n_pulses}
     return columns
-
-
-def padded(lists: Sequence[Sequence[int]]) -> Column:
-    """Lists of electrodes as one table, padded with -1."""
-    table = np.full((len(lists), max([1, *map(len, lists)])), UNKNOWN, dtype=np.int64)
-    for row, electrodes in zip(table, lists, strict=True):
-        row[: len(electrodes)] = electrodes
-    return table
 
 
 def _number(value: Any) -> float:

@@ -33,7 +33,6 @@ class TextTable:
     """A table of text, its cells still as they stand in the file.
 
     Attributes:
-        path: the file.
         header: the names of its columns, as they stand there.
         rows: the cells, as many in each row as the header has names.
         lines: the line of the file that each row ends on, the first line being 1.
@@ -75,7 +74,6 @@ class TextTable:
         """The numbers of a column, NaN for an empty cell.
 
         Args:
-            column: its place.
             name: what it is called in errors.
             required: whether each must be there and finite.
 

@@ -16,13 +16,12 @@ from animat.recordings.formats.choice import choose
 from animat.recordings.formats.cl1 import read_cl1
 from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, hdf5_file, unavailable_filters
 from animat.recordings.formats.hdf5_formats import format_of
-from animat.recordings.formats.maxwell import is_old, parts, read_maxwell
+from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
 from animat.recordings.formats.nwb_of_others import read_other_nwb
 from animat.recordings.raw import Hdf5Traces
 from animat.recordings.recording import Channels, Recording
 from animat.tables import UNKNOWN
 
-OLD_ROWS = 1024
 OLD_LSB_V = 6.294e-6
 """Of the old layout, where the file does not say."""
 
@@ -33,7 +32,6 @@ def open_traces(
     """Raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
     Args:
-        path: the file.
         part: of a MaxWell file that holds several recordings, which; of an NWB file with several series, which.
         stimuli: which of several things are the stimuli, as in `read_recording`.
 
@@ -51,15 +49,15 @@ def open_traces(
         base = read_cl1(path, spikes=False)
     else:
         with hdf5_file(path, "NWB recording") as file:
-            base = read_other_nwb(file, path, stimuli, spikes=False)
+            base = read_other_nwb(file, stimuli, spikes=False)
     with hdf5_file(path, "file of raw traces") as file:
         if found == "MaxWell":
-            traces = _maxwell(file, path, part, base)
+            traces = _maxwell(file, part, base)
         elif found == "CL1":
             scale = file.attribute("/", "uV_per_sample_unit")
-            traces = _traces(file, path, "samples", False, base, base.sampling_rate_hz, _number(scale, 0.195), 0.0)
+            traces = _traces(file, "samples", base, _number(scale, 0.195))
         else:
-            traces = _nwb(file, path, part, base)
+            traces = _nwb(file, part, base)
     stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
     start_s = min(base.start_s, traces.start_s)
     base = replace(
@@ -72,15 +70,15 @@ def open_traces(
     return traces, base
 
 
-def _maxwell(file: Hdf5File, path: Path, part: str | None, base: Recording) -> Hdf5Traces:
+def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
     if is_old(file):
         lsb = _number(file.first("settings/lsb"), OLD_LSB_V)
-        return _traces(file, path, "sig", True, base, base.sampling_rate_hz, 1e6 * lsb, 0.0, labels=np.arange(OLD_ROWS))
+        return _traces(file, "sig", base, 1e6 * lsb, channels_first=True, labels=np.arange(OLD_CHANNELS))
     there = parts(file)
-    at = there[choose(f"{path}: part", "--part", there, part)]
+    at = there[choose(f"{file.path}: part", "--part", there, part)]
     groups = [g for g in file.names(f"{at}/groups") if file.has(f"{at}/groups/{g}/raw")]
     if not groups:
-        raise InvalidFile(f"{path}: expected raw traces at /{at}/groups, found none: the rig kept spikes only")
+        raise InvalidFile(f"{file.path}: expected raw traces at /{at}/groups, found none: the rig kept spikes only")
     # Most groups are parts of one; the one with the most channels has them all.
     group = max(groups, key=lambda g: file.dataset(f"{at}/groups/{g}/raw").shape[0])
     labels = file.read(f"{at}/groups/{group}/channels") if file.has(f"{at}/groups/{group}/channels") else None
@@ -89,15 +87,13 @@ def _maxwell(file: Hdf5File, path: Path, part: str | None, base: Recording) -> H
     start_s = 0.0 if own is None else (own[0] - min(e[0] for e in ends)) / base.sampling_rate_hz
     lsb = _number(file.first(f"{at}/settings/lsb"), OLD_LSB_V)
     where = f"{at}/groups/{group}/raw"
-    return _traces(file, path, where, True, base, base.sampling_rate_hz, 1e6 * lsb, start_s, labels=labels)
+    return _traces(file, where, base, 1e6 * lsb, channels_first=True, start_s=start_s, labels=labels)
 
 
-def _nwb(file: Hdf5File, path: Path, part: str | None, base: Recording) -> Hdf5Traces:
-    series = [
-        n
-        for n in file.names("acquisition")
-        if file.attribute(f"acquisition/{n}", "neurodata_type") == "ElectricalSeries"
-    ]
+def _nwb(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
+    path, kind = file.path, "neurodata_type"
+    names = file.names("acquisition")
+    series = [name for name in names if file.attribute(f"acquisition/{name}", kind) == "ElectricalSeries"]
     if not series:
         raise InvalidFile(f"{path}: expected raw traces as an ElectricalSeries in /acquisition, found none")
     at = f"acquisition/{choose(f'{path}: series', '--part', series, part)}"
@@ -109,24 +105,23 @@ def _nwb(file: Hdf5File, path: Path, part: str | None, base: Recording) -> Hdf5T
     if rows is not None and len(rows) and rows.max() < len(base.channels) and rows.min() >= 0:
         labels = base.channels.label[rows]
     scale = _number(file.attribute(f"{at}/data", "conversion"), 1.0)
-    start_s = file.first(f"{at}/starting_time")
-    return _traces(
-        file, path, f"{at}/data", False, base, rate_hz, 1e6 * scale, float(start_s or 0.0), labels=labels
-    )  # fmt: skip
+    start_s = float(file.first(f"{at}/starting_time") or 0.0)
+    return _traces(file, f"{at}/data", base, 1e6 * scale, rate_hz=rate_hz, start_s=start_s, labels=labels)
 
 
 def _traces(
     file: Hdf5File,
-    path: Path,
     where: str,
-    channels_first: bool,
     base: Recording,
-    rate_hz: float,
     uv_per_step: float,
-    start_s: float,
+    *,
+    channels_first: bool = False,
+    rate_hz: float | None = None,
+    start_s: float = 0.0,
     labels: Any = None,
 ) -> Hdf5Traces:
     """Traces in a dataset, with the channels of the recording that it holds; one row or column a label."""
+    path, rate_hz = file.path, base.sampling_rate_hz if rate_hz is None else rate_hz
     if not isinstance(file.node(where), h5py.Dataset):
         raise InvalidFile(f"{path}: expected raw traces at /{where}, found none")
     dataset = file.dataset(where)

@@ -38,12 +38,10 @@ class SpikeInterfaceTraces:
 
     @property
     def samples(self) -> int:
-        """How many each channel has."""
         return int(self.recording.get_num_samples(segment_index=0))
 
     @property
     def sampling_rate_hz(self) -> float:
-        """Of the samples."""
         return float(self.recording.get_sampling_frequency())
 
     @property
@@ -52,7 +50,6 @@ class SpikeInterfaceTraces:
         return 0.0
 
     def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        """The voltage of samples `start` to `stop`."""
         has_scale = self.recording.has_scaleable_traces()
         return in_microvolts(
             self.recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale), 1.0

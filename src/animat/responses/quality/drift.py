@@ -59,9 +59,7 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         return
     large = abs(slope) > LARGE
     is_mixed = responses.presentation is not None and responses.presentation.order == "mixed"
-    yield Finding(
-        "drift",
-        "warning" if large else "note",
+    message = (
         f"responses {'rise' if slope > 0 else 'fall'} by {100 * abs(slope):.0f} % of their mean "
         f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last "
         + ("(in the order of the rows)" if responses.time_s is None else f"(recording: {span_s / 60:.1f} min)")
@@ -70,6 +68,6 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
             + ("" if is_mixed else ", or present conditions mixed, so that drift is not taken for a difference")
             if large
             else ""
-        ),
-        slope,
+        )
     )
+    yield Finding("drift", "warning" if large else "note", message, slope)

@@ -52,11 +52,9 @@ def memory_findings(responses: Responses) -> Iterator[Finding]:
     after_one, after_none = (float(np.average(p, weights=weights)) for p in (p1, p0))
     if abs(after_one - after_none) <= CERTAIN * error:
         return
-    yield Finding(
-        "memory",
-        "note",
+    message = (
         f"the culture remembers: after a response that passes the median {100 * after_one:.0f} % of the next ones do, "
         f"after one that does not {100 * after_none:.0f} %, conditions apart; histograms know nothing of it, the "
-        f"memory simulator does{', of recordings with --order mixed' if responses.is_blocked else ''}",
-        after_one - after_none,
+        f"memory simulator does{', of recordings with --order mixed' if responses.is_blocked else ''}"
     )
+    yield Finding("memory", "note", message, after_one - after_none)

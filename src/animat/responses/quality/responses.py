@@ -41,10 +41,6 @@ def findings_on(
     """Everything there is to say about how far responses can be trusted.
 
     Args:
-        responses: the responses.
-        recording: what they come from.
-        assignment: the condition of every pulse.
-        bursts: the burst separation.
         inside: whether a pulse's window ends within the recording, shape (stimuli,).
     """
     if not len(recording.stimuli):
@@ -68,14 +64,7 @@ def findings_on(
 def findings_without_times(
     responses: Responses, stimuli: Stimuli, assignment: Assignment, bursts: BurstSeparation
 ) -> tuple[Finding, ...]:
-    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told.
-
-    Args:
-        responses: the responses.
-        stimuli: what they are responses to.
-        assignment: the condition of every stimulus.
-        bursts: the burst separation.
-    """
+    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told."""
     return (
         *_without_condition(stimuli, assignment),
         Finding(
@@ -103,12 +92,8 @@ def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndar
     n_read = int(np.count_nonzero(read))
     late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
     if late:
-        yield Finding(
-            "window-past-end",
-            "note" if late < 0.05 * n_read else "warning",
-            f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out",
-            float(late),
-        )
+        message = f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out"
+        yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
 
 def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Finding]:
@@ -116,20 +101,14 @@ def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Fin
     n_read = int(np.count_nonzero(read))
     without = int(np.count_nonzero(read & (assignment.condition == NO_CONDITION)))
     if without == n_read:
-        yield Finding(
-            "no-condition",
-            "refuse",
+        message = (
             f"none of the {n_read} stimuli belongs to a condition: choose other conditions "
-            "(by frequency, interval, electrode or pattern)",
-            float(without),
+            "(by frequency, interval, electrode or pattern)"
         )
+        yield Finding("no-condition", "refuse", message, float(without))
     elif without:
-        yield Finding(
-            "no-condition",
-            "note",
-            f"{without} of {n_read} stimuli belong to no condition and are left out",
-            float(without),
-        )
+        message = f"{without} of {n_read} stimuli belong to no condition and are left out"
+        yield Finding("no-condition", "note", message, float(without))
 
 
 def _timing(responses: Responses, recording: Recording, assignment: Assignment) -> Iterator[Finding]:
@@ -140,32 +119,27 @@ def _timing(responses: Responses, recording: Recording, assignment: Assignment) 
     # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
     overlapping = int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6)))
     if overlapping:
-        yield Finding(
-            "stimuli-too-close",
-            "warning",
+        message = (
             f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
-            f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window",
-            float(overlapping),
+            f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window"
         )
+        yield Finding("stimuli-too-close", "warning", message, float(overlapping))
     rate_hz, _ = spontaneous_rate(recording, after_ms=end_ms)
     response = find_response(recording)
     parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
     if math.isnan(rate_hz) and parts.count.any():
-        yield Finding(
-            "window-not-tested",
-            "note",
+        message = (
             "stimuli follow each other too fast to see how the culture fires without them (less than a second in all "
-            "is 100 ms after a pulse and before the next), so it is not known whether the window holds a response",
+            "is 100 ms after a pulse and before the next), so it is not known whether the window holds a response"
         )
+        yield Finding("window-not-tested", "note", message)
         return
     spikes = _without_artefact(parts)
     per_stimulus = 0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * (1 - 1 / _WINDOW_PARTS)
     expected = per_stimulus * parts.n_stimuli
     elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
     if spikes <= expected:
-        yield Finding(
-            "dead-window",
-            "refuse",
+        message = (
             f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes a "
             f"stimulus (without an eighth at its start, where an artefact may be) against {per_stimulus:.2f} in as "
             f"much time before the stimulus"
@@ -174,27 +148,23 @@ def _timing(responses: Responses, recording: Recording, assignment: Assignment) 
                 f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
                 if response
                 else "; no response was found elsewhere either: these stimuli do not make the culture fire"
-            ),
-            spikes / expected if expected else 0.0,
+            )
         )
+        yield Finding("dead-window", "refuse", message, spikes / expected if expected else 0.0)
         return
     yield from _dead_conditions(responses, recording, assignment, per_stimulus)
     if response and elsewhere:
-        yield Finding(
-            "response-elsewhere",
-            "warning",
+        message = (
             f"the response is at {response.start_ms:g} to {response.end_ms:g} ms after a stimulus, outside the window "
-            f"from {start_ms:g} to {end_ms:g} ms: use --window-ms {response.start_ms:g} {response.end_ms:g}",
-            response.start_ms,
+            f"from {start_ms:g} to {end_ms:g} ms: use --window-ms {response.start_ms:g} {response.end_ms:g}"
         )
+        yield Finding("response-elsewhere", "warning", message, response.start_ms)
     elif response:
-        yield Finding(
-            "response-time",
-            "note",
+        message = (
             f"the culture fires above its spontaneous rate from {response.start_ms:g} to {response.end_ms:g} ms after "
-            f"a stimulus; the window is {start_ms:g} to {end_ms:g} ms",
-            response.start_ms,
+            f"a stimulus; the window is {start_ms:g} to {end_ms:g} ms"
         )
+        yield Finding("response-time", "note", message, response.start_ms)
 
 
 def _without_artefact(parts: PostStimulusHistogram) -> int:
@@ -219,14 +189,12 @@ def _dead_conditions(
             worst = min(worst, spikes)
     if dead:
         listed = ", ".join(dead[:8]) + (f" and {len(dead) - 8} more" if len(dead) > 8 else "")
-        yield Finding(
-            "dead-condition",
-            "warning",
+        message = (
             f"after stimuli of some conditions the window from {start_ms:g} to {end_ms:g} ms holds no more spikes than "
             f"as much time before a stimulus, {per_stimulus:.2f} (without an eighth at its start): {listed}; what is "
-            "in it is no response: leave them out, or use a window that suits all",
-            worst,
+            "in it is no response: leave them out, or use a window that suits all"
         )
+        yield Finding("dead-condition", "warning", message, worst)
 
 
 def _conditions(responses: Responses) -> Iterator[Finding]:
@@ -237,19 +205,13 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
             what = (
                 "no stimulus" if not n_all else f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
             )
-            yield Finding(
-                "empty-condition",
-                "refuse",
-                f"condition {condition.label}: {what}; leave it out or choose other conditions",
-                0.0,
-            )
+            message = f"condition {condition.label}: {what}; leave it out or choose other conditions"
+            yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
-            yield Finding(
-                "few-samples",
-                "warning",
-                f"condition {condition.label}: {n} non-burst responses; a distribution takes {FEW_SAMPLES} or more",
-                float(n),
+            message = (
+                f"condition {condition.label}: {n} non-burst responses; a distribution takes {FEW_SAMPLES} or more"
             )
+            yield Finding("few-samples", "warning", message, float(n))
 
 
 def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
@@ -258,32 +220,24 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
     if not n_bursts:
         if not math.isnan(bursts.rejected):
             above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
-            yield Finding(
-                "bursts-not-separable",
-                "note",
+            message = (
                 f"no response is set apart as a burst, as the ratios of active channels do not form two groups: Otsu's "
                 f"threshold, {bursts.rejected:.3f}, would part {above} of {len(responses)} responses from the others "
-                f"({values})",
-                bursts.separability,
+                f"({values})"
             )
+            yield Finding("bursts-not-separable", "note", message, bursts.separability)
         return
     share = n_bursts / len(responses)
     dropped = f"{n_bursts} of {len(responses)} responses ({100 * share:.1f} %) are set apart as bursts"
     if share > MANY_BURSTS:
-        yield Finding(
-            "many-bursts",
-            "warning",
+        message = (
             f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest stimuli that "
-            "failed: look at the panels of burst separation, and use --burst-threshold 1 to keep all",
-            share,
+            "failed: look at the panels of burst separation, and use --burst-threshold 1 to keep all"
         )
+        yield Finding("many-bursts", "warning", message, share)
     else:
-        yield Finding(
-            "bursts",
-            "note",
-            f"{dropped} (above {responses.threshold:.3f} of the channels active; {values})",
-            share,
-        )
+        message = f"{dropped} (above {responses.threshold:.3f} of the channels active; {values})"
+        yield Finding("bursts", "note", message, share)
 
 
 def _difference(responses: Responses) -> Iterator[Finding]:
@@ -294,13 +248,11 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     known = [(c.label, float(p)) for c, p, ok in zip(responses.conditions, shares, enough, strict=True) if ok]
     if len(known) < 2:
         if len(responses.conditions) == 1:
-            yield Finding(
-                "one-condition",
-                "warning",
+            message = (
                 "there is one condition only, so an agent has nothing to choose: to train, sort the stimuli by "
-                "frequency, interval, electrode or pattern",
-                1.0,
+                "frequency, interval, electrode or pattern"
             )
+            yield Finding("one-condition", "warning", message, 1.0)
         return
     lowest, highest = min(known, key=lambda item: item[1]), max(known, key=lambda item: item[1])
     spread = highest[1] - lowest[1]
@@ -310,25 +262,17 @@ def _difference(responses: Responses) -> Iterator[Finding]:
         f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
     )
     if spread < SMALL_DIFFERENCE:
-        yield Finding(
-            "no-difference",
-            "warning",
+        message = (
             f"the conditions hardly differ: P(x >= P50) is {listed}; {reach}, the rest is chance, so no policy can "
-            "steer a robot much better than at random: stimulate in ways that differ more",
-            spread,
+            "steer a robot much better than at random: stimulate in ways that differ more"
         )
+        yield Finding("no-difference", "warning", message, spread)
     elif spread < LITTLE_DIFFERENCE:
-        yield Finding(
-            "little-difference",
-            "warning",
+        message = (
             f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
-            "a robot can hardly be steered: --optimum cartpole computes how far; stimulate in ways that differ more",
-            spread,
+            "a robot can hardly be steered: --optimum cartpole computes how far; stimulate in ways that differ more"
         )
+        yield Finding("little-difference", "warning", message, spread)
     else:
-        yield Finding(
-            "difference",
-            "note",
-            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance",
-            spread,
-        )
+        message = f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance"
+        yield Finding("difference", "note", message, spread)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
-from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
+from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram, spontaneous_rate
 
 BIN_MS = 0.5
 SPAN_MS = (-10.0, 20.0)
@@ -56,31 +56,32 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
     apart = read & (gap_ms >= SPAN_MS[1]) & (before_ms >= -SPAN_MS[0] + SPAN_MS[1])
     chosen = apart if int(apart.sum()) >= min(20, int(read.sum())) else read
     histogram = post_stimulus_histogram(recording, *SPAN_MS, BIN_MS, chosen)
-    centre_ms = histogram.edges_ms[:-1] + BIN_MS / 2
-    count = histogram.count.astype(np.float64)
     rate_hz, quiet_s = spontaneous_rate(recording)
     spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * histogram.n_stimuli
-    later = count[centre_ms > 3.0]
+    later = histogram.count[_centre_ms(histogram) > 3.0]
     usual = max(spontaneous, float(np.median(later)), 1.0)
     # Responses can begin before 2 ms: what is no sharper than the response later on is one.
     usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
-    times_s = stimuli.time_s[chosen]
-    artefact = _artefact(centre_ms, count, usual, max(spontaneous, 1.0), recording.spike_times_s, times_s)
+    artefact = _artefact(histogram, usual, max(spontaneous, 1.0), recording.spike_times_s, stimuli.time_s[chosen])
     if artefact is not None:
-        yield _artefact_finding(centre_ms, count, artefact, usual, recording, histogram.n_stimuli, window_ms)
+        yield _artefact_finding(histogram, artefact, usual, len(recording.spike_times_s), window_ms)
     if quiet_s > 0 and spontaneous > 0:
-        yield from _blank(centre_ms, count, artefact, spontaneous, window_ms)
+        yield from _blank(histogram, artefact, spontaneous, window_ms)
+
+
+def _centre_ms(histogram: PostStimulusHistogram) -> Float64[np.ndarray, " bins"]:
+    return histogram.edges_ms[:-1] + BIN_MS / 2
 
 
 def _artefact(
-    centre_ms: Float64[np.ndarray, " bins"],
-    count: Float64[np.ndarray, " bins"],
+    histogram: PostStimulusHistogram,
     usual: float,
     spontaneous: float,
     spike_times_s: Float64[np.ndarray, " spikes"],
     stimulus_s: Float64[np.ndarray, " stimuli"],
 ) -> tuple[int, int] | None:
     """First and last bin of the artefact; None where there is none."""
+    centre_ms, count = _centre_ms(histogram), histogram.count
     above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
     early = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
     for largest in early[np.argsort(-count[early], kind="stable")].tolist():
@@ -114,42 +115,38 @@ def _run(flags: Bool[np.ndarray, " bins"], start: int) -> tuple[int, int]:
 
 
 def _artefact_finding(
-    centre_ms: Float64[np.ndarray, " bins"],
-    count: Float64[np.ndarray, " bins"],
+    histogram: PostStimulusHistogram,
     artefact: tuple[int, int],
     usual: float,
-    recording: Recording,
-    n_stimuli: int,
+    n_spikes: int,
     window_ms: tuple[float, float],
 ) -> Finding:
     first, last = artefact
+    centre_ms, count = _centre_ms(histogram), histogram.count[first : last + 1]
     from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
-    spikes = float(count[first : last + 1].sum())
+    spikes, n_stimuli = float(count.sum()), histogram.n_stimuli
     reaches = to_ms > window_ms[0] + 1e-9
     remedy = (
         f"the window begins at {window_ms[0]:g} ms, inside it: begin it at {to_ms:g} ms or later (--window-ms)"
         if reaches
         else f"the window from {window_ms[0]:g} ms on does not hold them"
     )
-    return Finding(
-        "artefact-spikes",
-        "warning" if reaches else "note",
+    message = (
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
-        f"{count[first : last + 1].max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
+        f"{count.max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
         f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
-        f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}",
-        spikes / n_stimuli,
+        f"({100 * spikes / max(n_spikes, 1):.1f} % of all); {remedy}"
     )
+    return Finding("artefact-spikes", "warning" if reaches else "note", message, spikes / n_stimuli)
 
 
 def _blank(
-    centre_ms: Float64[np.ndarray, " bins"],
-    count: Float64[np.ndarray, " bins"],
+    histogram: PostStimulusHistogram,
     artefact: tuple[int, int] | None,
     spontaneous: float,
     window_ms: tuple[float, float],
 ) -> Iterator[Finding]:
-    is_blank = count < spontaneous / TIMES
+    centre_ms, is_blank = _centre_ms(histogram), histogram.count < spontaneous / TIMES
     if artefact is not None:
         is_blank[artefact[0] : artefact[1] + 1] = True
     zero = int(np.searchsorted(centre_ms, 0.0))
@@ -170,10 +167,8 @@ def _blank(
         yield Finding("blanked-window", "note", f"{found}; the window from {window_ms[0]:g} ms on is after it", 0.0)
         return
     remedy = f"use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else "use a window after it"
-    yield Finding(
-        "blanked-window",
-        "note" if lost <= 0.15 else "warning",
+    message = (
         f"{found}: {100 * min(lost, 1):.0f} % of the window from {window_ms[0]:g} to {window_ms[1]:g} ms is lost, and "
-        f"rates are too low by as much: {remedy}",
-        min(lost, 1.0),
+        f"rates are too low by as much: {remedy}"
     )
+    yield Finding("blanked-window", "note" if lost <= 0.15 else "warning", message, min(lost, 1.0))
