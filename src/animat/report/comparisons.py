@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.report.html import cell
 from animat.report.minus import with_minus
-from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    OPTIMUM,
+    ORANGE,
+    Axes,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.report.style import BLACK, BLUE, GREY, ORANGE, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.report.style import BLACK, BLUE, GREY, ORANGE, Axes, Figure, add_common_legend, new_figure, style_axes
 
 _APART = 0.11
 """Between two cultures of a row, in rows."""

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from animat.report.minus import with_minus
-from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, Figure, add_common_legend, grid_of_panels, style_axes
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BURST, GREY, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import BLACK, BURST, GREY, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PERCENTILES = (10, 25, 50, 75, 90)
 """Of the responses, that are drawn."""

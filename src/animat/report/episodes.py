@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from animat.report.style import grid_of_panels, new_figure, style_axes
+from animat.report.style import Figure, grid_of_panels, new_figure, style_axes
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 from animat.robots.drawing import draw_robot
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Path = Float[np.ndarray, "iterations+1 observations"]
 _FRAMES = 7

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import GREY, MEDIAN, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import GREY, MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _BINS = 30
 _MOST_PANELS = 12

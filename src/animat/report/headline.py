@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.report.style import BLUE, GREY, OPTIMUM, SKY, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, SKY, Figure, add_common_legend, new_figure, style_axes
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
-from animat.report.style import BLUE, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, Figure, new_figure, style_axes
 
 
 def draw_importance(shares: Mapping[str, float], title: str) -> Figure:

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, OPTIMUM, add_common_legend, grid_of_panels, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, Figure, add_common_legend, grid_of_panels, style_axes
 
 _RESAMPLES = 2000
 

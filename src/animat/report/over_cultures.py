@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from animat.report.style import BLACK, BLUE, GREY, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLACK, BLUE, GREY, Figure, add_common_legend, new_figure, style_axes
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,13 +17,11 @@ from animat.report.style import (
     PURPLE,
     RED,
     SKY,
+    Figure,
     add_common_legend,
     grid_of_panels,
     style_axes,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
 

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from animat.report.style import BLUE, GREY, RED, WINDOW, add_legend, new_figure, style_axes
+from animat.report.style import BLUE, GREY, RED, WINDOW, Figure, add_legend, new_figure, style_axes
 from animat.responses.psth import PostStimulusHistogram
 
 _ARTEFACT_MS = 5.0
 """Bins nearer to the stimulus than this do not set the height of the axis when they would dwarf all others."""
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw_psth(

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, RED, WINDOW, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import BLACK, RED, WINDOW, Axes, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 from animat.responses.windows import spikes_in
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_STIMULI = 300
 _MOST_LABELS = 12

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import MEDIAN, condition_colours, new_figure, style_axes
+from animat.report.style import MEDIAN, Figure, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _BINS = 24
 _MOST_ROWS = 20

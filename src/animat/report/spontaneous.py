@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, WINDOW, add_legend, new_figure, style_axes
+from animat.report.style import BLACK, WINDOW, Figure, add_legend, new_figure, style_axes
 from animat.responses.network_bursts import NetworkBursts
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MOST_SPIKES = 200_000
 _MOST_BINS = 2_000

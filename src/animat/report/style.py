@@ -11,8 +11,11 @@ from animat.errors import InvalidArgument
 from animat.writing import atomic_write
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    # For annotations alone: matplotlib is loaded where something is drawn.
+    Axes = Figure = Any
 
 FORMATS = ("png", "svg", "pdf")
 

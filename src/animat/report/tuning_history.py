@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
-from animat.report.style import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+)
 
 _MARKERS = "ov^sDP"
 

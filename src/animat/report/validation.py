@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.neurons.free_runs import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
-from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    Axes,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+)
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
 _HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 from animat.goals.robot import RobotWithGoal
 from animat.report.html import Table
-from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED
+from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame
 from animat.studies.results import ObjectiveMet
 from animat.studies.specification import Study
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 
 def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:

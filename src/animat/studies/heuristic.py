@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from animat.evaluation.verdict import beside
-from animat.studies.episodes import POLICY
+from animat.studies.episodes import POLICY, DataFrame
 from animat.studies.evaluating import is_usual
 from animat.studies.results import BesideHeuristic, Results
 from animat.studies.specification import RobotSpec, Study, named_mapping
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 HEURISTIC = "heuristic"
 OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few episodes to tell"

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, final
+from typing import TypeAlias, final
 
 import numpy as np
 
@@ -27,10 +27,10 @@ from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
-from animat.report.style import FORMATS, save_figure
+from animat.report.style import FORMATS, Figure, save_figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.capabilities import lacking
-from animat.studies.episodes import POLICY, RANDOM, mean_returns
+from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.figure_tables import (
     write_array,
@@ -51,10 +51,6 @@ from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import TRAINED, References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 from animat.training.settings import SAC
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 
 @final

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 from animat.evaluation.coupling import context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
-from animat.studies.episodes import COUPLING, POLICY, RANDOM, mean_returns
+from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
 from animat.studies.results import BesideReflex, StudyOptimum
 from animat.studies.specification import RobotSpec, Study, named_mapping
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 
 def beside_reflex(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, final
+from typing import Any, TypeVar, final
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,7 +16,7 @@ from animat.evaluation.statistics import Comparison, compare, holm, interquartil
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
-from animat.studies.episodes import POLICY, RANDOM, mean_returns, read_episodes
+from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, first_minute, last_minute
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import beside_heuristic
@@ -42,9 +42,6 @@ from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
 from animat.writing import atomic_write
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 T = TypeVar("T")
 
