@@ -6,10 +6,10 @@ import base64
 import math
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from animat.errors import InvalidFile
 from animat.report.minus import MINUS, with_minus
@@ -76,6 +76,16 @@ class Table:
     beside: str = ""
     marked: tuple[int, ...] = ()
     folded: bool = False
+
+
+Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
+"""Of a table of records: their names, and the field or a function of a record that gives the cell."""
+
+
+def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) -> Table:
+    """A table with a row a record; `more` as of `Table`."""
+    rows = tuple(tuple(of(each) if callable(of) else getattr(each, of) for _, of in columns) for each in records)
+    return Table(title, tuple(name for name, _ in columns), rows, **more)
 
 
 @dataclass(frozen=True)
