@@ -57,6 +57,12 @@ def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
     return digest.hexdigest()
 
 
+def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
+    """Plain data by way of JSON, in which a tuple and a list are the same, with a fingerprint over all of it."""
+    told: dict[str, Any] = json.loads(json.dumps(description))
+    return told | {"fingerprint": fingerprint_of(told)}
+
+
 def description_in(path: Path, what: str) -> dict[str, Any] | None:
     """What a file says of the folder that it lies in, with its fingerprint; None if there is none.
 

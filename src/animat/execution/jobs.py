@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
@@ -15,7 +14,7 @@ from pathlib import Path
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import WithGpu
-from animat.execution.pinned import PinnedProcesses
+from animat.execution.pinned import PinnedProcesses, one_a_core
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
 from animat.progress import Progress
@@ -209,7 +208,7 @@ def _running_on(
 ) -> Iterator[Executor | WithGpu]:
     """The executor that was lent, or processes of ours; if the block fails, nothing goes on after it."""
     if executor is None:
-        with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours, PinnedProcesses([None]) as beside:
+        with one_a_core(workers) as ours, PinnedProcesses([None]) as beside:
             yield WithGpu(ours, beside) if has_gpu else ours
         return
     try:

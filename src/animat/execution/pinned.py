@@ -87,6 +87,11 @@ class PinnedProcesses(ThreadPoolExecutor):
         return value
 
 
+def one_a_core(workers: int | None) -> PinnedProcesses:
+    """So many processes, each on one of the cores that this one may use; None: one on each."""
+    return PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers])
+
+
 class _Process:
     """A process of `animat.execution.worker`, which imports from where this one does."""
 

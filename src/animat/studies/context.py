@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import os
 import shutil
 from concurrent.futures import Executor
@@ -11,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from animat.differences import description_in, fingerprint_of, first_difference, of_another
+from animat.differences import description_in, first_difference, of_another, with_fingerprint
 from animat.errors import InvalidFile
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
@@ -26,11 +25,10 @@ from animat.studies.context_tasks import (
     RecordCulture,
     TrainPolicies,
     read_json,
-    rows_by_name,
     write_json,
 )
 from animat.studies.places import RECEIPTS
-from animat.studies.results import write_records, write_table
+from animat.studies.results import write_records
 from animat.training.settings import LEARNER
 from animat.writing import exclusive_lock
 
@@ -130,9 +128,7 @@ def run_context_study(
     Args:
         study: the specification.
         folder: where everything goes; made if it is missing.
-        workers: processes, each on a core of its own; None: one a core. Not with an executor.
-        executor: where jobs are run, in view of the folder; it stays open. None: processes on this machine.
-        progress: told how far it is, and what runs.
+        workers, executor, progress: as of `animat.studies.run.run_study`.
 
     Raises:
         Mismatch: if the folder is another study's, or another run is at work in it.
@@ -157,9 +153,7 @@ def run_context_study(
         rows = tuple(_row(folder, *pair) for pair in pairs)
         lost = tuple(row for pair in pairs for row in _lost(folder, *pair))
         write_records(folder / TABLE, ContextRow, rows)
-        write_table(
-            folder / WHOSE_WORK, list(LostRow.__dataclass_fields__), [tuple(asdict(row).values()) for row in lost]
-        )
+        write_records(folder / WHOSE_WORK, LostRow, lost)
     return RanContext(folder, rows, lost, took_s)
 
 
@@ -169,8 +163,7 @@ def _describe(study: ContextStudy) -> dict[str, Any]:
     packages = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba")
     versions = {name: importlib.metadata.version(name) for name in packages}
     versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
-    told = json.loads(json.dumps({"context study": asdict(study), "versions": versions}))
-    return {**told, "fingerprint": fingerprint_of(told)}
+    return with_fingerprint({"context study": asdict(study), "versions": versions})
 
 
 def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
@@ -207,26 +200,18 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
 def _row(folder: Path, culture: int, robot: str) -> ContextRow:
     told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)
     in_turn = read_json(folder / f"culture-{culture}" / robot / MEASURED)["rows"]
-    measured = rows_by_name(in_turn)
-    simulated = rows_by_name(told["rows"])
+    simulated = {row["name"]: row["mean_return"] for row in told["rows"]}
+    measured = {row["name"]: row["measured"] for row in in_turn}
     context = told["context"] or {}
-    gap = context.get("context_gap") or {}
-    score = told["context_score"] or {}
+    gap, score = context.get("context_gap") or {}, told["context_score"] or {}
     information = told["whose_work"]["rows"][0]["goal_information"]
-
-    def in_loop(name: str) -> float | None:
-        return measured[name]["measured"] if name in measured else None
-
-    def on_simulator(name: str) -> float | None:
-        return simulated[name]["mean_return"] if name in simulated else None
-
     return ContextRow(
         culture=culture,
         robot=robot,
-        random=simulated["random"]["mean_return"],
-        heuristic=on_simulator("heuristic"),
-        coupling=on_simulator("coupling"),
-        policies=simulated["policies"]["mean_return"],
+        random=simulated["random"],
+        heuristic=simulated.get("heuristic"),
+        coupling=simulated.get("coupling"),
+        policies=simulated["policies"],
         optimum=None if told["optimum"] is None else told["optimum"]["value"],
         best_known=context.get("best_known"),
         gap=gap.get("value"),
@@ -236,9 +221,9 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
         score_low_95=score.get("low"),
         score_high_95=score.get("high"),
         bits=None if information is None else information["bits"]["value"],
-        measured_random=in_loop("random"),
-        measured_heuristic=in_loop("heuristic"),
-        measured_coupling=in_loop("coupling"),
+        measured_random=measured.get("random"),
+        measured_heuristic=measured.get("heuristic"),
+        measured_coupling=measured.get("coupling"),
         # All of them together; of one alone its own row.
         measured_policies=in_turn[0]["measured"],
         predicted_policies=in_turn[0]["predicted"],
@@ -248,14 +233,6 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
 def _lost(folder: Path, culture: int, robot: str) -> list[LostRow]:
     told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)["whose_work"]["rows"]
     return [
-        LostRow(
-            culture=culture,
-            robot=robot,
-            intervention=row["name"],
-            mean_return=row["mean_return"],
-            lost=row["lost"]["value"],
-            lost_low_95=row["lost"]["low"],
-            lost_high_95=row["lost"]["high"],
-        )
+        LostRow(culture, robot, row["name"], row["mean_return"], *(row["lost"][of] for of in ("value", "low", "high")))
         for row in told[1:]
     ]

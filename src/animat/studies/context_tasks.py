@@ -277,8 +277,3 @@ def write_json(path: Path, words: Any) -> Path:
 def read_json(path: Path) -> Any:
     """What `write_json` wrote."""
     return json.loads(path.read_text())
-
-
-def rows_by_name(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Rows of a table that was written, by their names."""
-    return {row["name"]: row for row in rows}

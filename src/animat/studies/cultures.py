@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from animat.execution.pinned import PinnedProcesses
 from animat.progress import Progress, Silent
 from animat.studies.parquet import write_parquet
 from animat.studies.places import results_file
-from animat.studies.results import ComparedReturns, Results, Score, read_typed, write_records, write_table
+from animat.studies.results import ComparedReturns, Results, Score, read_typed, write_named_records, write_records
 from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
@@ -153,13 +153,11 @@ def run_over_cultures(
     results = {name: read_typed(results_file(each.folder), Results) for name, each in ran.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
-    head = ["culture", *ComparedReturns.__dataclass_fields__]
-    rows = [(name, *asdict(row).values()) for name, compared in comparisons.items() for row in compared]
-    write_table(folder / COMPARISONS, head, rows)
-    write_records(folder / SUMMARY, OverCultures, summary)
+    compared = [(name, row) for name, rows in comparisons.items() for row in rows]
     scores = [(name, score) for name, each in results.items() for score in each.scores]
-    rows = [(name, *asdict(score).values()) for name, score in scores]
-    write_table(folder / SCORES, ["culture", *Score.__dataclass_fields__], rows)
+    write_named_records(folder / COMPARISONS, "culture", ComparedReturns, compared)
+    write_records(folder / SUMMARY, OverCultures, summary)
+    write_named_records(folder / SCORES, "culture", Score, scores)
     parquet = (folder / SCORES).with_suffix(".parquet")
     is_written = write_parquet(parquet, scores, Score, "culture")
     return RanCultures(folder, ran, failed, comparisons, summary, parquet if is_written else None)
@@ -245,13 +243,13 @@ class _Together:
             self._whole.update(self._ended + sum(self._shares.values()), self._studies, note)
 
 
-@dataclass(frozen=True)
 class _OfOne:
-    see: Callable[[float], None]
+    def __init__(self, see: Callable[[float], None]) -> None:
+        self._see = see
 
     def update(self, done: float, total: float, note: str = "") -> None:
         """Tell the others of it."""
-        self.see(done / total)
+        self._see(done / total)
 
 
 def over_cultures(found: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:

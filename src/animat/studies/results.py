@@ -256,3 +256,9 @@ def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) 
 def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
     """Write records as a CSV file, a column a field."""
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
+
+
+def write_named_records(path: Path, name: str, kind: type, named: Iterable[tuple[str, Any]]) -> Path:
+    """The same with a first column of this name, which comes with each record."""
+    head = [name, *(field.name for field in fields(kind))]
+    return write_table(path, head, ((first, *astuple(row)) for first, row in named))
