@@ -9,7 +9,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.cultures import CulturesView
@@ -23,6 +23,7 @@ from animat.watch.stopping import stop_session
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
+from animat.watch.view import View
 
 _FILES = {
     "": ("index.html", "text/html"),
@@ -33,19 +34,6 @@ _FILES = {
 """Of the page, by their addresses."""
 _MOST_VIEWS = 8
 """That are kept open."""
-
-
-class View(Protocol):
-    """Something that is watched."""
-
-    def about(self) -> dict[str, Any]:
-        """What does not change while it goes on."""
-
-    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How it is, in the seconds before a time."""
-
-    def close(self) -> None:
-        """Let go of files."""
 
 
 _VIEWS: dict[Kind, Callable[[Path], View]] = {

@@ -19,6 +19,7 @@ from animat.watch.plain import listed, mapped, number, numbers, text, whole
 from animat.watch.spikes import packed
 from animat.watch.sums import Sums
 from animat.watch.tail import Tail
+from animat.watch.view import View
 
 MOST_SPAN_S = 60.0
 """That is shown at once."""
@@ -34,15 +35,11 @@ _NO_TIME = 64
 """Records in a row without a time, at most."""
 
 
-class SessionView:
-    """A session's folder, looked at again and again.
-
-    Args:
-        folder: with a log in it.
-    """
+class SessionView(View):
+    """A session's folder, with a log in it."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        super().__init__(folder)
         self.tail = Tail(folder / LOG_FILE)
         self._generation = -1
         self._agents: list[dict[str, Any]] = []
@@ -50,11 +47,9 @@ class SessionView:
         self._agents_until_s, self._done = 0.0, 0
 
     def close(self) -> None:
-        """Let go of its log."""
         self.tail.close()
 
     def about(self) -> dict[str, Any]:
-        """What does not change while it goes on."""
         self._look()
         header, words = self._header, self._words
         loop, channels = mapped(words.get("loop")), header.channels
