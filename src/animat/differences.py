@@ -64,14 +64,9 @@ def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
 
 
 def description_in(path: Path, what: str) -> dict[str, Any] | None:
-    """What a file says of the folder that it lies in, with its fingerprint; None if there is none.
+    """What a file of JSON says of the folder that it lies in, with its fingerprint; None if there is none.
 
-    Args:
-        path: the file, JSON.
-        what: the folder's contents, such as `study`, for a message.
-
-    Raises:
-        InvalidFile: if it cannot be read.
+    What the folder holds, such as a `study`, is for the message of an InvalidFile, if it cannot be read.
     """
     if not path.exists():
         return None

@@ -35,10 +35,7 @@ def store(folder: Path, contents: Mapping[str, bytes]) -> None:
 def carry_out_apart(task: Task, reads: Mapping[str, str], folder: Path) -> DoneApart:
     """`carry_out` in a folder of its own, which is made of what was sent and is gone afterwards.
 
-    Args:
-        task: what is done.
-        reads: of each file that it reads, by its place, under what it was stored (`store`).
-        folder: the worker's own, in which that is.
+    In the worker's folder lies what the task reads, of each file, by its place, under what it was stored (`store`).
 
     Raises:
         InvalidFile: if something was not sent.
@@ -58,11 +55,7 @@ def carry_out_apart(task: Task, reads: Mapping[str, str], folder: Path) -> DoneA
 
 
 def bring_back(came: DoneApart, folder: Path) -> Done:
-    """Write what came back into the folder.
-
-    Raises:
-        InvalidFile: if it is not what the worker left.
-    """
+    """Write what came back into the folder; raises InvalidFile if it is not what the worker left."""
     for place, content in came.contents.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / place) as beside:

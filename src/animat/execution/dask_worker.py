@@ -86,11 +86,7 @@ _HELD: list[TextIO] = []
 
 
 def dask_setup(worker: Any) -> None:
-    """Make a Dask worker one of ours, before the scheduler hears of it; called by Dask.
-
-    Args:
-        worker: Dask's.
-    """
+    """Make a Dask worker one of ours, before the scheduler hears of it; called by Dask."""
     threads = worker.state.nthreads
     for core in _own_cores(threads):
         _FREE.put(_Core(core))

@@ -49,11 +49,7 @@ class Receipt:
 
     @staticmethod
     def load(receipts: Path, job: str) -> Receipt | None:
-        """The receipt of a job; None where there is none.
-
-        Raises:
-            InvalidFile: if it cannot be read.
-        """
+        """The receipt of a job; None where there is none. Raises InvalidFile if it cannot be read."""
         path = receipt_path(receipts, job)
         if not path.exists():
             return None

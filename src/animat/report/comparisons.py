@@ -68,11 +68,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     """A column a comparison: above with random actions (dotted) and the optimal return (dashed), below close up.
 
     Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; policies are
-    points.
-
-    Args:
-        pairs: on one robot, at least one.
-        title: of the whole figure.
+    points. All pairs are of one robot; at least one is given.
     """
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
     figure.suptitle(title, fontsize=10)

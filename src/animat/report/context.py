@@ -33,8 +33,7 @@ def draw_context(
     """Context gaps of tasks beside context scores of policies: a row a robot, a point a culture with its interval.
 
     Args:
-        gaps: by the robot's name, of each culture.
-        scores: the same.
+        gaps, scores: by the robot's name, of each culture.
         admitted: the gap from which on a task needs more than a reflex.
     """
     figure = new_figure(9.2, 1.7 + 0.55 * len(gaps))

@@ -46,11 +46,9 @@ def drift_of(series: Sequence[Responses]) -> Drift:
 
 
 def draw_drift(series: Sequence[Responses]) -> Figure:
-    """Against the minutes: the pooled percentiles, P(x >= P50) of each condition, and the share of bursts.
+    """Against the minutes: the pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts.
 
-    Args:
-        series: responses of the recordings in the order of time, with the same conditions. At most 12 conditions
-            are drawn.
+    The responses are those of `drift_of`.
     """
     drift = drift_of(series)
     minutes, percentiles = drift.minutes, drift.percentiles_hz

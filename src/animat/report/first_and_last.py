@@ -16,11 +16,9 @@ _MOST_PANELS = 12
 
 
 def draw_first_and_last(series: Sequence[Responses]) -> Figure:
-    """Non-burst responses of each condition: filled in the first recording, as an outline in the last.
+    """Non-burst responses of at most 12 conditions: filled in the first recording, as an outline in the last.
 
-    Args:
-        series: responses of the recordings in the order of time, with the same conditions. At most 12 conditions
-            are drawn.
+    All recordings, in the order of time, have the same conditions.
     """
     first, last = series[0], series[-1]
     conditions = first.conditions[:_MOST_PANELS]

@@ -107,14 +107,9 @@ class Section:
 def write_page(
     path: str | os.PathLike[str], title: str, lead: str, sections: Sequence[Section], colophon: Sequence[str]
 ) -> Path:
-    """Write the page, complete or absent.
+    """Write the page, complete or absent; each section has an entry in the list of contents.
 
-    Args:
-        path: the file.
-        title: of the page.
-        lead: under the title.
-        sections: in their order; each has an entry in the list of contents.
-        colophon: lines at the end: versions, seeds.
+    The lead stands under the title; the colophon is lines at the end, with versions and seeds.
 
     Raises:
         InvalidFile: if a figure cannot be read or the page cannot be written.

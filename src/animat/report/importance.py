@@ -8,12 +8,7 @@ from animat.report.style import BLUE, Figure, new_figure, style_axes
 
 
 def draw_importance(shares: Mapping[str, float], title: str) -> Figure:
-    """A bar a setting, the most important at the top.
-
-    Args:
-        shares: of each setting by name, together 1, the largest first.
-        title: of the figure.
-    """
+    """A bar a setting, by the shares of settings, which come the largest first and together are 1."""
     figure = new_figure(6.0, 1.1 + 0.27 * len(shares))
     axes = figure.subplots()
     places = range(0, -len(shares), -1)

@@ -34,12 +34,7 @@ class LearningCurve:
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
-    """A panel for each arm: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum.
-
-    Args:
-        curves: of one robot.
-        title: of the whole figure.
-    """
+    """A panel for each arm: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum."""
     columns = 2 if len(curves) == 4 else min(3, len(curves))
     figure, panels = grid_of_panels(len(curves), columns, 3.1, 2.4, title, share_x=True, share_y=True)
     for axes, curve in zip(panels, curves, strict=True):

@@ -73,10 +73,7 @@ class Courses:
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
     """A panel a mapping: median over policies of each arm with its quartiles, against the recording's minute.
 
-    Args:
-        panels_of: of one robot.
-        title: of the whole figure.
-        trained_until_min: end of training on the culture's clock, to be marked.
+    The end of training on the culture's clock is marked.
     """
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 3.4, title, share_x=True)
     names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses))

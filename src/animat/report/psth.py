@@ -16,10 +16,7 @@ def draw_psth(
 ) -> Figure:
     """Mean rate per channel against the time from the stimulus; what is lost in the artefact stands out as empty.
 
-    Args:
-        histogram: the counts.
-        window_ms: the window to mark.
-        spontaneous_hz: rate per channel without stimuli, drawn as a line.
+    The response window is marked, and the spontaneous rate, per channel too, is a line.
     """
     figure = new_figure(7.5, 3.8)
     axes = figure.subplots()

@@ -17,22 +17,17 @@ _MOST_DOTS = 3000
 _MOST_BINS = 100
 
 
-def draw_raster(
-    recording: Recording, responses: Responses, from_ms: float = -20.0, to_ms: float | None = None
-) -> Figure:
+def draw_raster(recording: Recording, responses: Responses) -> Figure:
     """Spikes by channel in a stretch of the recording, and by stimulus around it, sorted by condition.
 
-    Args:
-        recording: the spikes.
-        responses: the responses, made from this recording.
-        from_ms, to_ms: the span around a stimulus; to_ms is by default 50 ms, or twice the window's end if that is
-            later.
+    From 20 ms before a stimulus to 50 ms after it, or to twice the window's end if that is later. The responses are
+    made from this recording.
     """
-    to_ms = max(50.0, 2 * responses.window_ms[1]) if to_ms is None else to_ms
+    to_ms = max(50.0, 2 * responses.window_ms[1])
     figure = new_figure(8.0, 7.0)
     upper, lower = figure.subplots(2, 1, height_ratios=[1, 1.25])
     _draw_stretch(upper, recording)
-    _draw_stimuli(lower, recording, responses, from_ms, to_ms)
+    _draw_stimuli(lower, recording, responses, -20.0, to_ms)
     return figure
 
 

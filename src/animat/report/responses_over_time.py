@@ -18,10 +18,8 @@ _MOST_CONDITIONS = 8
 def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     """A column a condition, a row a recording, the first at the top: its non-burst responses, and their median.
 
-    At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so.
-
-    Args:
-        series: responses of the recordings in the order of time, with the same conditions.
+    At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so. All recordings, in the
+    order of time, have the same conditions.
     """
     rows = np.unique(np.linspace(0, len(series) - 1, min(len(series), _MOST_ROWS)).round().astype(int))
     shown = [series[row] for row in rows]

@@ -13,12 +13,7 @@ _MOST_BINS = 2_000
 
 
 def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
-    """Spikes by channel and the rate per channel, over the whole recording, with the network bursts marked.
-
-    Args:
-        recording: without stimuli.
-        bursts: found in it.
-    """
+    """Spikes by channel and the rate per channel, over the whole recording, with the network bursts marked."""
     figure = new_figure(8.0, 7.0)
     upper, lower = figure.subplots(2, 1, height_ratios=[2, 1], sharex=True)
     n = len(recording.spike_times_s)

@@ -83,12 +83,7 @@ def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
 
 @dataclass(frozen=True)
 class ContextTask(Task):
-    """A part of the study on one culture.
-
-    Attributes:
-        study: the specification.
-        culture: its seed.
-    """
+    """A part of the study on the culture of one seed."""
 
     study: ContextStudy
     culture: int
@@ -109,11 +104,7 @@ class ContextTask(Task):
 @final
 @dataclass(frozen=True)
 class RecordCulture(ContextTask):
-    """Record the culture twice, five minutes apart.
-
-    Attributes:
-        n_commands: of the robots that it is recorded for.
-    """
+    """Record the culture twice, five minutes apart, for robots with so many commands."""
 
     n_commands: int = 1
 
@@ -136,11 +127,7 @@ class RecordCulture(ContextTask):
 
 @dataclass(frozen=True)
 class RobotTask(ContextTask):
-    """A part of the study with one robot.
-
-    Attributes:
-        robot: its name.
-    """
+    """A part of the study with the robot of one name."""
 
     robot: str
 

@@ -155,9 +155,9 @@ def run_over_cultures(
     summary = over_cultures(list(comparisons.values()))
     compared = [(name, row) for name, rows in comparisons.items() for row in rows]
     scores = [(name, score) for name, each in results.items() for score in each.scores]
-    write_named_records(folder / COMPARISONS, "culture", ComparedReturns, compared)
+    write_named_records(folder / COMPARISONS, compared, ComparedReturns, "culture")
     write_records(folder / SUMMARY, OverCultures, summary)
-    write_named_records(folder / SCORES, "culture", Score, scores)
+    write_named_records(folder / SCORES, scores, Score, "culture")
     parquet = (folder / SCORES).with_suffix(".parquet")
     is_written = write_parquet(parquet, scores, Score, "culture")
     return RanCultures(folder, ran, failed, comparisons, summary, parquet if is_written else None)
@@ -253,11 +253,7 @@ class _OfOne:
 
 
 def over_cultures(found: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
-    """Each comparison over cultures.
-
-    Args:
-        found: the comparisons of each culture, the same ones in the same order.
-    """
+    """Each comparison over cultures, of which all have the same ones in the same order."""
     return tuple(_over(rows) for rows in zip(*found, strict=True))
 
 

@@ -112,12 +112,7 @@ class Control(StudyTask):
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What policies are run in: an environment, and the neurons of every minute.
-
-    Attributes:
-        timeline: None without neurons.
-        action_labels: of discrete actions.
-    """
+    """What policies are run in: an environment, the neurons of every minute (None without), labels of its actions."""
 
     environment: Environment[Any]
     timeline: SimulatorTimeline | None

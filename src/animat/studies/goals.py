@@ -12,11 +12,7 @@ from animat.studies.specification import Study
 
 
 def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
-    """Of each robot with a goal: what its policies and controls came to at each minute.
-
-    Args:
-        table: of episodes.
-    """
+    """Of each robot with a goal: what its policies and controls came to at each minute, by the table of episodes."""
     for spec in study.robots:
         robot = spec.robot()
         if not isinstance(robot, RobotWithGoal):

@@ -15,11 +15,7 @@ OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few epi
 
 
 def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[BesideHeuristic]:
-    """Each arm that is trained as usual, at each minute at which the rule was run too.
-
-    Args:
-        table: of episodes.
-    """
+    """Each arm that is trained as usual, at each minute at which the rule was run too, by the table of episodes."""
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     for arm in study.arms:
         if not is_usual(arm):

@@ -13,12 +13,7 @@ ITERATIONS_PER_S = 110_000
 
 
 def plan_study(study: Study, base: Path) -> list[Job]:
-    """All jobs of a study.
-
-    Args:
-        study: the specification.
-        base: what the names of its files are relative to.
-    """
+    """All jobs of a study, whose files are named as seen from `base`."""
     # Tasks bring JAX along; a finished folder is recognised without it only in part, but the command line stays light.
     from animat.studies.evaluating import Evaluate
     from animat.studies.pictures import CulturePictures, RobotPictures

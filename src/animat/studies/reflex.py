@@ -18,11 +18,7 @@ def beside_reflex(
 ) -> Iterator[BesideReflex]:
     """Each arm that is trained as usual, at the minute at which the best coupling was run too.
 
-    Where there is no optimal return of all conditions there is no context gap, and no row.
-
-    Args:
-        table: of episodes.
-        optima: of all robots.
+    The table is of episodes. Where there is no optimal return of all conditions there is no context gap, and no row.
     """
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     known = {

@@ -213,11 +213,7 @@ def write_typed(path: Path, value: Any) -> Path:
 
 
 def read_typed(path: Path, kind: type[T]) -> T:
-    """Read what `write_typed` wrote.
-
-    Raises:
-        InvalidFile: if it cannot be read, or is of another version.
-    """
+    """Read what `write_typed` wrote; raises InvalidFile if it cannot be read, or is of another version."""
     try:
         return read_record(kind, json.loads(path.read_text()))
     except (OSError, ValueError, InvalidArgument) as error:
@@ -232,11 +228,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what `write_arrays` wrote.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
+    """Read what `write_arrays` wrote; raises InvalidFile if it cannot be read."""
     try:
         with path.open("rb") as file, np.load(file) as arrays:
             return dict(arrays)
@@ -258,7 +250,7 @@ def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
 
 
-def write_named_records(path: Path, name: str, kind: type, named: Iterable[tuple[str, Any]]) -> Path:
+def write_named_records(path: Path, named: Iterable[tuple[str, Any]], kind: type, name: str) -> Path:
     """The same with a first column of this name, which comes with each record."""
     head = [name, *(field.name for field in fields(kind))]
     return write_table(path, head, ((first, *astuple(row)) for first, row in named))

@@ -137,11 +137,7 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
 
 
 def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
-    """How often each condition passes the median in every recording, in the data and in the simulator.
-
-    Args:
-        kept: what the simulator keeps of each recording, by its minute.
-    """
+    """How often each condition passes the median in every recording, in the data and in what the simulator kept."""
     kinds = rough_kinds(study)[:1]
     optima = {
         spec.name: {

@@ -121,11 +121,7 @@ def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
 
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
-    """Write the simulators as safetensors, with all that is no array as JSON in the metadata; the same bytes always.
-
-    Raises:
-        InvalidFile: if it cannot be written.
-    """
+    """Write the simulators as safetensors, with all that is no array as JSON in the metadata; the same bytes always."""
     from safetensors.numpy import save
 
     simulators = timeline.simulators
@@ -149,11 +145,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:
-    """Read what `save_timeline` wrote.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
+    """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
 

@@ -130,11 +130,7 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
 
 
 class References:
-    """Random policies and optimal returns on a robot, for every mapping and minute.
-
-    Args:
-        table: of the robot's episodes.
-    """
+    """Random policies and optimal returns on a robot, for every mapping and minute, by the table of its episodes."""
 
     def __init__(self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame) -> None:
         self._optima = {
@@ -153,10 +149,7 @@ class References:
         return self._of(self._random, arm, at_min)
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """The optimal return and how well it is known.
-
-        None for a control, which can do nothing, and where conditions with few responses were left out of it.
-        """
+        """None for a control, which can do nothing, and where conditions with few responses were left out of it."""
         if arm.delivery == "shuffled":
             return None
         return self._of(self._optima, arm, at_min)

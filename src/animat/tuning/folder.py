@@ -13,11 +13,6 @@ MANIFEST = "tune.json"
 
 
 def describe_tuning(tuning: Tuning, sources: dict[str, str]) -> dict[str, Any]:
-    """What decides how a tuning comes out, with a fingerprint over all of it.
-
-    Args:
-        tuning: the specification.
-        sources: SHA-256 of each file of recordings, by its place.
-    """
+    """What decides how a tuning comes out, as of a study (`describe_study`), with a fingerprint over all of it."""
     versions = {**describe_study(tuning.study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
     return with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})

@@ -50,11 +50,7 @@ def write_journal(folder: Path, told: Sequence[Told]) -> None:
 
 
 def read_journal(folder: Path) -> list[Told]:
-    """What is in the folder's journal; nothing where there is none.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
+    """What is in the folder's journal, nothing where there is none; raises InvalidFile if it cannot be read."""
     path = folder / JOURNAL
     if not path.exists():
         return []

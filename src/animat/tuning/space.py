@@ -186,11 +186,7 @@ def first_settings(study: Study, space: Space) -> list[Settings]:
 
 
 def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
-    """The study with settings in place of its own.
-
-    Raises:
-        InvalidArgument: for a value that a setting may not have.
-    """
+    """The study with settings in place of its own; raises InvalidArgument for a value that a setting may not have."""
     changed: dict[str, Any] = dict(settings)
     arm, simulators = study.arms[0], study.simulators
     arm = replace(arm, mapping=changed.pop("mapping", arm.mapping))

@@ -107,11 +107,7 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
 
 
 def read_tuning(path: str | os.PathLike[str]) -> Tuning:
-    """Read a study's file with a table `[tune]`.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
-    """
+    """Read a study's file with a table `[tune]`; errors as those of `animat.studies.toml.read_study`."""
     data = read_toml(path)
     tune = data.pop("tune", {})
     if not data:

@@ -47,11 +47,7 @@ _VIEWS: dict[Kind, Callable[[Path], View]] = {
 
 
 class Watched:
-    """A folder and the views of what is in it; asked by one thread at a time.
-
-    Args:
-        folder: that is watched; it may come to be later.
-    """
+    """A folder, which may come to be later, and the views of what is in it; asked by one thread at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

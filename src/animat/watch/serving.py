@@ -28,11 +28,7 @@ _LINGER_S = 60.0
 
 
 def expect_installed() -> None:
-    """Refuse where what the page needs is not installed.
-
-    Raises:
-        AnimatError: saying how to install it.
-    """
+    """Refuse where what the page needs is not installed (AnimatError, saying how to install it)."""
     if missing := [name for name in _NEEDS if find_spec(name) is None]:
         raise AnimatError(f"the page needs {' and '.join(missing)}: pip install 'animat[watch]'")
 

@@ -82,11 +82,7 @@ class SessionView(View):
         }
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """The seconds before a time.
-
-        Args:
-            to_s: on the session's clock; None: now, or its end.
-            span_s: how many.
+        """The seconds before a time on the session's clock; None: now, or its end.
 
         Raises:
             InvalidFile: if there is no session any more.

@@ -19,11 +19,7 @@ _LOOKS = 64
 
 
 class Sums:
-    """The totals of a log's records, as far as they were counted.
-
-    Args:
-        tail: the log.
-        pulses: of a trial.
+    """The totals of a log's records, with so many pulses a trial, as far as they were counted.
 
     Attributes:
         counted: of the log's records.

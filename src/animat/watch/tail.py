@@ -33,9 +33,6 @@ _LOOKS = 512
 class Tail:
     """A log that may grow.
 
-    Args:
-        path: of the log.
-
     Attributes:
         generation: another number once another file is in its place, or it became shorter.
         damage: what follows the last whole record, in words, where nothing more can be read; empty where all is well.
