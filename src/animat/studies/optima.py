@@ -12,7 +12,7 @@ from animat.evaluation.resampling import Counted, few_of
 from animat.progress import Part, Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
-from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
+from animat.studies.evaluating import as_recorded, setting_of, span_min
 from animat.studies.places import optima_file
 from animat.studies.results import StudyOptimum, read_typed, write_typed
 from animat.studies.simulating import read_series
@@ -82,7 +82,7 @@ class FindOptima(StudyTask):
         if no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
         study, timeline = as_recorded(self.study, folder)
-        first, last = first_minute(timeline), last_minute(timeline)
+        first, last = span_min(timeline)
         kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
         resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:

@@ -48,18 +48,28 @@ class Fit(StudyTask):
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        study, settings = self.study, self.study.simulators
-        series = read_series(study, folder)
-        timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
-        if len(timeline.conditions) < 2 and "one-condition" not in settings.allow:
+        study, series = self.study, read_series(self.study, folder)
+        timeline = fit_as(study, series)
+        if len(timeline.conditions) < 2 and "one-condition" not in study.simulators.allow:
             raise UnusableData(
-                "simulators.conditions: expected two or more for an agent to choose from, got one "
-                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                f"{one_condition(timeline)}; sort the stimuli by interval:5,10, electrode or pattern "
                 '(to allow it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)
         return [folder / TIMELINE, _write_responses(folder / RESPONSES, series)]
+
+
+def fit_as(study: Study, series: list[Responses]) -> SimulatorTimeline:
+    """The simulators that a study's settings make of responses."""
+    settings = study.simulators
+    return fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+
+
+def one_condition(timeline: SimulatorTimeline) -> str:
+    """The beginning of an error of simulators of one condition."""
+    only = timeline.conditions[0].label
+    return f"simulators.conditions: expected two or more for an agent to choose from, got one ({only})"
 
 
 def _write_responses(path: Path, series: list[Responses]) -> Path:

@@ -17,7 +17,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
-from animat.studies.evaluating import as_recorded, first_minute, last_minute
+from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import beside_heuristic
 from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
@@ -67,7 +67,7 @@ class Tabulate(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
-        first, last = first_minute(timeline), last_minute(timeline)
+        first, last = span_min(timeline)
         table = all_episodes(study, folder)
         known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
@@ -130,14 +130,19 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
 
 
 class References:
-    """Random policies and optimal returns on a robot, for every mapping and minute, by the table of its episodes."""
+    """Random policies and optimal returns on a robot, for every mapping and minute, by the table of its episodes.
 
-    def __init__(self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame) -> None:
+    Over time: of the few episodes at every recording, with the optimum on a rough grid.
+    """
+
+    def __init__(
+        self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame, *, over_time: bool = False
+    ) -> None:
         self._optima = {
             (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
-            for optimum in optima_of_all(folder, spec.name)
+            for optimum in optima_of_all(folder, spec.name, "over-time" if over_time else "optima")
         }
-        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & ~table["over_time"]]
+        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
             of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
