@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from animat.devices import gpu_here
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
-from animat.execution.trains import Work, train_alone
+from animat.execution.trains import train_alone
 from animat.progress import Progress
 from animat.records import Positive, Seed, Whole, as_json, record
 from animat.responses.responses import Responses
@@ -164,8 +163,7 @@ class TrainPolicies(RobotTask):
         from animat.coding.mapping import mapping_named
         from animat.neurons.timeline import fit_timeline
         from animat.robots.registry import robot_named
-        from animat.training.folder import describe, provenance_of
-        from animat.training.group import Group
+        from animat.studies.training import work_on
         from animat.training.specification import Training
 
         robot, timeline = robot_named(self.robot), fit_timeline(self.series(folder))
@@ -177,12 +175,9 @@ class TrainPolicies(RobotTask):
             seed=self.drawn("context"),
             shadowing=True,
         ).over(timeline)
-        manifest = describe(training, timeline, device=gpu_here())
-        out = self.beside(folder, POLICIES)
-        members = tuple(range(training.policies))
-        group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / f"culture-{self.culture}" / f"{self.robot}.npz"
-        return train_alone(Work(group, out, checkpoint, description=manifest), progress)
+        members = tuple(range(training.policies))
+        return train_alone(work_on(training, members, timeline, self.beside(folder, POLICIES), checkpoint), progress)
 
 
 @final

@@ -116,34 +116,16 @@ def train_command(study: Study) -> str:
     spec, arm, simulators = study.robots[0], study.arms[0], study.simulators
     words = ["animat", "train", spec.kind or spec.name, "--mapping", arm.mapping]
     if arm.through_neurons:
-        words += [
-            "--recordings",
-            RECORDINGS,
-            "--simulator",
-            simulators.kind,
-            "--duration-min",
-            f"{study.training_min:g}",
-        ]
-        if simulators.kind == "histogram" and simulators.bins != Simulators().bins:
-            words += ["--bins", str(simulators.bins)]
-        if simulators.range_hz is not None:
-            words += ["--range-hz", f"{simulators.range_hz:g}"]
-        if simulators.conditions:
-            words += ["--conditions", simulators.conditions]
-        if simulators.readouts != Simulators().readouts:
-            words += ["--readouts", simulators.readouts]
-        if simulators.window_ms != Simulators().window_ms:
-            words += ["--window-ms", *(f"{ms:g}" for ms in simulators.window_ms)]
-        if simulators.burst_threshold is not None:
-            words += ["--burst-threshold", f"{simulators.burst_threshold:g}"]
-        if simulators.allow:
-            words += ["--allow", *simulators.allow]
+        words += ["--recordings", RECORDINGS, "--simulator", simulators.kind]
+        words += ["--duration-min", f"{study.training_min:g}"]
+        if simulators.kind == "histogram":
+            words += _unusual(simulators, Simulators(), "bins")
+        words += _unusual(simulators, Simulators(), "range_hz", "conditions", "readouts", "window_ms")
+        words += _unusual(simulators, Simulators(), "burst_threshold", "allow")
     words += ["--policies", str(study.policies), "--iterations", str(spec.trained_for)]
     words += ["--seed", str(study.seed)] * (study.seed != 1)
-    usual = Arm("usual")
     words += ["--shadowing", "off"] * (not arm.shadowing)
-    words += ["--percentiles", arm.percentiles] * (arm.percentiles != usual.percentiles)
-    words += ["--delivery", arm.delivery] * (arm.delivery != usual.delivery)
+    words += _unusual(arm, Arm("usual"), "percentiles", "delivery")
     if spec.parameters:
         words += ["--parameters", *(f"{name}={value!r}" for name, value in spec.parameters.items())]
     defaults = asdict(SAC())
@@ -151,6 +133,16 @@ def train_command(study: Study) -> str:
     if given:
         words += ["--sac", *(f"{name}={value!r}" for name, value in given.items())]
     return shlex.join(words)
+
+
+def _unusual(given: Any, usual: Any, *names: str) -> list[str]:
+    """The options of settings that are not the usual ones."""
+    words = []
+    for name in names:
+        if (value := getattr(given, name)) != getattr(usual, name):
+            values = value if isinstance(value, tuple) else (value,)
+            words += [f"--{name.replace('_', '-')}", *(f"{x:g}" if isinstance(x, float) else str(x) for x in values)]
+    return words
 
 
 def settings_in_words(settings: Mapping[str, Any]) -> str:
