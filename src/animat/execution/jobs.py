@@ -136,7 +136,8 @@ class Jobs:
                 if time.monotonic() - told_s > _LOOK_EVERY_S:
                     report()
                 # Those that succeeded first: their receipts are kept, whatever the others raise.
-                for future in sorted(wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done, key=_has_failed):
+                ended = wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done
+                for future in sorted(ended, key=lambda each: each.cancelled() or each.exception() is not None):
                     ended_s += running[future].cost_s
                     try:
                         done = _done(future, running[future])
@@ -217,10 +218,6 @@ def _running_on(
         # The folder is let go of only when nobody writes to it any more.
         wait([future for future in running if not future.cancel()])
         raise
-
-
-def _has_failed(future: Future[Done]) -> bool:
-    return future.cancelled() or future.exception() is not None
 
 
 def _done(future: Future[Done], job: Job) -> Done:

@@ -41,11 +41,6 @@ def draw_psth(
         axes.set_ylim(0, highest_hz)
     else:
         axes.set_ylim(0, None)
-    style_axes(
-        axes,
-        title,
-        "time from stimulus (ms)",
-        "firing rate (Hz per channel)",
-    )
+    style_axes(axes, title, "time from stimulus (ms)", "firing rate (Hz per channel)")
     add_legend(axes, loc="upper right")
     return figure

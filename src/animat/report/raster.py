@@ -6,7 +6,18 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, RED, WINDOW, Axes, Figure, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import (
+    BLACK,
+    RED,
+    WINDOW,
+    Axes,
+    Figure,
+    add_legend,
+    condition_colours,
+    evenly,
+    new_figure,
+    style_axes,
+)
 from animat.responses.responses import Responses
 from animat.responses.windows import spikes_in
 
@@ -41,12 +52,7 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
         from_s, to_s = shown[0] - margin_s, shown[-1] + max(margin_s, 0.02)
     _, spike = spikes_in(recording, np.array([from_s]), np.array([to_s]))
     axes.scatter(
-        recording.spike_times_s[spike],
-        recording.spike_channels[spike],
-        s=4,
-        color=BLACK,
-        linewidths=0,
-        rasterized=True,
+        recording.spike_times_s[spike], recording.spike_channels[spike], s=4, color=BLACK, linewidths=0, rasterized=True
     )
     # Whatever else falls into it.
     inside = times_s[(times_s >= from_s) & (times_s <= to_s)]
@@ -64,7 +70,7 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     """Stimuli as rows, sorted by condition and then in time; evenly thinned where there are too many to see."""
     start_ms, end_ms = responses.window_ms
     times_s = np.empty(0) if responses.time_s is None else responses.time_s
-    chosen = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _MOST_STIMULI)).round().astype(np.int64))
+    chosen = evenly(len(times_s), _MOST_STIMULI)
     chosen = chosen[np.argsort(responses.condition[chosen], kind="stable")]
     row, spike = spikes_in(recording, times_s[chosen] + from_ms * 1e-3, times_s[chosen] + to_ms * 1e-3)
     lag_ms = 1e3 * (recording.spike_times_s[spike] - times_s[chosen[row]])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import MEDIAN, Figure, condition_colours, new_figure, style_axes
+from animat.report.style import MEDIAN, Figure, condition_colours, evenly, new_figure, style_axes
 from animat.responses.responses import Responses
 
 _BINS = 24
@@ -21,8 +21,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so. All recordings, in the
     order of time, have the same conditions.
     """
-    rows = np.unique(np.linspace(0, len(series) - 1, min(len(series), _MOST_ROWS)).round().astype(int))
-    shown = [series[row] for row in rows]
+    shown = [series[row] for row in evenly(len(series), _MOST_ROWS)]
     conditions = shown[0].conditions[:_MOST_CONDITIONS]
     rates = [[responses.rates_of(i) for responses in shown] for i in range(len(conditions))]
     edges_hz = rate_edges(shown[0], np.concatenate([x for of in rates for x in of]), _BINS)

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import Int64
+
 from animat.errors import InvalidArgument
 from animat.writing import atomic_write
 
@@ -77,6 +80,11 @@ def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -
         figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
 
 
+def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
+    """Of n things in a row at most so many, evenly spread, by their numbers."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
+
+
 def condition_colours(units: Sequence[str]) -> list[str]:
     """A colour for each condition: rising along cividis for frequencies, which are ordered; Okabe-Ito for others."""
     from matplotlib import colormaps
@@ -109,14 +117,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def grid_of_panels(
-    n: int,
-    columns: int,
-    width_in: float,
-    height_in: float,
-    title: str,
-    *,
-    share_x: bool = False,
-    share_y: bool = False,
+    n: int, columns: int, width_in: float, height_in: float, title: str, *, share_x: bool = False, share_y: bool = False
 ) -> tuple[Figure, list[Axes]]:
     """A figure of n panels in rows, each of a size in inches, and its panels; places left over stay empty."""
     columns = min(columns, max(n, 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, final
@@ -156,19 +155,19 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
 
 def load_timeline(path: Path) -> SimulatorTimeline:
     """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
+    from safetensors import SafetensorError, safe_open
 
     try:
-        data = path.read_bytes()
-        told: dict[str, Any] = json.loads(_metadata(data)["animat"])
+        with safe_open(path, framework="numpy") as file:
+            told: dict[str, Any] = json.loads(file.metadata()["animat"])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dictionary
         conditions = tuple(Condition(**each) for each in told["conditions"])
         labels = tuple(condition.label for condition in conditions)
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         readouts = Readouts.from_dict(told.get("readouts"))
         return SimulatorTimeline(
-            simulators=_simulators(told["kind"], load(data)),
+            simulators=_simulators(told["kind"], arrays),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),
@@ -178,7 +177,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             fitted=told["fitted"],
             readouts=readouts,
         )
-    except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
         raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error
 
 
@@ -192,9 +191,3 @@ def _simulators(kind: str, arrays: dict[str, np.ndarray]) -> NeuronSimulator:
         arrays["kept"] = np.ones(before.shape[:2], np.float32)
         arrays["added"] = arrays["load_s"] = np.zeros_like(decay)
     return _KINDS[kind](**{name: jnp.asarray(array) for name, array in arrays.items()})
-
-
-def _metadata(data: bytes) -> dict[str, str]:
-    (length,) = struct.unpack("<Q", data[:8])
-    metadata: dict[str, str] = json.loads(data[8 : 8 + length])["__metadata__"]
-    return metadata

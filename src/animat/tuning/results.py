@@ -11,9 +11,8 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from animat.report.importance import draw_importance
 from animat.report.style import save_figure
-from animat.report.tuning_history import draw_history
+from animat.report.tuning import draw_history, draw_importance
 from animat.studies.places import RECORDINGS
 from animat.studies.specification import Arm, Simulators, Study
 from animat.studies.toml import study_to_toml

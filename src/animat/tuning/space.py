@@ -13,15 +13,7 @@ from animat.records import Flag, Number, read_record, record
 from animat.studies.specification import Study
 from animat.training.settings import SAC
 
-NUMBERS = (
-    "learning_rate",
-    "discount",
-    "tau",
-    "reward_scale",
-    "initial_alpha",
-    "target_entropy_ratio",
-    "entropy_nats",
-)
+NUMBERS = ("learning_rate", "discount", "tau", "reward_scale", "initial_alpha", "target_entropy_ratio", "entropy_nats")
 """Settings of the algorithm that a compiled program takes as numbers: trials that differ in nothing else share one."""
 _OF_SIMULATORS = {"simulator": "kind", "conditions": "conditions", "readouts": "readouts"}
 """Settings of a study's simulators, and their fields there."""

@@ -111,7 +111,8 @@ def app_for(folder: Path, token: str, port: int) -> App:
     from starlette.routing import Route
 
     watched = Watched(folder)
-    pages = {address: (_file(name), kind) for address, (name, kind) in _FILES.items()}
+    own = importlib.resources.files("animat.watch") / "page"
+    pages = {address: ((own / name).read_bytes(), kind) for address, (name, kind) in _FILES.items()}
 
     async def file(request: Request) -> Response:
         content, kind = pages[request.url.path.removeprefix("/")]
@@ -165,10 +166,6 @@ def _answered(answer: Callable[[Any], Any], asked: Any) -> tuple[int, str, bytes
     except Exception as error:
         # Anything may be in a file.
         return 500, "application/json", _told(f"cannot be shown: {first_line(error)}")
-
-
-def _file(name: str) -> bytes:
-    return (importlib.resources.files("animat.watch") / "page" / name).read_bytes()
 
 
 def _told(message: str) -> bytes:

@@ -87,14 +87,10 @@ class _Noted:
 
 
 def _end_after(process: int, app: _Noted, server: Any) -> None:
-    while _runs(process) or time.monotonic() - app.asked_s < _LINGER_S:
+    # Whoever loses the process that started it gets another parent.
+    while os.getppid() == process or time.monotonic() - app.asked_s < _LINGER_S:
         time.sleep(1.0)
     server.should_exit = True
-
-
-def _runs(process: int) -> bool:
-    """Whether the process that started this one is still there: whoever loses it gets another parent."""
-    return os.getppid() == process
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from animat.watch.held import is_held
 from animat.watch.picture import is_drawn
 from animat.watch.plain import listed, mapped, number, numbers, text, whole
 from animat.watch.spikes import packed
-from animat.watch.sums import Sums
+from animat.watch.sums import Sums, first_readout
 from animat.watch.tail import Tail
 from animat.watch.view import View
 
@@ -69,7 +69,7 @@ class SessionView(View):
             "thresholds": _thresholds(loop.get("mapping")),
             "adaptive": bool(loop.get("adaptive")),
             "burst_threshold": number(loop.get("burst_threshold")),
-            "percentiles_hz": _first_readout(loop.get("percentiles")),
+            "percentiles_hz": first_readout(listed(loop.get("percentiles"))),
             "planned": len(listed(words.get("turns"))),
             "limits": {text(name): number(value) for name, value in mapped(words.get("limits")).items()},
             "account": {text(name): number(value) for name, value in mapped(words.get("account")).items()},
@@ -289,11 +289,6 @@ def _span(words: dict[str, Any]) -> tuple[float, float] | None:
     if words.get("kind") != "seen" or start is None or duration is None or number(start + duration) is None:
         return None
     return start, start + duration
-
-
-def _first_readout(percentiles: Any) -> list[float | None]:
-    of = listed(percentiles)
-    return numbers(of[0] if of and isinstance(of[0], list) else of)
 
 
 def _thresholds(mapping: Any) -> list[int]:
