@@ -8,7 +8,7 @@ from typing import Any
 
 from animat.execution.task import report, reported
 from animat.neurons.simulator import NeuronSimulator
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 _FINISH = "finish"
 
@@ -22,8 +22,7 @@ class Exchange:
 
     def publish(self, number: int, start_min: float, simulator: NeuronSimulator) -> None:
         """Put up a simulator, its arrays on the host; the one with the largest number is in force."""
-        with atomic_write(self.folder / f"{number:06}.simulator") as beside:
-            beside.write_bytes(pickle.dumps((number, start_min, simulator)))
+        write_whole(self.folder / f"{number:06}.simulator", pickle.dumps((number, start_min, simulator)))
 
     def newest(self, known: int) -> tuple[int, float, NeuronSimulator] | None:
         """Number, minute and simulator of the newest, if its number is larger than the one that is known."""

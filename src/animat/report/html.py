@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from animat.errors import InvalidFile
 from animat.report.minus import MINUS, with_minus
 from animat.report.style import PNG_DPI
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 TEMPLATE = "report.html.j2"
 
@@ -126,10 +126,7 @@ def write_page(
     environment.filters["cell"] = cell
     environment.filters["prose"] = with_minus
     text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
-    path = Path(path)
-    with atomic_write(path) as beside:
-        beside.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(Path(path), text)
 
 
 def _bytes(file: Path) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import shutil
 from concurrent.futures import Executor
@@ -15,6 +16,7 @@ from animat.errors import InvalidFile
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
+from animat.records import write_json
 from animat.robots.registry import robot_named
 from animat.studies.context_tasks import (
     MEASURED,
@@ -24,8 +26,6 @@ from animat.studies.context_tasks import (
     Measure,
     RecordCulture,
     TrainPolicies,
-    read_json,
-    write_json,
 )
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
@@ -198,8 +198,8 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
 
 
 def _row(folder: Path, culture: int, robot: str) -> ContextRow:
-    told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)
-    in_turn = read_json(folder / f"culture-{culture}" / robot / MEASURED)["rows"]
+    told = _read(folder, culture, robot, SIMULATED)
+    in_turn = _read(folder, culture, robot, MEASURED)["rows"]
     simulated = {row["name"]: row["mean_return"] for row in told["rows"]}
     measured = {row["name"]: row["measured"] for row in in_turn}
     context = told["context"] or {}
@@ -231,8 +231,12 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
 
 
 def _lost(folder: Path, culture: int, robot: str) -> list[LostRow]:
-    told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)["whose_work"]["rows"]
+    told = _read(folder, culture, robot, SIMULATED)["whose_work"]["rows"]
     return [
         LostRow(culture, robot, row["name"], row["mean_return"], *(row["lost"][of] for of in ("value", "low", "high")))
         for row in told[1:]
     ]
+
+
+def _read(folder: Path, culture: int, robot: str, name: str) -> Any:
+    return json.loads((folder / f"culture-{culture}" / robot / name).read_text())

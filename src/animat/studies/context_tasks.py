@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import train_alone
 from animat.progress import Progress
-from animat.records import Positive, Seed, Whole, as_json, record
+from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.responses import Responses
 from animat.studies.draws import draw_seed
-from animat.writing import atomic_write
 
 if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol
@@ -247,15 +245,3 @@ def presented_for(n_commands: int) -> Protocol:
     from animat.stimulation import protocol
 
     return protocol.CLOSED_LOOP if n_commands == 1 else protocol.TWO_COMMANDS
-
-
-def write_json(path: Path, words: Any) -> Path:
-    """Plain data as a file, whole or absent."""
-    with atomic_write(path) as beside:
-        beside.write_text(json.dumps(as_json(words), indent=1, sort_keys=True) + "\n")
-    return path
-
-
-def read_json(path: Path) -> Any:
-    """What `write_json` wrote."""
-    return json.loads(path.read_text())

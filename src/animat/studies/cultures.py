@@ -28,7 +28,7 @@ from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND, TOO_FEW
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 RESAMPLES = 10_000
 MOST_AT_ONCE = 64
@@ -139,8 +139,7 @@ def run_over_cultures(
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
-    with atomic_write(folder / MANIFEST) as unfinished:
-        unfinished.write_text(json.dumps({"cultures": list(studies)}, indent=1) + "\n")
+    write_whole(folder / MANIFEST, json.dumps({"cultures": list(studies)}, indent=1) + "\n")
     with _room(workers, executor) as (room, at_once):
         here = workers if room is None else None
         runs = {

@@ -20,7 +20,7 @@ from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
 from animat.training.settings import LEARNER
-from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished
+from animat.writing import LOCK, clear_away, exclusive_lock, is_unfinished, write_whole
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
@@ -137,8 +137,7 @@ def held(
     with exclusive_lock(folder):
         if not _is_ours(folder, what, manifest, [*files]):
             for name, words in files.items():
-                with atomic_write(folder / name) as unfinished:
-                    unfinished.write_text(words)
+                write_whole(folder / name, words)
         for leftover in [*folder.iterdir(), *(path for name in own_folders for path in (folder / name).rglob("*"))]:
             if is_unfinished(leftover):
                 clear_away(leftover)

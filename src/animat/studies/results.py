@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.optimum import bracket_findings
 from animat.recordings.findings import Finding
 from animat.records import read_record
-from animat.writing import atomic_write
+from animat.writing import atomic_write, write_whole
 
 T = TypeVar("T")
 
@@ -206,10 +206,8 @@ class Results:
 
 def write_typed(path: Path, value: Any) -> Path:
     """Write records, complete or absent: `read_typed` reads them."""
-    with atomic_write(path) as beside:
-        plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
-        beside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    return path
+    plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
+    return write_whole(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
 
 def read_typed(path: Path, kind: type[T]) -> T:

@@ -30,7 +30,7 @@ from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
 from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 _FORMER = {"reach": "neighbour_exponent"}
 """What files of before call arrays of simulators."""
@@ -149,8 +149,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "fitted": timeline.fitted,
         **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
-    with atomic_write(path) as beside:
-        beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
+    write_whole(path, save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:

@@ -20,7 +20,7 @@ from animat.training.settings import SAC
 from animat.tuning.journal import Told
 from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
 from animat.tuning.specification import Tuning
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 BEST, RESULTS, HISTORY, IMPORTANCE = "best.toml", "results.json", "history.png", "importance.png"
 
@@ -94,10 +94,8 @@ def write_results(
     study = with_settings(tuning.study, best.settings)
     if study.culture.kind == "files":
         study = replace(study, culture=replace(study.culture, files=(RECORDINGS,)))
-    with atomic_write(folder / BEST) as beside:
-        beside.write_text(f"# {train_command(study)}\n# animat study {BEST}\n{study_to_toml(study)}")
-    with atomic_write(folder / RESULTS) as beside:
-        beside.write_text(json.dumps(tuned.to_dict(), indent=1) + "\n")
+    write_whole(folder / BEST, f"# {train_command(study)}\n# animat study {BEST}\n{study_to_toml(study)}")
+    write_whole(folder / RESULTS, json.dumps(tuned.to_dict(), indent=1) + "\n")
     robot, own = tuning.study.robots[0].name, finals[0]
     rungs = [(each.trial, each.chunks, each.means) for each in told]
     chosen = (best.trial, best.mean, best.standard_error)

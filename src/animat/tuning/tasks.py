@@ -25,7 +25,7 @@ from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
 from animat.tuning.side_by_side import SideBySide
 from animat.tuning.space import NUMBERS, Settings, with_settings
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 
 def timeline_file(study: Study) -> Path:
@@ -134,9 +134,8 @@ class TrainTrials(StudyTask):
                 returns = ran.returns.mean(axis=1).tolist()
                 if not np.isfinite(returns).all():
                     returns = None
-            files.append(returns_file(place, trial, last, self.members[0]))
-            with atomic_write(files[-1]) as beside:
-                beside.write_text(json.dumps(returns) + "\n")
+            file = returns_file(place, trial, last, self.members[0])
+            files.append(write_whole(file, json.dumps(returns) + "\n"))
             if self.goes_on:
                 files.append(kept_file(place, trial, last, self.members[0]))
                 together.keep(files[-1], last, i)
