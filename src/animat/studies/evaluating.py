@@ -83,7 +83,7 @@ class Control(StudyTask):
         arm, robot = replace(self.plain, delivery="chosen"), self.spec.name
         setting = setting_of(study, self.spec, arm, timeline)
         name = f"controls-{arm.thresholds}"
-        through = named_mapping(arm.mapping, arm.percentiles)
+        through = named_mapping(*arm.kind)
         networks = _networks(study, folder, self.spec, self.plain) if is_usual(self.plain) else None
         parts = []
         first, last = span_min(timeline)

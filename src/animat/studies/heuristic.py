@@ -17,10 +17,8 @@ OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few epi
 def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[BesideHeuristic]:
     """Each arm that is trained as usual, at each minute at which the rule was run too, by the table of episodes."""
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
-    for arm in study.arms:
-        if not is_usual(arm):
-            continue
-        through = named_mapping(arm.mapping, arm.percentiles)
+    for arm in filter(is_usual, study.arms):
+        through = named_mapping(*arm.kind)
         heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
         policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")["return"]
         rule = {at_min: returns.to_numpy() for at_min, returns in heuristic}

@@ -27,11 +27,8 @@ COARSER = 0.8
 
 def kinds_of(study: Study) -> list[Arm]:
     """One arm for each mapping and way to hold percentiles, delivered as chosen: each has its own optimum."""
-    kinds: dict[tuple[str, str], Arm] = {}
-    for arm in study.arms:
-        optimum = Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles)
-        kinds.setdefault((arm.mapping, arm.percentiles), optimum)
-    return list(kinds.values())
+    alike = [Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles) for arm in study.arms]
+    return list(dict.fromkeys(alike))
 
 
 def rough_kinds(study: Study) -> list[Arm]:
@@ -136,8 +133,7 @@ def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]
     return [
         (kind, at)
         for kind in rough_kinds(study)
-        for arm in study.arms
-        if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles)
+        for arm in study.arms_of(kind)
         for at in study.minutes_of(arm, first, last)
     ]
 

@@ -209,17 +209,16 @@ def _courses(
     panels = []
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
         courses = []
-        for arm in study.arms:
-            if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles):
-                of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
-                returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
-                courses.append(Course(arm.name, np.array(every_min), returns))
+        for arm in study.arms_of(kind):
+            of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
+            returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
+            courses.append(Course(arm.name, np.array(every_min), returns))
         roughly = [rough.optimum(kind, at_min) for at_min in every_min]
         levels = [None if each is None else each.best_return for each in roughly]
         optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
-                named_mapping(kind.mapping, kind.percentiles),
+                named_mapping(*kind.kind),
                 tuple(courses),
                 np.array([rough.random(kind, at_min) for at_min in every_min]),
                 None if levels[0] is None else np.array(levels, np.float64),

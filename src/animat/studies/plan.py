@@ -77,5 +77,4 @@ def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job
 
 def plain_arm(study: Study, kind: Arm) -> Arm:
     """Of the arms with a mapping, the one trained most plainly: its policies stand for the mapping."""
-    same = [c for c in study.arms if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
-    return max(same, key=lambda c: (c.trained, c.delivery == "chosen", c.shadowing is True))
+    return max(study.arms_of(kind), key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))

@@ -26,12 +26,10 @@ def beside_reflex(
         for each in optima
         if each.robot == spec.name and each.left_out is None and each.best_return is not None
     }
-    for arm in study.arms:
-        if not is_usual(arm):
-            continue
-        of = at[at["arm"] == named_mapping(arm.mapping, arm.percentiles)]
+    for arm in filter(is_usual, study.arms):
+        of = at[at["arm"] == named_mapping(*arm.kind)]
         for at_min, coupled in of[of["agent"] == COUPLING].groupby("at_min")["return"]:
-            best = known.get((arm.mapping, arm.percentiles, at_min))
+            best = known.get((*arm.kind, at_min))
             policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY) & (at["at_min"] == at_min)]
             if best is None or not len(policies):
                 continue

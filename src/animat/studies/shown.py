@@ -143,7 +143,7 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
         spec.name: {
             optimum.at_min: optimum.best_return
             for optimum in optima_of_all(folder, spec.name, "over-time")
-            if (optimum.mapping, optimum.percentiles) == (kinds[0].mapping, kinds[0].percentiles)
+            if (optimum.mapping, optimum.percentiles) == kinds[0].kind
         }
         for spec in study.robots
         if kinds
@@ -167,7 +167,7 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
         "have is not what the culture would give."
     )
     if kinds:
-        mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)
+        mapping = named_mapping(*kinds[0].kind)
         note += f" Optimum: the optimal return with {mapping} on a rough grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."

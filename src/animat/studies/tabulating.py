@@ -145,9 +145,9 @@ class References:
         random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
+            of_kind = random[random["arm"] == named_mapping(*kind.kind)]
             for at_min, returns in of_kind.groupby("at_min")["return"]:
-                self._random[kind.mapping, kind.percentiles, at_min] = float(returns.to_numpy().mean())
+                self._random[*kind.kind, at_min] = float(returns.to_numpy().mean())
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
@@ -173,7 +173,7 @@ class References:
     @staticmethod
     def _of(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
         if arm.through_neurons:
-            return known.get((arm.mapping, arm.percentiles, at_min))
+            return known.get((*arm.kind, at_min))
         # Without neurons every minute is the same.
         return next((value for (mapping, _, _), value in known.items() if mapping == arm.mapping), None)
 
@@ -300,15 +300,14 @@ def _comparisons(
 
 def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        through = named_mapping(kind.mapping, kind.percentiles)
+        through = named_mapping(*kind.kind)
         of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
         for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
-            for arm in study.arms:
-                if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles):
-                    means = performances(table, spec.name, arm, at_min)
-                    if arm.trained and len(means):
-                        rows.append((f"{TRAINED}{arm.name}", len(means), means))
+            for arm in study.arms_of(kind):
+                means = performances(table, spec.name, arm, at_min)
+                if arm.trained and len(means):
+                    rows.append((f"{TRAINED}{arm.name}", len(means), means))
             for agent, of_agent in of_minute.groupby("agent", sort=False):
                 means = mean_returns(of_agent)
                 # Over actors, as each is one sample; a control of one actor has its episodes for samples.
