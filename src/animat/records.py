@@ -75,10 +75,7 @@ def record(kind: type[T]) -> type[T]:
 def read_record(kind: type[T], data: Any, where: str = "") -> T:
     """A record, or any other type, from plain data as a file holds them; what is left out has its default.
 
-    Args:
-        kind: its type.
-        data: dictionaries, lists, texts and numbers.
-        where: what a message calls the whole.
+    `where` is what a message calls the whole.
 
     Raises:
         InvalidArgument: naming the key, what was expected and what came.

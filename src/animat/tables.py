@@ -33,11 +33,7 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
 
 
 def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse times that are not finite, or not within a century.
-
-    Raises:
-        UnusableData: by the name of the column.
-    """
+    """Refuse times that are not finite, or not within a century (UnusableData, by the name of the column)."""
     bad = np.count_nonzero(~np.isfinite(times_s))
     if bad:
         raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
@@ -49,11 +45,7 @@ def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
 
 
 def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse also times that fall.
-
-    Raises:
-        UnusableData: by the name of the column.
-    """
+    """Refuse also times that fall."""
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")

@@ -100,12 +100,9 @@ class LostRow:
 
 @dataclass(frozen=True)
 class RanContext:
-    """What a run of the study came to.
+    """What a run of the study came to: rows of each culture and robot, and what was lost by each intervention.
 
     Attributes:
-        folder: of the study.
-        rows: of each culture and robot.
-        lost: of each culture, robot and intervention.
         done_now: processor seconds of each job that this run did.
     """
 

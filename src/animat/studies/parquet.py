@@ -16,9 +16,6 @@ def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name
     """Write records, as `write_named_records` takes them, complete or absent; numbers that may be None are NaN there.
 
     Returns whether it was written: not where fastparquet is missing.
-
-    Raises:
-        InvalidFile: if it cannot be written.
     """
     try:
         import fastparquet

@@ -25,13 +25,10 @@ from animat.studies.specification import RobotSpec, Study
 
 @dataclass(frozen=True)
 class Ran:
-    """What a run of a study did.
+    """What a run of a study did: where, of how many jobs.
 
     Attributes:
-        folder: the study's.
-        report: its page.
-        jobs: how many there are.
-        done_now: those that this run did, with the processor seconds that each took; none if the folder was finished.
+        done_now: jobs that this run did, with the processor seconds that each took; none if the folder was finished.
     """
 
     folder: Path

@@ -60,12 +60,9 @@ class Tune:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Everything that decides how a tuning comes out, but for recordings in files.
+    """Everything that decides how a tuning comes out, but for recordings in files: how is searched, and what.
 
-    Attributes:
-        study: of one robot and one arm, with the settings that the search begins with.
-        tune: how is searched.
-        space: what is searched.
+    The study is of one robot and one arm, with the settings that the search begins with.
     """
 
     study: Study
