@@ -8,24 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    OPTIMUM,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    Figure,
-    add_common_legend,
-    grid_of_panels,
-    style_axes,
-)
+from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes
 
-_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
-
-MOST = len(_COLOURS)
+MOST = len(PALETTE)
 """Arms that a panel has colours for."""
 
 
@@ -79,7 +64,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
     names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses))
     for axes, of in zip(panels, panels_of, strict=True):
         for course in of.courses:
-            colour = _COLOURS[names.index(course.name) % MOST]
+            colour = PALETTE[names.index(course.name) % MOST]
             low, middle, high = course.quartiles
             axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)

@@ -34,6 +34,8 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (
     "#D55E00",
     "#CC79A7",
 )
+PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
+"""In the order in which they are taken."""
 GREY = "#8C8C8C"
 WINDOW = ORANGE
 NON_BURST = BLUE
@@ -94,7 +96,7 @@ def condition_colours(units: Sequence[str]) -> list[str]:
     if n > 1 and (n > 6 or all(unit == "Hz" for unit in units)):
         # The last tenth of cividis is too pale on white.
         return [to_hex(colormaps["cividis"](0.88 * i / (n - 1))) for i in range(n)]
-    return [BLUE, ORANGE, GREEN, PURPLE, SKY, RED][:n]
+    return list(PALETTE[:n])
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
