@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import Any, TypeVar, final, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,11 +25,8 @@ from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
 from animat.studies.reflex import beside_reflex
 from animat.studies.results import (
-    BesideHeuristic,
-    BesideReflex,
     ComparedReturns,
     ControlReturns,
-    ObjectiveMet,
     Results,
     Score,
     StudyOptimum,
@@ -82,17 +79,11 @@ class Tabulate(StudyTask):
             reflexes=tuple(row for spec in study.robots for row in beside_reflex(study, table, spec, optima)),
         )
         files = [write_typed(results_file(folder), results)]
-        for name, kind in (
-            ("scores", Score),
-            ("comparisons", ComparedReturns),
-            ("controls", ControlReturns),
-            ("heuristic", BesideHeuristic),
-            ("reflexes", BesideReflex),
-            ("optima", StudyOptimum),
-        ):
-            files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
-        if results.goals:
-            files.append(write_records(table_file(folder, "goals"), ObjectiveMet, results.goals))
+        for name, kinds in get_type_hints(Results).items():
+            rows = getattr(results, name)
+            # Findings have columns of their own, and most studies have no goals.
+            if name != "findings" and (rows or name != "goals"):
+                files.append(write_records(table_file(folder, name), get_args(kinds)[0], rows))
         told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
         files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
