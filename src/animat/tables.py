@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
 
@@ -30,6 +30,11 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
         length = len(array)
         array.setflags(write=False)
         object.__setattr__(table, attribute, array)
+
+
+def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
+    """Of n things in a row at most so many, evenly spread, by their numbers."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:

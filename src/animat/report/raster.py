@@ -6,20 +6,10 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Recording
-from animat.report.style import (
-    BLACK,
-    RED,
-    WINDOW,
-    Axes,
-    Figure,
-    add_legend,
-    condition_colours,
-    evenly,
-    new_figure,
-    style_axes,
-)
+from animat.report.style import BLACK, RED, WINDOW, Axes, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 from animat.responses.windows import spikes_in
+from animat.tables import evenly
 
 _MOST_STIMULI = 300
 _MOST_LABELS = 12

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import MEDIAN, Figure, condition_colours, evenly, new_figure, style_axes
+from animat.report.style import MEDIAN, Figure, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
+from animat.tables import evenly
 
 _BINS = 24
 _MOST_ROWS = 20

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, WINDOW, Figure, add_legend, evenly, new_figure, style_axes
+from animat.report.style import BLACK, WINDOW, Figure, add_legend, new_figure, style_axes
 from animat.responses.network_bursts import NetworkBursts
+from animat.tables import evenly
 
 _MOST_SPIKES = 200_000
 _MOST_BINS = 2_000

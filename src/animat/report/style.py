@@ -7,9 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from jaxtyping import Int64
-
 from animat.errors import InvalidArgument
 from animat.writing import atomic_write
 
@@ -80,11 +77,6 @@ def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -
     if entries:
         place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
         figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
-
-
-def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
-    """Of n things in a row at most so many, evenly spread, by their numbers."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def condition_colours(units: Sequence[str]) -> list[str]:

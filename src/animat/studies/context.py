@@ -18,15 +18,7 @@ from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.records import write_json
 from animat.robots.registry import robot_named
-from animat.studies.context_tasks import (
-    MEASURED,
-    SIMULATED,
-    ContextStudy,
-    Judge,
-    Measure,
-    RecordCulture,
-    TrainPolicies,
-)
+from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
 from animat.training.settings import LEARNER
