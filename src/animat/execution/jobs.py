@@ -14,7 +14,7 @@ from pathlib import Path
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import WithGpu
-from animat.execution.pinned import PinnedProcesses, one_a_core
+from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
 from animat.progress import Progress
@@ -209,7 +209,7 @@ def _running_on(
 ) -> Iterator[Executor | WithGpu]:
     """The executor that was lent, or processes of ours; if the block fails, nothing goes on after it."""
     if executor is None:
-        with one_a_core(workers) as ours, PinnedProcesses([None]) as beside:
+        with PinnedProcesses(own_cores(workers)) as ours, PinnedProcesses([None]) as beside:
             yield WithGpu(ours, beside) if has_gpu else ours
         return
     try:

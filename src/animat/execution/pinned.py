@@ -87,9 +87,9 @@ class PinnedProcesses(ThreadPoolExecutor):
         return value
 
 
-def one_a_core(workers: int | None) -> PinnedProcesses:
-    """So many processes, each on one of the cores that this one may use; None: one on each."""
-    return PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers])
+def own_cores(most: int | None = None) -> list[int]:
+    """The cores that this process may use, or so many of them at most."""
+    return sorted(os.sched_getaffinity(0))[:most]
 
 
 class _Process:

@@ -19,7 +19,7 @@ from animat.errors import AnimatError
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
-from animat.execution.pinned import PinnedProcesses
+from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.progress import Progress, Silent
 from animat.studies.parquet import write_parquet
 from animat.studies.places import results_file
@@ -171,7 +171,7 @@ def _room(workers: int | None, executor: Executor | None) -> Iterator[tuple[Exec
         # It trains all policies of a culture at once.
         yield None, 1
     else:
-        cores = sorted(os.sched_getaffinity(0))[:workers]
+        cores = own_cores(workers)
         with PinnedProcesses(cores) as ours:
             yield ours, len(cores)
 

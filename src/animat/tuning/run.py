@@ -13,7 +13,7 @@ from typing import Any
 
 from animat.errors import InvalidFile, UnusableData
 from animat.execution.jobs import Job, Jobs, expect_workers
-from animat.execution.pinned import one_a_core
+from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
 from animat.studies.draws import draw_seed
@@ -69,7 +69,9 @@ def tune(
     check_own(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
     manifest = describe_tuning(tuning, sums_of(source_files(study, base), base))
     # Processes of ours stay from one part of the work to the next.
-    running_on: AbstractContextManager[Executor] = one_a_core(workers) if executor is None else nullcontext(executor)
+    running_on: AbstractContextManager[Executor] = (
+        PinnedProcesses(own_cores(workers)) if executor is None else nullcontext(executor)
+    )
     with held(folder, "tuning", manifest, MANIFEST, {}, (*OWN_FOLDERS, FINALS)), running_on as at:
         run = _Run(tuning, folder, manifest["fingerprint"], at, progress)
         run.fit(base)
