@@ -88,9 +88,6 @@ def kept_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` that keeps what it compiles beside the source or in the user's cache.
 
     Where neither can be written (a package of the system's, no home), each process compiles anew, instead of failing.
-
-    Args:
-        options: of `numba.njit`.
     """
     import numba
 

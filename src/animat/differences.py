@@ -57,15 +57,16 @@ def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
     return digest.hexdigest()
 
 
+def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
+    """Plain data by way of JSON, in which a tuple and a list are the same, with a fingerprint over all of it."""
+    told: dict[str, Any] = json.loads(json.dumps(description))
+    return told | {"fingerprint": fingerprint_of(told)}
+
+
 def description_in(path: Path, what: str) -> dict[str, Any] | None:
-    """What a file says of the folder that it lies in, with its fingerprint; None if there is none.
+    """What a file of JSON says of the folder that it lies in, with its fingerprint; None if there is none.
 
-    Args:
-        path: the file, JSON.
-        what: the folder's contents, such as `study`, for a message.
-
-    Raises:
-        InvalidFile: if it cannot be read.
+    What the folder holds, such as a `study`, is for the message of an InvalidFile, if it cannot be read.
     """
     if not path.exists():
         return None

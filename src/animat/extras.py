@@ -9,17 +9,7 @@ from animat.errors import AnimatError
 
 
 def expect_extra(module: str, *, package: str, extra: str, what: str) -> Any:
-    """A package that an extra brings.
-
-    Args:
-        module: to import.
-        package: what people call it.
-        extra: that brings it.
-        what: needs it.
-
-    Raises:
-        AnimatError: if it is not installed, saying how to install it.
-    """
+    """A module of a package that an extra brings, for what needs it; AnimatError, saying how to install it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -8,9 +8,7 @@ from collections.abc import Sequence
 def lined_up(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table, indented: the first column and the last, which are words, to the left, the others to the right.
 
-    Args:
-        head: the columns' names; empty for one that needs none.
-        rows: cells, one for each column.
+    A column that needs no name has an empty one.
     """
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = []

@@ -11,11 +11,7 @@ from animat.errors import InvalidFile
 
 
 def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> Path:
-    """Refuse whatever cannot be read to its end: a folder, a device, a pipe, no file at all.
-
-    Args:
-        path: the file.
-        most_bytes: the largest size that what it should hold can have.
+    """Refuse whatever cannot be read to its end: a folder, a device, a pipe, no file at all, or too many bytes.
 
     Raises:
         InvalidFile: naming the file and what it is.
@@ -48,11 +44,7 @@ def is_folder(path: Path) -> bool:
 
 
 def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
-    """The text of a file, in UTF-8.
-
-    Raises:
-        InvalidFile: for what is no file of text, or a larger one.
-    """
+    """The text of a file, in UTF-8; raises InvalidFile for what is no file of text, or a larger one."""
     path = expect_plain_file(path, most_bytes)
     try:
         with path.open("rb") as file:
@@ -68,11 +60,7 @@ def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
 
 
 def read_toml(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:
-    """A TOML file as plain data.
-
-    Raises:
-        InvalidFile: if it cannot be read or is no TOML.
-    """
+    """A TOML file as plain data; raises InvalidFile if it cannot be read or is no TOML."""
     text = read_plain_text(path, most_bytes)
     try:
         return tomllib.loads(text)

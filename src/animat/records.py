@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
 import numpy as np
@@ -11,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
 from animat.errors import InvalidArgument, did_you_mean, shown
+from animat.writing import write_whole
 
 T = TypeVar("T")
 
@@ -72,10 +75,7 @@ def record(kind: type[T]) -> type[T]:
 def read_record(kind: type[T], data: Any, where: str = "") -> T:
     """A record, or any other type, from plain data as a file holds them; what is left out has its default.
 
-    Args:
-        kind: its type.
-        data: dictionaries, lists, texts and numbers.
-        where: what a message calls the whole.
+    `where` is what a message calls the whole.
 
     Raises:
         InvalidArgument: naming the key, what was expected and what came.
@@ -93,6 +93,11 @@ def as_json(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [as_json(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_json(path: Path, value: Any) -> Path:
+    """Write plain data as JSON, complete or absent, None for numbers that it has no word for; returns the path."""
+    return write_whole(path, json.dumps(as_json(value), indent=1, sort_keys=True) + "\n")
 
 
 def _told(error: ValidationError, kind: Any, within: str = "") -> str:

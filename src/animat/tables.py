@@ -41,12 +41,13 @@ def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]
     return table
 
 
-def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse times that are not finite, or not within a century.
+def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
+    """Of n things in a row at most so many, evenly spread, by their numbers."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
-    Raises:
-        UnusableData: by the name of the column.
-    """
+
+def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
+    """Refuse times that are not finite, or not within a century (UnusableData, by the name of the column)."""
     bad = np.count_nonzero(~np.isfinite(times_s))
     if bad:
         raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
@@ -58,11 +59,7 @@ def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
 
 
 def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse also times that fall.
-
-    Raises:
-        UnusableData: by the name of the column.
-    """
+    """Refuse also times that fall."""
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")

@@ -53,6 +53,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
+def write_whole(path: Path, content: str | bytes) -> Path:
+    """Write a file, complete or absent, as `atomic_write`; returns its path."""
+    with atomic_write(path) as beside:
+        beside.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
 def expect_writable(folder: str | os.PathLike[str]) -> None:
     """Refuse a folder that could not be written to, or not be made, before any work; nothing is left of the trial.
 

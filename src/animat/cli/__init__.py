@@ -14,15 +14,8 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, get_args
 
 import tyro
+from tyro import constructors
 from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
-from tyro.constructors import (
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-    StructConstructorSpec,
-    StructFieldSpec,
-    StructTypeInfo,
-)
 
 from animat.cli.cluster import ClusterCommand
 from animat.cli.convert import Convert
@@ -218,20 +211,20 @@ def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) 
         raise InvalidArgument(f"unexpected argument {given!r}{see}") from None
 
 
-def _options() -> ConstructorRegistry:
+def _options() -> constructors.ConstructorRegistry:
     """A rule by which the options of every command are read and told."""
-    registry = ConstructorRegistry()
+    registry = constructors.ConstructorRegistry()
     within = False
 
     @registry.struct_rule
-    def rule(command: StructTypeInfo) -> StructConstructorSpec | None:
+    def rule(command: constructors.StructTypeInfo) -> constructors.StructConstructorSpec | None:
         nonlocal within
         if within or not dataclasses.is_dataclass(command.type):
             return None
         within = True  # What else would ask this rule again.
-        spec = ConstructorRegistry.get_struct_spec(command)
+        spec = constructors.ConstructorRegistry.get_struct_spec(command)
         within = False
-        if not isinstance(spec, StructConstructorSpec):
+        if not isinstance(spec, constructors.StructConstructorSpec):
             return None
         return dataclasses.replace(spec, fields=tuple(map(_option, spec.fields)))
 
@@ -241,11 +234,11 @@ def _options() -> ConstructorRegistry:
 _NUMBERS = {"INT": "a whole number", "FLOAT": "a number", "FLOAT FLOAT": "two numbers"}
 
 
-def _option(option: StructFieldSpec) -> StructFieldSpec:
+def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpec:
     """The same in our words: an error says what was expected and what came, help what is done without the option."""
     kind: Any = Annotated[option.type, DisallowNone]
-    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, set()))
-    if option.type is not bool and isinstance(spec, PrimitiveConstructorSpec):
+    spec = constructors.ConstructorRegistry.get_primitive_spec(constructors.PrimitiveTypeInfo.make(kind, set()))
+    if option.type is not bool and isinstance(spec, constructors.PrimitiveConstructorSpec):
         among = sorted(spec.metavar.strip("{}").split(","))
         expected = f"one of {', '.join(among)}" if spec.choices else _NUMBERS.get(spec.metavar.strip("{}"))
 

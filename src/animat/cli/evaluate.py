@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,8 @@ from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for, say_findings
 from animat.errors import InvalidArgument
-from animat.records import as_json
-from animat.writing import atomic_write, expect_writable
+from animat.records import write_json
+from animat.writing import expect_writable
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,5 @@ class Evaluate(Fitting):
         say_findings(evaluation.findings)
         print(evaluation.to_text())
         if self.out is not None:
-            with atomic_write(self.out) as beside:
-                beside.write_text(json.dumps(as_json(evaluation.to_dict()), indent=1, sort_keys=True) + "\n")
+            write_json(self.out, evaluation.to_dict())
         return evaluation.to_dict()

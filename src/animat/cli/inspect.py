@@ -16,10 +16,7 @@ from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.progress import Progress
-    from animat.recordings.recording import Recording
-    from animat.recordings.response_table import ResponseTable
     from animat.responses.conditions import Conditions
-    from animat.responses.inspection import Inspection
     from animat.responses.responses import Responses
 
 
@@ -75,6 +72,7 @@ class Inspect(Responding):
         from animat.recordings.recording import Recording
         from animat.report.inspection import draw_inspection, inspection_text
         from animat.report.series import draw_series
+        from animat.responses.inspection import inspect_recording
 
         inspected, series, unreadable = [], [], []
         # Reading is one step of each file, drawing another, and the figures of the series are the last.
@@ -84,7 +82,10 @@ class Inspect(Responding):
             progress.update(steps * number, total, file.name)
             try:
                 source = read_source(file, stimuli=self.stimuli, part=self.part)
-                inspection = _inspected(source, by, window_ms, self.burst_threshold, file)
+                try:
+                    inspection = inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
+                except (UnusableData, Mismatch) as error:
+                    raise type(error)(f"{file}: {error}") from error
             except AnimatError as error:
                 if len(files) == 1:
                     raise
@@ -123,21 +124,6 @@ class Inspect(Responding):
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"
             print(f"animat: {count}, as said above{others}", file=sys.stderr)
         return told
-
-
-def _inspected(
-    source: Recording | ResponseTable,
-    by: Conditions | None,
-    window_ms: tuple[float, float],
-    burst_threshold: float | None,
-    file: Path,
-) -> Inspection:
-    from animat.responses.inspection import inspect_recording
-
-    try:
-        return inspect_recording(source, by, window_ms, burst_threshold, file.name)
-    except (UnusableData, Mismatch) as error:
-        raise type(error)(f"{file}: {error}") from error
 
 
 def _optima(robot: str, responses: Responses) -> list[dict[str, Any]] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -141,6 +140,8 @@ class Live(Stimulating):
         return ran.to_dict()
 
     def _report(self, ran: LiveRun) -> None:
+        from animat.execution.training import in_words
+
         print(
             f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
             f"({ran.wall_s:.0f} s of ours); {ran.iterations:,} iterations of each policy, never stopped; "
@@ -148,12 +149,8 @@ class Live(Stimulating):
         )
         for swap in ran.swaps:
             print(
-                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {_range(swap['members'])} after "
+                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {in_words(swap['members'])} after "
                 f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
             )
         print(ran.gap.to_text())
         expect_no_fault(ran.gap.session, self.out)
-
-
-def _range(members: Sequence[int]) -> str:
-    return f"p{members[0]} to p{members[-1]}" if len(members) > 1 else f"p{members[0]}"

@@ -13,11 +13,7 @@ if TYPE_CHECKING:
 
 
 def read_numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
-    """What was given as `NAME=NUMBER`, by name; whole numbers stay whole.
-
-    Raises:
-        InvalidArgument: for anything else, or a name that is given twice.
-    """
+    """What was given as `NAME=NUMBER`, by name, each once (else InvalidArgument); whole numbers stay whole."""
     numbers: dict[str, float] = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
@@ -31,11 +27,7 @@ def read_numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
 
 
 def read_sac(pairs: Sequence[str]) -> SAC:
-    """The algorithm's settings, those given in place of its defaults.
-
-    Raises:
-        InvalidArgument: for a setting that there is none of, or a value that it may not have.
-    """
+    """The algorithm's settings, those given in place of its defaults; InvalidArgument for one that cannot be."""
     from animat.training.settings import SAC
 
     numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from animat.cli.study import run_and_report
+from animat.cli.working import Working
 from animat.errors import InvalidArgument
 
 
 @dataclass(frozen=True)
-class Reproduce:
-    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Goes on where it stopped."""
+class Ours:
+    """Which of the studies that come with animat; its options come before those of all."""
 
     study: Literal["paper", "context"] = "paper"
     """paper: the paper's comparisons; context: which tasks need more than a reflex, what the policies do beyond one,
@@ -23,18 +24,11 @@ class Reproduce:
     """Which virtual culture; several: 1-5, or 1,3,8"""
     seed: int = 1
     """Decides every draw of training and evaluation"""
-    workers: int | None = None
-    """Processes, each on its own core; default: one a core"""
-    cluster: str | None = None
-    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
-    shared_folder: bool = True
-    """Whether its workers see --out at the same place; if not, files go through this process"""
-    out: Path = Path("study")
-    """Folder for everything; the report is report.html in it"""
-    watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
+
+
+@dataclass(frozen=True)
+class Reproduce(Working, Ours):
+    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Goes on where it stopped."""
 
     def run(self) -> dict[str, Any]:
         """Run it."""
@@ -52,21 +46,17 @@ class Reproduce:
             culture = replace(study.culture, seed=seeds[0])
         else:
             culture = replace(study.culture, seeds=self.culture_seed)
-        return run_and_report(
-            replace(study, culture=culture), Path(), self.out, self.workers, self.cluster, self.shared_folder
-        )
+        return run_and_report(replace(study, culture=culture), Path(), self)
 
     def _context(self, cultures: list[int]) -> dict[str, Any]:
         """Run the context study."""
-        from animat.execution.cluster import on_cluster
-        from animat.progress import Bar
         from animat.studies.context import run_context_study
         from animat.studies.context_page import in_short, write_context_page
         from animat.studies.context_tasks import ContextStudy, quick_context_study
 
         study = (quick_context_study if self.quick else ContextStudy)(cultures=tuple(cultures), seed=self.seed)
-        with on_cluster(self.cluster, self.shared_folder) as executor, Bar("study") as progress:
-            found = run_context_study(study, self.out, workers=self.workers, executor=executor, progress=progress)
+        with self.at_work("study") as how:
+            found = run_context_study(study, self.out, **how)
         report = write_context_page(study, found)
         for robot in study.robots:
             print(f"{robot}: {in_short([row for row in found.rows if row.robot == robot])}")

@@ -35,7 +35,8 @@ class Robots:
                 unusable[name] = str(said)
         for name, robot in listed.items():
             observed = ", ".join(f"{each['name']} ({each['unit']})" for each in robot["observes"])
-            parameters = " ".join(f"{key}={_short(value)}" for key, value in robot["parameters"].items())
+            numbers = {k: f"{v:g}" if isinstance(v, float) else v for k, v in robot["parameters"].items()}
+            parameters = " ".join(f"{key}={value}" for key, value in numbers.items())
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
                 print(f"  takes {robot['commands']} commands: train it with as many --readouts, or --mapping none")
@@ -44,10 +45,6 @@ class Robots:
         for name, why in unusable.items():
             print(f"{name} cannot be used: {why}")
         return {"robots": listed, "unusable": unusable}
-
-
-def _short(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _told(name: str) -> dict[str, Any]:

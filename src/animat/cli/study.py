@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -11,70 +10,44 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
+from animat.cli.working import Working
 
+if TYPE_CHECKING:
     from animat.studies.specification import Study
 
 
-@dataclass(frozen=True)
-class StudyFile:
+@dataclass(frozen=True, kw_only=True)
+class StudyFile(Working):
     """A study of one's own from a TOML file: recordings, robots, arms. Goes on where it stopped."""
 
     specification: Positional[Path]
     """The TOML file; animat reproduce leaves one to start from in its folder"""
-    workers: int | None = None
-    """Processes, each on its own core; default: one a core"""
-    cluster: str | None = None
-    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
-    shared_folder: bool = True
-    """Whether its workers see --out at the same place; if not, files go through this process"""
-    out: Path = Path("study")
-    """Folder for everything; the report is report.html in it"""
-    watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         """Run it."""
         from animat.studies.toml import read_study
 
-        study = read_study(self.specification)
-        return run_and_report(
-            study, self.specification.parent, self.out, self.workers, self.cluster, self.shared_folder
-        )
+        return run_and_report(read_study(self.specification), self.specification.parent, self)
 
 
-def run_and_report(
-    study: Study, base: Path, out: Path, workers: int | None, cluster: str | None, shared_folder: bool
-) -> dict[str, Any]:
+def run_and_report(study: Study, base: Path, command: Working) -> dict[str, Any]:
     """Run a study, whose files are named as seen from `base`, and print its comparisons."""
-    from animat.execution.cluster import on_cluster
     from animat.studies.cultures import studies_of
 
-    for spec in study.robots:
-        for caveat in spec.robot().caveats():
-            print(f"warning: {caveat}", file=sys.stderr)
-    cores = len(os.sched_getaffinity(0))
-    if workers is not None and workers > cores:
-        print(f"warning: --workers: {workers} were asked for; there is one a core, {cores}", file=sys.stderr)
-    run = _run_many if studies_of(study) else _run_one
-    with on_cluster(cluster, shared_folder) as executor:
-        return run(study, base, out, workers, executor)
+    command.say_first(study.robots)
+    return (_run_many if studies_of(study) else _run_one)(study, base, command)
 
 
-def _run_one(study: Study, base: Path, out: Path, workers: int | None, executor: Executor | None) -> dict[str, Any]:
+def _run_one(study: Study, base: Path, command: Working) -> dict[str, Any]:
     from animat.lined_up import lined_up
-    from animat.progress import Bar
     from animat.studies.heuristic import not_outperforming
     from animat.studies.places import results_file
     from animat.studies.results import Results, read_typed
     from animat.studies.run import run_study
 
     began = time.monotonic()
-    with Bar("study") as progress:
-        ran = run_study(study, out, base=base, workers=workers, executor=executor, progress=progress)
+    with command.at_work("study") as how:
+        ran = run_study(study, command.out, base=base, **how)
     results = read_typed(results_file(ran.folder), Results)
     cells = []
     for row in results.comparisons:
@@ -102,17 +75,16 @@ def _run_one(study: Study, base: Path, out: Path, workers: int | None, executor:
     }
 
 
-def _run_many(study: Study, base: Path, out: Path, workers: int | None, executor: Executor | None) -> dict[str, Any]:
+def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
     from animat.errors import AnimatError
     from animat.lined_up import lined_up
-    from animat.progress import Bar
     from animat.studies.cultures import run_over_cultures
     from animat.studies.cultures_page import write_cultures_page
     from animat.studies.parquet import MISSING
 
     began = time.monotonic()
-    with Bar("study") as progress:
-        found = run_over_cultures(study, out, base=base, workers=workers, executor=executor, progress=progress)
+    with command.at_work("study") as how:
+        found = run_over_cultures(study, command.out, base=base, **how)
     report = write_cultures_page(study, found)
     cells = []
     for row in found.summary:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,31 +9,21 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from animat.cli.working import Working
 
-@dataclass(frozen=True)
-class TuneFile:
+
+@dataclass(frozen=True, kw_only=True)
+class TuneFile(Working):
     """Search for the best settings of a study with one robot and one arm. Goes on where it stopped."""
 
     specification: Positional[Path]
     """The study's TOML file; its table [tune] says what is searched"""
-    workers: int | None = None
-    """Processes, each on its own core; default: one a core"""
-    cluster: str | None = None
-    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
-    shared_folder: bool = True
-    """Whether its workers see --out at the same place; if not, files go through this process"""
     out: Path = Path("tuning")
     """Folder for everything; the settings found are best.toml in it"""
-    watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         """Search."""
-        from animat.execution.cluster import on_cluster
         from animat.lined_up import lined_up
-        from animat.progress import Bar
         from animat.tuning.search import expect_optuna
         from animat.tuning.specification import read_tuning
 
@@ -45,15 +33,10 @@ class TuneFile:
         from animat.tuning.run import tune
         from animat.tuning.space import first_settings
 
-        for caveat in tuning.study.robots[0].robot().caveats():
-            print(f"warning: {caveat}", file=sys.stderr)
-        cores = len(os.sched_getaffinity(0))
-        if self.workers is not None and self.workers > cores:
-            print(f"warning: --workers: {self.workers} were asked for; there is one a core, {cores}", file=sys.stderr)
+        self.say_first(tuning.study.robots)
         began = time.monotonic()
-        base = self.specification.parent
-        with on_cluster(self.cluster, self.shared_folder) as executor, Bar("tuning") as progress:
-            tuned = tune(tuning, self.out, base=base, workers=self.workers, executor=executor, progress=progress)
+        with self.at_work("tuning") as how:
+            tuned = tune(tuning, self.out, base=self.specification.parent, **how)
         cells = []
         names = ("own settings", "defaults")[: len(first_settings(tuning.study, tuning.space))]
         for final in sorted(tuned.finals, key=lambda each: -each.mean):

@@ -27,13 +27,10 @@ class Watch:
         from animat.watch.serving import serve
 
         if not self.folder.is_dir():
-            raise InvalidArgument(f"{self.folder}: expected a folder to watch, got {_what(self.folder)}")
+            got = "a file" if self.folder.exists() else "none"
+            raise InvalidArgument(f"{self.folder}: expected a folder to watch, got {got}")
         serve(self.folder, self.port, _say)
         return {"folder": str(self.folder)}
-
-
-def _what(path: Path) -> str:
-    return "a file" if path.exists() else "none"
 
 
 def _say(address: str) -> None:

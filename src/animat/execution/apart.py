@@ -10,7 +10,7 @@ from pathlib import Path
 from animat.errors import InvalidFile
 from animat.execution.receipts import digest_of
 from animat.execution.task import Done, Task, carry_out
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 STORE = "animat-files"
 """Folder of what a worker was sent, in its own folder."""
@@ -28,17 +28,13 @@ def store(folder: Path, contents: Mapping[str, bytes]) -> None:
     """Keep contents, each under its digest, in a worker's folder."""
     (folder / STORE).mkdir(exist_ok=True)
     for digest, content in contents.items():
-        with atomic_write(folder / STORE / digest) as beside:
-            beside.write_bytes(content)
+        write_whole(folder / STORE / digest, content)
 
 
 def carry_out_apart(task: Task, reads: Mapping[str, str], folder: Path) -> DoneApart:
     """`carry_out` in a folder of its own, which is made of what was sent and is gone afterwards.
 
-    Args:
-        task: what is done.
-        reads: of each file that it reads, by its place, under what it was stored (`store`).
-        folder: the worker's own, in which that is.
+    In the worker's folder lies what the task reads, of each file, by its place, under what it was stored (`store`).
 
     Raises:
         InvalidFile: if something was not sent.
@@ -58,15 +54,8 @@ def carry_out_apart(task: Task, reads: Mapping[str, str], folder: Path) -> DoneA
 
 
 def bring_back(came: DoneApart, folder: Path) -> Done:
-    """Write what came back into the folder.
-
-    Raises:
-        InvalidFile: if it is not what the worker left.
-    """
+    """Write what came back into the folder; raises InvalidFile if it is not what the worker left."""
     for place, content in came.contents.items():
-        (folder / place).parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder / place) as beside:
-            beside.write_bytes(content)
-        if digest_of(folder / place) != came.done.files[place]:
+        if digest_of(write_whole(folder / place, content)) != came.done.files[place]:
             raise InvalidFile(f"{folder / place}: expected what the worker left, got something else")
     return came.done

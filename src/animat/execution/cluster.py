@@ -29,11 +29,7 @@ _CONNECT_S = 60
 
 
 def expect_distributed() -> Any:
-    """Dask's package for clusters, which is imported nowhere else.
-
-    Raises:
-        AnimatError: if it is not installed.
-    """
+    """Dask's package for clusters, which is imported nowhere else; raises AnimatError if it is not installed."""
     return expect_extra("distributed", package="Dask", extra="cluster", what="a cluster")
 
 
@@ -80,11 +76,7 @@ class Cluster(Executor):
         self._dispatch = Dispatch(self._client, self._ours, longest_s)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """As any executor's; what is called, and with what, is pickled at once.
-
-        Raises:
-            AnimatError: if the scheduler has ended.
-        """
+        """As any executor's; what is called, and with what, is pickled at once. AnimatError if the scheduler ended."""
         pickled = pickle.dumps((fn, args, kwargs))
         return self._hand_in(Call(fn.__name__, lambda _: pickled))
 
@@ -95,8 +87,7 @@ class Cluster(Executor):
 
         Args:
             task, folder, notice: as there.
-            name: of the task, for messages.
-            cost_s: about how many seconds it takes.
+            name, cost_s: as of a `Job`.
             reads: the digest of each file in the folder that it reads, by its place.
 
         Raises:
@@ -168,11 +159,7 @@ def _why_refused(worker: tuple[str, dict[str, Any]]) -> str:
 
 @contextmanager
 def on_cluster(where: str | None, shared_folder: bool) -> Iterator[Cluster | None]:
-    """A cluster for as long as the block takes; None where none is asked for.
-
-    Raises:
-        InvalidArgument: if there is no cluster, and no shared folder either.
-    """
+    """A cluster for as long as the block takes; None without one, and InvalidArgument for no shared folder then."""
     if where is None:
         if not shared_folder:
             raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")

@@ -18,12 +18,7 @@ _FOLDER = "curves"
 
 
 class CurveFile:
-    """The file of a group of policies, which begins anew with the process that trains them.
-
-    Args:
-        folder: of the training.
-        first: the number of the group's first policy.
-    """
+    """The file of a group of policies, by the number of its first, which begins anew with the process that trains."""
 
     def __init__(self, folder: Path, first: int) -> None:
         self._path = _file(folder, first)
@@ -39,11 +34,7 @@ class CurveFile:
 class Curves:
     """The rows that were told already, and those that are new; as a progress, it looks for them at each report.
 
-    Args:
-        folder: of the training; None where it has none.
-        groups: the numbers of the policies of each group.
-        callbacks: to be called with each row.
-        progress: to be told what this one is.
+    A training may have no folder. The groups are numbers of policies; each callback is called with each row.
     """
 
     def __init__(

@@ -35,14 +35,7 @@ _REPORTED_BYTES = 2**16
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of a call.
-
-    Attributes:
-        value: what it returned.
-        error: what it raised, instead.
-        ended: how its process ended, instead.
-        took_s: how long it took.
-    """
+    """What came of a call: what it returned, what it raised instead, or how its process ended; and how long it took."""
 
     value: Any = None
     error: Exception | None = None
@@ -86,11 +79,7 @@ _HELD: list[TextIO] = []
 
 
 def dask_setup(worker: Any) -> None:
-    """Make a Dask worker one of ours, before the scheduler hears of it; called by Dask.
-
-    Args:
-        worker: Dask's.
-    """
+    """Make a Dask worker one of ours, before the scheduler hears of it; called by Dask."""
     threads = worker.state.nthreads
     for core in _own_cores(threads):
         _FREE.put(_Core(core))

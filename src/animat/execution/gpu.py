@@ -56,12 +56,7 @@ def programs_among(tasks: Sequence[Task]) -> list[list[int]]:
 
 
 class WithGpu:
-    """The cores of this machine, and its GPU, to which goes what trains policies.
-
-    Args:
-        cores: for the rest.
-        process: the one that may use the GPU.
-    """
+    """The cores of this machine, and a process with its GPU, to which goes what trains policies."""
 
     def __init__(self, cores: Executor, process: Executor) -> None:
         self._cores, self._process = cores, process

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
@@ -15,7 +14,7 @@ from pathlib import Path
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import WithGpu
-from animat.execution.pinned import PinnedProcesses
+from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
 from animat.progress import Progress
@@ -137,7 +136,8 @@ class Jobs:
                 if time.monotonic() - told_s > _LOOK_EVERY_S:
                     report()
                 # Those that succeeded first: their receipts are kept, whatever the others raise.
-                for future in sorted(wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done, key=_has_failed):
+                ended = wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done
+                for future in sorted(ended, key=lambda each: each.cancelled() or each.exception() is not None):
                     ended_s += running[future].cost_s
                     try:
                         done = _done(future, running[future])
@@ -209,7 +209,7 @@ def _running_on(
 ) -> Iterator[Executor | WithGpu]:
     """The executor that was lent, or processes of ours; if the block fails, nothing goes on after it."""
     if executor is None:
-        with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours, PinnedProcesses([None]) as beside:
+        with PinnedProcesses(own_cores(workers)) as ours, PinnedProcesses([None]) as beside:
             yield WithGpu(ours, beside) if has_gpu else ours
         return
     try:
@@ -218,10 +218,6 @@ def _running_on(
         # The folder is let go of only when nobody writes to it any more.
         wait([future for future in running if not future.cancel()])
         raise
-
-
-def _has_failed(future: Future[Done]) -> bool:
-    return future.cancelled() or future.exception() is not None
 
 
 def _done(future: Future[Done], job: Job) -> Done:

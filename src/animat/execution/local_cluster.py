@@ -29,13 +29,8 @@ runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler, and so many workers, until the block ends. A worker that dies is replaced.
 
-    Args:
-        workers: how many.
-        file: where the scheduler writes its address; gone at the end.
-        threads: cores of each worker.
-
-    Yields:
-        The processes of the scheduler and of what looks after the workers.
+    The file, in which the scheduler writes its address, is gone at the end. Yields the processes of the scheduler and
+    of what looks after the workers.
 
     Raises:
         AnimatError: if Dask is not installed, or the scheduler does not start.

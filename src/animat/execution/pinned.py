@@ -87,6 +87,11 @@ class PinnedProcesses(ThreadPoolExecutor):
         return value
 
 
+def own_cores(most: int | None = None) -> list[int]:
+    """The cores that this process may use, or so many of them at most."""
+    return sorted(os.sched_getaffinity(0))[:most]
+
+
 class _Process:
     """A process of `animat.execution.worker`, which imports from where this one does."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import AnimatError, InvalidFile
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,7 @@ class Receipt:
 
     def save(self, receipts: Path) -> None:
         """Write it into a folder of receipts, after all files are there."""
-        with atomic_write(receipt_path(receipts, self.job)) as beside:
-            beside.write_text(self._text())
+        write_whole(receipt_path(receipts, self.job), self._text())
 
     def changed(self, folder: Path) -> list[str]:
         """The files that are not in the folder any more as they were left."""
@@ -49,11 +48,7 @@ class Receipt:
 
     @staticmethod
     def load(receipts: Path, job: str) -> Receipt | None:
-        """The receipt of a job; None where there is none.
-
-        Raises:
-            InvalidFile: if it cannot be read.
-        """
+        """The receipt of a job; None where there is none. Raises InvalidFile if it cannot be read."""
         path = receipt_path(receipts, job)
         if not path.exists():
             return None

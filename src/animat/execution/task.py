@@ -124,17 +124,7 @@ def carry_out(task: Task, folder: Path, notice: Path) -> Done:
 def carried_out(
     tasks: Sequence[Task], folder: Path, notices: Sequence[Path], run: Callable[[Progress], list[list[Path]]]
 ) -> list[Done]:
-    """Have tasks done together.
-
-    Args:
-        tasks: which.
-        folder: in which all files are.
-        notices: the file of each in which it is told how far it is.
-        run: does them; returns the files that each left.
-
-    Raises:
-        AnimatError: if they fail; in one line, also where nobody foresaw it.
-    """
+    """Have tasks done together, with arguments and errors as of `carry_out`; `run` returns the files that each left."""
     progress = _Notice(notices)
     progress.update(0, 1)
     began_s = time.process_time()
@@ -164,11 +154,7 @@ class _Notice:
 
 
 def report(path: Path, words: Any) -> None:
-    """Put something into a file for other processes to see (`reported`).
-
-    Raises:
-        OSError: where that cannot be written.
-    """
+    """Put something into a file for other processes to see (`reported`); OSError where it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".new")
     beside.write_text(json.dumps(words))

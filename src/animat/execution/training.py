@@ -116,7 +116,7 @@ def train(
         missing = [group for group in groups if not _is_trained(group, folder)]
         left = [
             Job(
-                _names(group),
+                in_words(group.members),
                 TrainGroup(group, checkpoint_s, tells_rows=bool(callbacks)),
                 cost_s=CHUNKS * len(group.members),
             )
@@ -184,8 +184,9 @@ def _phase_of(groups: Sequence[Group], progress: Progress | None) -> Progress:
     return in_phase(progress, "training", iterations, "iterations")
 
 
-def _names(group: Group) -> str:
-    first, last = group.members[0], group.members[-1]
+def in_words(members: Sequence[int]) -> str:
+    """Policies that follow each other, such as `p0 to p4`."""
+    first, last = members[0], members[-1]
     return f"p{first}" if first == last else f"p{first} to p{last}"
 
 

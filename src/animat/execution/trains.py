@@ -71,15 +71,8 @@ def train_alone(work: Work, progress: Progress) -> list[Path]:
 def train_at_once(tasks: Sequence[Trains], folder: Path, notices: Sequence[Path]) -> list[Done]:
     """Carry out tasks that one program does: all of their policies at once, or as many as there is memory for.
 
-    Killed at any moment before it returns and called again with the same tasks, it leaves the same bits.
-
-    Args:
-        tasks: which.
-        folder: in which all their files are.
-        notices: the file of each in which it is told how far it is.
-
-    Raises:
-        AnimatError: if they fail.
+    Killed at any moment before it returns and called again with the same tasks, it leaves the same bits. Arguments and
+    errors are those of `animat.execution.task.carried_out`.
     """
 
     def run(progress: Progress) -> list[list[Path]]:

@@ -9,11 +9,7 @@ signature of `animat.gym.setup.set_up`.
 
 from __future__ import annotations
 
-IDS = {
-    "Animat/Cartpole-v0": "cartpole",
-    "Animat/Navigation-v0": "navigation",
-    "Animat/SwingUp-v0": "swing-up",
-}
+IDS = {"Animat/Cartpole-v0": "cartpole", "Animat/Navigation-v0": "navigation", "Animat/SwingUp-v0": "swing-up"}
 """The environments of a robot each: of those with one command, which need no recordings."""
 
 ANY = "Animat/Robot-v0"

@@ -114,7 +114,13 @@ def set_up(
             if got != usual:
                 raise InvalidArgument(f"{name}: expected only with recordings, of which it says how they are read")
     if recordings is not None:
-        simulator, labels = _simulator_of(recordings, at_min, conditions, window_ms, kind, readouts)
+        by = None if conditions is None else conditions_named(conditions)
+        timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=readouts), kind=kind)
+        for message in warnings_once(timeline.findings):
+            warnings.warn(message, stacklevel=2)
+        row = 0 if at_min is None else timeline.row_asked_for(at_min)
+        simulator = timeline.at(timeline.start_min[row])
+        labels = tuple(condition.label for condition in timeline.conditions)
     elif simulator is not None:
         labels = tuple(f"condition {i}" for i in range(simulator.n_conditions))
     else:
@@ -127,19 +133,3 @@ def set_up(
         check_mapping(chosen)
     animat = Animat(body, chosen, simulator.n_conditions)
     return Setup(EpisodeLimit(ShuffledDelivery(animat) if delivery == "shuffled" else animat), simulator, labels)
-
-
-def _simulator_of(
-    recordings: Paths,
-    at_min: float | None,
-    conditions: str | None,
-    window_ms: tuple[float, float],
-    kind: Kind | None,
-    readouts: str | Readouts,
-) -> tuple[NeuronSimulator, tuple[str, ...]]:
-    by = None if conditions is None else conditions_named(conditions)
-    timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=readouts), kind=kind)
-    for message in warnings_once(timeline.findings):
-        warnings.warn(message, stacklevel=3)
-    row = 0 if at_min is None else timeline.row_asked_for(at_min)
-    return timeline.at(timeline.start_min[row]), tuple(condition.label for condition in timeline.conditions)

@@ -19,12 +19,8 @@ from animat.training.group import Group, SideBySide, save_policies
 class TrainAlongside(Task):
     """Train a group of policies, before each chunk on the newest simulator of the exchange.
 
-    It says which of them it uses, its swaps, and how far it is, by the exchange too.
-
-    Attributes:
-        group: what is trained.
-        exchange: the simulators, and when to end.
-        keep_s: seconds between times that the policies are written as they are.
+    It says which of them it uses, its swaps, and how far it is, by the exchange too, which also tells when to end.
+    Every `keep_s` seconds the policies are written as they are.
     """
 
     group: Group

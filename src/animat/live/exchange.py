@@ -8,30 +8,21 @@ from typing import Any
 
 from animat.execution.task import report, reported
 from animat.neurons.simulator import NeuronSimulator
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 _FINISH = "finish"
 
 
 class Exchange:
-    """A folder that one process publishes simulators in and others look into; every file is whole or absent.
-
-    Args:
-        folder: used for nothing else, and for one run.
-    """
+    """A folder of one run alone, in which one process publishes simulators and others look; its files are whole."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
 
     def publish(self, number: int, start_min: float, simulator: NeuronSimulator) -> None:
-        """Put up a simulator, its arrays on the host; the one with the largest number is in force.
-
-        Raises:
-            InvalidFile: if it cannot be written.
-        """
-        with atomic_write(self.folder / f"{number:06}.simulator") as beside:
-            beside.write_bytes(pickle.dumps((number, start_min, simulator)))
+        """Put up a simulator, its arrays on the host; the one with the largest number is in force."""
+        write_whole(self.folder / f"{number:06}.simulator", pickle.dumps((number, start_min, simulator)))
 
     def newest(self, known: int) -> tuple[int, float, NeuronSimulator] | None:
         """Number, minute and simulator of the newest, if its number is larger than the one that is known."""

@@ -68,13 +68,7 @@ def check_plan(
 ) -> None:
     """Raise for what would only come out when the culture is open, or after an hour of training.
 
-    Args:
-        training: what is trained.
-        protocol: of every recording.
-        folder: for all that comes of it.
-        timetable: when the culture is recorded.
-        episodes: of each policy in closed loop.
-        settings: of the closed loop (`animat.closed_loop.loop.Loop`).
+    Arguments are those of `animat.live.shadowing.live`.
 
     Raises:
         InvalidArgument: for a training without neurons or with a neural observation, recordings that take longer than

@@ -24,10 +24,7 @@ def record_within(
     """Record by a protocol if the budget holds all of it.
 
     Of a recording that fails half way, what it handed to the culture until then is spent, and nothing that others did.
-
-    Args:
-        account: of the budget.
-        culture, protocol, seed, progress, follow: as of `Culture.record`.
+    Other arguments are those of `Culture.record`.
 
     Raises:
         BudgetSpent: if it does not; nothing is delivered then.

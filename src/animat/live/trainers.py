@@ -20,13 +20,7 @@ KEEP_S = 10.0
 
 
 class Trainers:
-    """One process a group of policies; use it as a context manager, which ends them whatever happens.
-
-    Args:
-        groups: what they train.
-        exchange: the simulators.
-        folder: where the policies go.
-    """
+    """One process a group of policies, which go into a folder; a context manager ends them whatever happens."""
 
     def __init__(self, groups: Sequence[Group], exchange: Exchange, folder: Path) -> None:
         self._exchange, self._folder = exchange, folder

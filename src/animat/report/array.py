@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Float64
 
 from animat.recordings.recording import Recording
-from animat.report.style import GREY, RED, add_legend, new_figure, style_axes
+from animat.report.style import GREY, RED, Axes, Figure, add_legend, new_figure, style_axes
 from animat.stimulation.selection import Selection
 from animat.tables import UNKNOWN
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_LABELS = 64
 

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import BLACK, BLUE, BURST, NON_BURST, add_legend, new_figure, style_axes
+from animat.report.style import BLACK, BLUE, BURST, NON_BURST, Axes, Figure, add_legend, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _RATE = "response x (Hz per channel)"
 _RATIO = "ratio of active channels (fraction)"

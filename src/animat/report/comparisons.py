@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.report.html import cell
 from animat.report.minus import with_minus
-from animat.report.style import BLACK, BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    OPTIMUM,
+    ORANGE,
+    Axes,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +68,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     """A column a comparison: above with random actions (dotted) and the optimal return (dashed), below close up.
 
     Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; policies are
-    points.
-
-    Args:
-        pairs: on one robot, at least one.
-        title: of the whole figure.
+    points. All pairs are of one robot; at least one is given.
     """
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
     figure.suptitle(title, fontsize=10)

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.report.style import BLACK, BLUE, GREY, ORANGE, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.report.style import BLACK, BLUE, GREY, ORANGE, Axes, Figure, add_common_legend, new_figure, style_axes
 
 _APART = 0.11
 """Between two cultures of a row, in rows."""
@@ -38,8 +33,7 @@ def draw_context(
     """Context gaps of tasks beside context scores of policies: a row a robot, a point a culture with its interval.
 
     Args:
-        gaps: by the robot's name, of each culture.
-        scores: the same.
+        gaps, scores: by the robot's name, of each culture.
         admitted: the gap from which on a task needs more than a reflex.
     """
     figure = new_figure(9.2, 1.7 + 0.55 * len(gaps))

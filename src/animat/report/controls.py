@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from animat.report.minus import with_minus
-from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, add_common_legend, grid_of_panels, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, Figure, add_common_legend, grid_of_panels, style_axes
 
 
 @dataclass(frozen=True)
@@ -32,12 +28,7 @@ class Controls:
 
 
 def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
-    """A panel a mapping and recording: mean returns with their standard errors, random actions and the optimum.
-
-    Args:
-        panels_of: on one robot.
-        title: of the whole figure.
-    """
+    """A panel a mapping and recording: mean returns with their standard errors, random actions and the optimum."""
     most = max(len(controls.returns) for controls in panels_of)
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)
     for axes, controls in zip(panels, panels_of, strict=True):

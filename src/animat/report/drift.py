@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, BURST, GREY, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import BLACK, BURST, GREY, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PERCENTILES = (10, 25, 50, 75, 90)
 """Of the responses, that are drawn."""
@@ -50,11 +46,9 @@ def drift_of(series: Sequence[Responses]) -> Drift:
 
 
 def draw_drift(series: Sequence[Responses]) -> Figure:
-    """Against the minutes: the pooled percentiles, P(x >= P50) of each condition, and the share of bursts.
+    """Against the minutes: the pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts.
 
-    Args:
-        series: responses of the recordings in the order of time, with the same conditions. At most 12 conditions
-            are drawn.
+    The responses are those of `drift_of`.
     """
     drift = drift_of(series)
     minutes, percentiles = drift.minutes, drift.percentiles_hz

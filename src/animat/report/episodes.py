@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from animat.report.style import grid_of_panels, new_figure, style_axes
+from animat.report.style import Figure, grid_of_panels, new_figure, style_axes
 from animat.robots.base import Robot
 from animat.robots.capabilities import capability
 from animat.robots.drawing import draw_robot
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Path = Float[np.ndarray, "iterations+1 observations"]
 _FRAMES = 7
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
-    """A panel for each arm with one episode of each policy, as the robot draws them.
+    """A panel for each arm with one episode of each policy, as a robot with a method `draw_paths` draws them.
 
-    Args:
-        robot: one with a method `draw_paths`.
-        paths: by arm, the observations of each episode, in the robot's own units.
-        title: of the whole figure.
+    The observations are in the robot's own units.
     """
     draw = capability(robot, "draw_paths")
     figure, panels = grid_of_panels(len(paths), 3, 3.1, 2.5, title)
@@ -39,10 +33,7 @@ def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: st
 def draw_frames(robot: Robot[Any], episodes: Mapping[str, tuple[Path, Sequence[float]]], title: str) -> Figure:
     """A row for each arm: pictures of the robot from the start of an episode to its end, evenly spread.
 
-    Args:
-        robot: one that can be drawn.
-        episodes: by arm, the observations of an episode and its commands.
-        title: of the whole figure.
+    Of each arm's episode the observations and the commands are given.
     """
     first = draw_robot(robot, next(iter(episodes.values()))[0][0])
     wide = first.shape[1] / first.shape[0]

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import GREY, MEDIAN, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import GREY, MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _BINS = 30
 _MOST_PANELS = 12
 
 
 def draw_first_and_last(series: Sequence[Responses]) -> Figure:
-    """Non-burst responses of each condition: filled in the first recording, as an outline in the last.
+    """Non-burst responses of at most 12 conditions: filled in the first recording, as an outline in the last.
 
-    Args:
-        series: responses of the recordings in the order of time, with the same conditions. At most 12 conditions
-            are drawn.
+    All recordings, in the order of time, have the same conditions.
     """
     first, last = series[0], series[-1]
     conditions = first.conditions[:_MOST_PANELS]

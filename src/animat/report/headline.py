@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from animat.report.style import BLUE, GREY, OPTIMUM, SKY, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, SKY, Figure, add_common_legend, new_figure, style_axes
 
 
 @dataclass(frozen=True)
@@ -38,11 +34,8 @@ class ArmReturns:
 def draw_headline(rows: Sequence[ArmReturns], *, narrow: bool = False) -> Figure:
     """A panel a robot, a line an arm: the policies with their interval, random actions, the optimal return.
 
-    The axis reaches as far as returns do; an interval that goes on beyond it ends in an arrow.
-
-    Args:
-        rows: at least one.
-        narrow: as wide as a telephone: the panels below each other.
+    The axis reaches as far as returns do; an interval that goes on beyond it ends in an arrow. A narrow figure is as
+    wide as a telephone, with the panels below each other.
     """
     robots = list(dict.fromkeys(row.robot for row in rows))
     most = max(sum(row.robot == robot for row in rows) for robot in robots)

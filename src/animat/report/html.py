@@ -6,15 +6,15 @@ import base64
 import math
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from animat.errors import InvalidFile
 from animat.report.minus import MINUS, with_minus
 from animat.report.style import PNG_DPI
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 TEMPLATE = "report.html.j2"
 
@@ -78,6 +78,16 @@ class Table:
     folded: bool = False
 
 
+Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
+"""Of a table of records: their names, and the field or a function of a record that gives the cell."""
+
+
+def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) -> Table:
+    """A table with a row a record; `more` as of `Table`."""
+    rows = tuple(tuple(of(each) if callable(of) else getattr(each, of) for _, of in columns) for each in records)
+    return Table(title, tuple(name for name, _ in columns), rows, **more)
+
+
 @dataclass(frozen=True)
 class Section:
     """A section of the page: paragraphs, then points of a list, then figures, then tables."""
@@ -97,14 +107,9 @@ class Section:
 def write_page(
     path: str | os.PathLike[str], title: str, lead: str, sections: Sequence[Section], colophon: Sequence[str]
 ) -> Path:
-    """Write the page, complete or absent.
+    """Write the page, complete or absent; each section has an entry in the list of contents.
 
-    Args:
-        path: the file.
-        title: of the page.
-        lead: under the title.
-        sections: in their order; each has an entry in the list of contents.
-        colophon: lines at the end: versions, seeds.
+    The lead stands under the title; the colophon is lines at the end, with versions and seeds.
 
     Raises:
         InvalidFile: if a figure cannot be read or the page cannot be written.
@@ -121,10 +126,7 @@ def write_page(
     environment.filters["cell"] = cell
     environment.filters["prose"] = with_minus
     text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
-    path = Path(path)
-    with atomic_write(path) as beside:
-        beside.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(Path(path), text)
 
 
 def _bytes(file: Path) -> bytes:

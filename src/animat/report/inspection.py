@@ -89,15 +89,8 @@ def draw_inspection(
 ) -> list[Path]:
     """Draw raster, post-stimulus histogram, burst separation and response histograms into a folder.
 
-    Args:
-        recording: the recording that was inspected.
-        inspection: what was found in it.
-        folder: where to; it is made if it is missing. Files are named after the inspection's name.
-        file_format: `"png"`, `"svg"` or `"pdf"`.
-
-    Returns:
-        The files. A recording without stimuli has a raster and its bursts only, a table of responses no raster and no
-        post-stimulus histogram.
+    Files, in `FORMATS`, are named after the inspection's name. A recording without stimuli has a raster and its bursts
+    only, a table of responses no raster and no post-stimulus histogram.
 
     Raises:
         InvalidFile: if a file cannot be written.
@@ -127,11 +120,7 @@ def figure_stem(name: str) -> str:
 
 
 def expect_unlike_stems(names: Sequence[str], *others: str) -> None:
-    """Raise if the figures of two recordings would have the same names, or a name that is used for others.
-
-    Raises:
-        InvalidArgument: naming it.
-    """
+    """Refuse recordings whose figures would have the same names, or one of these others (InvalidArgument)."""
     stems = [*others, *map(figure_stem, names)]
     for stem in stems:
         if stems.count(stem) > 1:

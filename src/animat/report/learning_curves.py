@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, OPTIMUM, add_common_legend, grid_of_panels, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLUE, GREY, OPTIMUM, Figure, add_common_legend, grid_of_panels, style_axes
 
 _RESAMPLES = 2000
 
@@ -38,12 +34,7 @@ class LearningCurve:
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
-    """A panel for each arm: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum.
-
-    Args:
-        curves: of one robot.
-        title: of the whole figure.
-    """
+    """A panel for each arm: every policy thin, their mean with its 95 % bootstrap interval, random and the optimum."""
     columns = 2 if len(curves) == 4 else min(3, len(curves))
     figure, panels = grid_of_panels(len(curves), columns, 3.1, 2.4, title, share_x=True, share_y=True)
     for axes, curve in zip(panels, curves, strict=True):

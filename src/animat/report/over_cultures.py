@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from animat.report.style import BLACK, BLUE, GREY, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import BLACK, BLUE, GREY, Figure, add_common_legend, new_figure, style_axes
 
 
 @dataclass(frozen=True)
@@ -30,11 +26,7 @@ class Compared:
 
 
 def draw_over_cultures(rows: Sequence[Compared]) -> Figure:
-    """A panel a robot, a line a comparison: a point for each culture, their mean with its interval.
-
-    Args:
-        rows: at least one.
-    """
+    """A panel a robot, a line a comparison: a point for each culture, their mean with its interval."""
     robots = list(dict.fromkeys(row.robot for row in rows))
     figure = new_figure(4.4 * len(robots), 1.3 + 0.5 * max(sum(row.robot == robot for row in rows) for robot in robots))
     panels = figure.subplots(1, len(robots), squeeze=False)[0]

@@ -4,31 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    OPTIMUM,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    add_common_legend,
-    grid_of_panels,
-    style_axes,
-)
+from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
-
-MOST = len(_COLOURS)
+MOST = len(PALETTE)
 """Arms that a panel has colours for."""
 
 
@@ -76,16 +58,13 @@ class Courses:
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
     """A panel a mapping: median over policies of each arm with its quartiles, against the recording's minute.
 
-    Args:
-        panels_of: of one robot.
-        title: of the whole figure.
-        trained_until_min: end of training on the culture's clock, to be marked.
+    The end of training on the culture's clock is marked.
     """
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 3.4, title, share_x=True)
     names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses))
     for axes, of in zip(panels, panels_of, strict=True):
         for course in of.courses:
-            colour = _COLOURS[names.index(course.name) % MOST]
+            colour = PALETTE[names.index(course.name) % MOST]
             low, middle, high = course.quartiles
             axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from animat.report.style import BLUE, GREY, RED, WINDOW, add_legend, new_figure, style_axes
+from animat.report.style import BLUE, GREY, RED, WINDOW, Figure, add_legend, new_figure, style_axes
 from animat.responses.psth import PostStimulusHistogram
 
 _ARTEFACT_MS = 5.0
 """Bins nearer to the stimulus than this do not set the height of the axis when they would dwarf all others."""
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw_psth(
@@ -21,10 +16,7 @@ def draw_psth(
 ) -> Figure:
     """Mean rate per channel against the time from the stimulus; what is lost in the artefact stands out as empty.
 
-    Args:
-        histogram: the counts.
-        window_ms: the window to mark.
-        spontaneous_hz: rate per channel without stimuli, drawn as a line.
+    The response window is marked, and the spontaneous rate, per channel too, is a line.
     """
     figure = new_figure(7.5, 3.8)
     axes = figure.subplots()
@@ -49,11 +41,6 @@ def draw_psth(
         axes.set_ylim(0, highest_hz)
     else:
         axes.set_ylim(0, None)
-    style_axes(
-        axes,
-        title,
-        "time from stimulus (ms)",
-        "firing rate (Hz per channel)",
-    )
+    style_axes(axes, title, "time from stimulus (ms)", "firing rate (Hz per channel)")
     add_legend(axes, loc="upper right")
     return figure

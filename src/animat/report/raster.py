@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, RED, WINDOW, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import BLACK, RED, WINDOW, Axes, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 from animat.responses.windows import spikes_in
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.tables import evenly
 
 _MOST_STIMULI = 300
 _MOST_LABELS = 12
@@ -23,22 +18,17 @@ _MOST_DOTS = 3000
 _MOST_BINS = 100
 
 
-def draw_raster(
-    recording: Recording, responses: Responses, from_ms: float = -20.0, to_ms: float | None = None
-) -> Figure:
+def draw_raster(recording: Recording, responses: Responses) -> Figure:
     """Spikes by channel in a stretch of the recording, and by stimulus around it, sorted by condition.
 
-    Args:
-        recording: the spikes.
-        responses: the responses, made from this recording.
-        from_ms, to_ms: the span around a stimulus; to_ms is by default 50 ms, or twice the window's end if that is
-            later.
+    From 20 ms before a stimulus to 50 ms after it, or to twice the window's end if that is later. The responses are
+    made from this recording.
     """
-    to_ms = max(50.0, 2 * responses.window_ms[1]) if to_ms is None else to_ms
+    to_ms = max(50.0, 2 * responses.window_ms[1])
     figure = new_figure(8.0, 7.0)
     upper, lower = figure.subplots(2, 1, height_ratios=[1, 1.25])
     _draw_stretch(upper, recording)
-    _draw_stimuli(lower, recording, responses, from_ms, to_ms)
+    _draw_stimuli(lower, recording, responses, -20.0, to_ms)
     return figure
 
 
@@ -52,12 +42,7 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
         from_s, to_s = shown[0] - margin_s, shown[-1] + max(margin_s, 0.02)
     _, spike = spikes_in(recording, np.array([from_s]), np.array([to_s]))
     axes.scatter(
-        recording.spike_times_s[spike],
-        recording.spike_channels[spike],
-        s=4,
-        color=BLACK,
-        linewidths=0,
-        rasterized=True,
+        recording.spike_times_s[spike], recording.spike_channels[spike], s=4, color=BLACK, linewidths=0, rasterized=True
     )
     # Whatever else falls into it.
     inside = times_s[(times_s >= from_s) & (times_s <= to_s)]
@@ -75,7 +60,7 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     """Stimuli as rows, sorted by condition and then in time; evenly thinned where there are too many to see."""
     start_ms, end_ms = responses.window_ms
     times_s = np.empty(0) if responses.time_s is None else responses.time_s
-    chosen = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _MOST_STIMULI)).round().astype(np.int64))
+    chosen = evenly(len(times_s), _MOST_STIMULI)
     chosen = chosen[np.argsort(responses.condition[chosen], kind="stable")]
     row, spike = spikes_in(recording, times_s[chosen] + from_ms * 1e-3, times_s[chosen] + to_ms * 1e-3)
     lag_ms = 1e3 * (recording.spike_times_s[spike] - times_s[chosen[row]])

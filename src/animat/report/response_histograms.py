@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import MEDIAN, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MOST_PANELS = 16
 _BINS = 30

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import MEDIAN, condition_colours, new_figure, style_axes
+from animat.report.style import MEDIAN, Figure, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.tables import evenly
 
 _BINS = 24
 _MOST_ROWS = 20
@@ -22,13 +19,10 @@ _MOST_CONDITIONS = 8
 def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     """A column a condition, a row a recording, the first at the top: its non-burst responses, and their median.
 
-    At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so.
-
-    Args:
-        series: responses of the recordings in the order of time, with the same conditions.
+    At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so. All recordings, in the
+    order of time, have the same conditions.
     """
-    rows = np.unique(np.linspace(0, len(series) - 1, min(len(series), _MOST_ROWS)).round().astype(int))
-    shown = [series[row] for row in rows]
+    shown = [series[row] for row in evenly(len(series), _MOST_ROWS)]
     conditions = shown[0].conditions[:_MOST_CONDITIONS]
     rates = [[responses.rates_of(i) for responses in shown] for i in range(len(conditions))]
     edges_hz = rate_edges(shown[0], np.concatenate([x for of in rates for x in of]), _BINS)

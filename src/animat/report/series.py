@@ -19,16 +19,10 @@ from animat.responses.responses import Responses
 def draw_series(
     first: Recording | None, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
 ) -> list[Path]:
-    """Draw a series: `series-array`, `series-responses`, `series-over-time` (of the first condition), `series-drift`.
+    """Draw a series: `series-array`, `series-responses`, `series-over-time`, `series-drift`, in one of `FORMATS`.
 
-    Args:
-        first: the first recording, for the array; None: it is not drawn.
-        series: responses of all recordings, in any order.
-        folder: where to; it is made if it is missing.
-        file_format: `"png"`, `"svg"` or `"pdf"`.
-
-    Returns:
-        The files: the array only where its positions are known, the others only for two recordings or more.
+    The array is that of the first recording, where its positions are known; the others, of responses in any order, are
+    drawn for two recordings or more.
 
     Raises:
         InvalidArgument: for no responses.

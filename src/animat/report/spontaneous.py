@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, WINDOW, add_legend, new_figure, style_axes
+from animat.report.style import BLACK, WINDOW, Figure, add_legend, new_figure, style_axes
 from animat.responses.network_bursts import NetworkBursts
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.tables import evenly
 
 _MOST_SPIKES = 200_000
 _MOST_BINS = 2_000
 
 
 def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
-    """Spikes by channel and the rate per channel, over the whole recording, with the network bursts marked.
-
-    Args:
-        recording: without stimuli.
-        bursts: found in it.
-    """
+    """Spikes by channel and the rate per channel, over the whole recording, with the network bursts marked."""
     figure = new_figure(8.0, 7.0)
     upper, lower = figure.subplots(2, 1, height_ratios=[2, 1], sharex=True)
     n = len(recording.spike_times_s)
-    shown = np.unique(np.linspace(0, n - 1, min(n, _MOST_SPIKES)).round().astype(np.int64))
+    shown = evenly(n, _MOST_SPIKES)
     size = 4.0 if n < 10_000 else 1.0
     upper.scatter(
         recording.spike_times_s[shown],

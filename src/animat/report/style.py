@@ -11,8 +11,11 @@ from animat.errors import InvalidArgument
 from animat.writing import atomic_write
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    # For annotations alone: matplotlib is loaded where something is drawn.
+    Axes = Figure = Any
 
 FORMATS = ("png", "svg", "pdf")
 
@@ -28,6 +31,8 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (
     "#D55E00",
     "#CC79A7",
 )
+PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
+"""In the order in which they are taken."""
 GREY = "#8C8C8C"
 WINDOW = ORANGE
 NON_BURST = BLUE
@@ -83,7 +88,7 @@ def condition_colours(units: Sequence[str]) -> list[str]:
     if n > 1 and (n > 6 or all(unit == "Hz" for unit in units)):
         # The last tenth of cividis is too pale on white.
         return [to_hex(colormaps["cividis"](0.88 * i / (n - 1))) for i in range(n)]
-    return [BLUE, ORANGE, GREEN, PURPLE, SKY, RED][:n]
+    return list(PALETTE[:n])
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
@@ -106,14 +111,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def grid_of_panels(
-    n: int,
-    columns: int,
-    width_in: float,
-    height_in: float,
-    title: str,
-    *,
-    share_x: bool = False,
-    share_y: bool = False,
+    n: int, columns: int, width_in: float, height_in: float, title: str, *, share_x: bool = False, share_y: bool = False
 ) -> tuple[Figure, list[Axes]]:
     """A figure of n panels in rows, each of a size in inches, and its panels; places left over stay empty."""
     columns = min(columns, max(n, 1))

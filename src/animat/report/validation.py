@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.neurons.free_runs import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
-from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, Figure, add_common_legend, new_figure, style_axes
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
 _HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"
@@ -81,7 +76,9 @@ def draw_validation(name: str, validation: Validation) -> Figure:
     style_axes(runs, "runs of x ≥ P50 (command above 0)", "run length (trials)", "share that last as long (-)")
     for axes, of in ((correlation, "autocorrelation"), (runs, "lasting")):
         for s in shown:
-            _draw_band(axes, lags, getattr(s, of), _COLOURS[s.kind])
+            band: Band = getattr(s, of)
+            axes.fill_between(lags, band.low, band.high, color=_COLOURS[s.kind], alpha=0.2, linewidth=0)
+            axes.plot(lags, band.mean, color=_COLOURS[s.kind], linewidth=1.2)
         recorded = getattr(v, of)
         # A share of 0 has no place on an axis of logarithms.
         recorded = np.where(recorded > 0, recorded, np.nan) if of == "lasting" else recorded
@@ -94,8 +91,3 @@ def draw_validation(name: str, validation: Validation) -> Figure:
     runs.yaxis.set_major_formatter("{x:g}")
     add_common_legend(figure, [calibration, correlation], columns=6)
     return figure
-
-
-def _draw_band(axes: Axes, x: Any, band: Band, colour: str) -> None:
-    axes.fill_between(x, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
-    axes.plot(x, band.mean, color=colour, linewidth=1.2)

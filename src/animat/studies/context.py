@@ -11,26 +11,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from animat.differences import description_in, fingerprint_of, first_difference, of_another
+from animat.differences import description_in, first_difference, of_another, with_fingerprint
 from animat.errors import InvalidFile
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
+from animat.records import write_json
 from animat.robots.registry import robot_named
-from animat.studies.context_tasks import (
-    MEASURED,
-    SIMULATED,
-    ContextStudy,
-    Judge,
-    Measure,
-    RecordCulture,
-    TrainPolicies,
-    read_json,
-    rows_by_name,
-    write_json,
-)
+from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
 from animat.studies.places import RECEIPTS
-from animat.studies.results import write_records, write_table
+from animat.studies.results import write_records
 from animat.training.settings import LEARNER
 from animat.writing import exclusive_lock
 
@@ -102,12 +92,9 @@ class LostRow:
 
 @dataclass(frozen=True)
 class RanContext:
-    """What a run of the study came to.
+    """What a run of the study came to: rows of each culture and robot, and what was lost by each intervention.
 
     Attributes:
-        folder: of the study.
-        rows: of each culture and robot.
-        lost: of each culture, robot and intervention.
         done_now: processor seconds of each job that this run did.
     """
 
@@ -130,9 +117,7 @@ def run_context_study(
     Args:
         study: the specification.
         folder: where everything goes; made if it is missing.
-        workers: processes, each on a core of its own; None: one a core. Not with an executor.
-        executor: where jobs are run, in view of the folder; it stays open. None: processes on this machine.
-        progress: told how far it is, and what runs.
+        workers, executor, progress: as of `animat.studies.run.run_study`.
 
     Raises:
         Mismatch: if the folder is another study's, or another run is at work in it.
@@ -157,9 +142,7 @@ def run_context_study(
         rows = tuple(_row(folder, *pair) for pair in pairs)
         lost = tuple(row for pair in pairs for row in _lost(folder, *pair))
         write_records(folder / TABLE, ContextRow, rows)
-        write_table(
-            folder / WHOSE_WORK, list(LostRow.__dataclass_fields__), [tuple(asdict(row).values()) for row in lost]
-        )
+        write_records(folder / WHOSE_WORK, LostRow, lost)
     return RanContext(folder, rows, lost, took_s)
 
 
@@ -169,8 +152,7 @@ def _describe(study: ContextStudy) -> dict[str, Any]:
     packages = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba")
     versions = {name: importlib.metadata.version(name) for name in packages}
     versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
-    told = json.loads(json.dumps({"context study": asdict(study), "versions": versions}))
-    return {**told, "fingerprint": fingerprint_of(told)}
+    return with_fingerprint({"context study": asdict(study), "versions": versions})
 
 
 def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
@@ -205,28 +187,20 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
 
 
 def _row(folder: Path, culture: int, robot: str) -> ContextRow:
-    told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)
-    in_turn = read_json(folder / f"culture-{culture}" / robot / MEASURED)["rows"]
-    measured = rows_by_name(in_turn)
-    simulated = rows_by_name(told["rows"])
+    told = _read(folder, culture, robot, SIMULATED)
+    in_turn = _read(folder, culture, robot, MEASURED)["rows"]
+    simulated = {row["name"]: row["mean_return"] for row in told["rows"]}
+    measured = {row["name"]: row["measured"] for row in in_turn}
     context = told["context"] or {}
-    gap = context.get("context_gap") or {}
-    score = told["context_score"] or {}
+    gap, score = context.get("context_gap") or {}, told["context_score"] or {}
     information = told["whose_work"]["rows"][0]["goal_information"]
-
-    def in_loop(name: str) -> float | None:
-        return measured[name]["measured"] if name in measured else None
-
-    def on_simulator(name: str) -> float | None:
-        return simulated[name]["mean_return"] if name in simulated else None
-
     return ContextRow(
         culture=culture,
         robot=robot,
-        random=simulated["random"]["mean_return"],
-        heuristic=on_simulator("heuristic"),
-        coupling=on_simulator("coupling"),
-        policies=simulated["policies"]["mean_return"],
+        random=simulated["random"],
+        heuristic=simulated.get("heuristic"),
+        coupling=simulated.get("coupling"),
+        policies=simulated["policies"],
         optimum=None if told["optimum"] is None else told["optimum"]["value"],
         best_known=context.get("best_known"),
         gap=gap.get("value"),
@@ -236,9 +210,9 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
         score_low_95=score.get("low"),
         score_high_95=score.get("high"),
         bits=None if information is None else information["bits"]["value"],
-        measured_random=in_loop("random"),
-        measured_heuristic=in_loop("heuristic"),
-        measured_coupling=in_loop("coupling"),
+        measured_random=measured.get("random"),
+        measured_heuristic=measured.get("heuristic"),
+        measured_coupling=measured.get("coupling"),
         # All of them together; of one alone its own row.
         measured_policies=in_turn[0]["measured"],
         predicted_policies=in_turn[0]["predicted"],
@@ -246,16 +220,12 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
 
 
 def _lost(folder: Path, culture: int, robot: str) -> list[LostRow]:
-    told = read_json(folder / f"culture-{culture}" / robot / SIMULATED)["whose_work"]["rows"]
+    told = _read(folder, culture, robot, SIMULATED)["whose_work"]["rows"]
     return [
-        LostRow(
-            culture=culture,
-            robot=robot,
-            intervention=row["name"],
-            mean_return=row["mean_return"],
-            lost=row["lost"]["value"],
-            lost_low_95=row["lost"]["low"],
-            lost_high_95=row["lost"]["high"],
-        )
+        LostRow(culture, robot, row["name"], row["mean_return"], *(row["lost"][of] for of in ("value", "low", "high")))
         for row in told[1:]
     ]
+
+
+def _read(folder: Path, culture: int, robot: str, name: str) -> Any:
+    return json.loads((folder / f"culture-{culture}" / robot / name).read_text())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from animat.report.context import Estimate, draw_context, draw_whose_work
-from animat.report.html import Picture, Section, Table, cell, write_page
+from animat.report.html import Columns, Picture, Section, Table, cell, table_of, write_page
 from animat.report.style import FORMATS, save_figure
 from animat.studies.context import ADMITTED, TABLE, WHOSE_WORK, ContextRow, LostRow, RanContext
 from animat.studies.context_tasks import ContextStudy
@@ -128,49 +128,40 @@ def _lost_table(lost: dict[str, dict[str, list[float]]]) -> Table:
 
 
 def _table(rows: Sequence[ContextRow]) -> Table:
-    head = (
-        "robot",
-        "culture",
-        "random",
-        "heuristic",
-        "best coupling",
-        "policies",
-        "optimum",
-        "gap",
-        "score, 95 %",
-        "bits",
-        "measured: random",
-        "measured: heuristic",
-        "measured: best coupling",
-        "measured: policies",
-        "predicted: policies",
-    )
-    cells = tuple(
-        (
-            row.robot,
-            row.culture,
-            row.random,
-            row.heuristic,
-            row.coupling,
-            row.policies,
-            row.optimum if row.best_known is None else f"≥ {cell(row.best_known)}",
-            None if row.gap is None else least + f"{row.gap:.2f}".replace("-", "−"),
-            None
-            if row.score is None
-            else f"{least}{cell(row.score)} ({cell(row.score_low_95)} to {cell(row.score_high_95)})",
-            row.bits,
-            row.measured_random,
-            row.measured_heuristic,
-            row.measured_coupling,
-            row.measured_policies,
-            row.predicted_policies,
-        )
-        for row, least in ((row, "≥ " if row.is_least else "") for row in rows)
-    )
+    columns: Columns = [
+        ("robot", "robot"),
+        ("culture", "culture"),
+        ("random", "random"),
+        ("heuristic", "heuristic"),
+        ("best coupling", "coupling"),
+        ("policies", "policies"),
+        ("optimum", lambda row: row.optimum if row.best_known is None else f"≥ {cell(row.best_known)}"),
+        ("gap", _gap),
+        ("score, 95 %", _score),
+        ("bits", "bits"),
+        ("measured: random", "measured_random"),
+        ("measured: heuristic", "measured_heuristic"),
+        ("measured: best coupling", "measured_coupling"),
+        ("measured: policies", "measured_policies"),
+        ("predicted: policies", "predicted_policies"),
+    ]
     note = (
         "Mean returns on the simulator of the last recording; measured: in closed loop on the culture, from where its "
         "recordings ended, beside the returns predicted for the same policies. Bits: goal information, of robots with "
         "several goals. ≥: no optimal return is known. The gap is then with the best of policies and heuristic in its "
         "place, and the score with the highest return of any episode: both are at least that."
     )
-    return Table("Tasks and cultures", head, cells, note=note, beside=TABLE)
+    return table_of("Tasks and cultures", rows, columns, note=note, beside=TABLE)
+
+
+def _gap(row: ContextRow) -> str | None:
+    return None if row.gap is None else _least(row) + f"{row.gap:.2f}".replace("-", "−")
+
+
+def _score(row: ContextRow) -> str | None:
+    ends = f"({cell(row.score_low_95)} to {cell(row.score_high_95)})"
+    return None if row.score is None else f"{_least(row)}{cell(row.score)} {ends}"
+
+
+def _least(row: ContextRow) -> str:
+    return "≥ " if row.is_least else ""

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
-from animat.devices import gpu_here
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
-from animat.execution.trains import Work, train_alone
+from animat.execution.trains import train_alone
 from animat.progress import Progress
-from animat.records import Positive, Seed, Whole, as_json, record
+from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.responses import Responses
 from animat.studies.draws import draw_seed
-from animat.writing import atomic_write
 
 if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol
@@ -83,12 +80,7 @@ def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
 
 @dataclass(frozen=True)
 class ContextTask(Task):
-    """A part of the study on one culture.
-
-    Attributes:
-        study: the specification.
-        culture: its seed.
-    """
+    """A part of the study on the culture of one seed."""
 
     study: ContextStudy
     culture: int
@@ -109,11 +101,7 @@ class ContextTask(Task):
 @final
 @dataclass(frozen=True)
 class RecordCulture(ContextTask):
-    """Record the culture twice, five minutes apart.
-
-    Attributes:
-        n_commands: of the robots that it is recorded for.
-    """
+    """Record the culture twice, five minutes apart, for robots with so many commands."""
 
     n_commands: int = 1
 
@@ -136,11 +124,7 @@ class RecordCulture(ContextTask):
 
 @dataclass(frozen=True)
 class RobotTask(ContextTask):
-    """A part of the study with one robot.
-
-    Attributes:
-        robot: its name.
-    """
+    """A part of the study with the robot of one name."""
 
     robot: str
 
@@ -177,8 +161,7 @@ class TrainPolicies(RobotTask):
         from animat.coding.mapping import mapping_named
         from animat.neurons.timeline import fit_timeline
         from animat.robots.registry import robot_named
-        from animat.training.folder import describe, provenance_of
-        from animat.training.group import Group
+        from animat.studies.training import work_on
         from animat.training.specification import Training
 
         robot, timeline = robot_named(self.robot), fit_timeline(self.series(folder))
@@ -190,12 +173,9 @@ class TrainPolicies(RobotTask):
             seed=self.drawn("context"),
             shadowing=True,
         ).over(timeline)
-        manifest = describe(training, timeline, device=gpu_here())
-        out = self.beside(folder, POLICIES)
-        members = tuple(range(training.policies))
-        group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / f"culture-{self.culture}" / f"{self.robot}.npz"
-        return train_alone(Work(group, out, checkpoint, description=manifest), progress)
+        members = tuple(range(training.policies))
+        return train_alone(work_on(training, members, timeline, self.beside(folder, POLICIES), checkpoint), progress)
 
 
 @final
@@ -265,20 +245,3 @@ def presented_for(n_commands: int) -> Protocol:
     from animat.stimulation import protocol
 
     return protocol.CLOSED_LOOP if n_commands == 1 else protocol.TWO_COMMANDS
-
-
-def write_json(path: Path, words: Any) -> Path:
-    """Plain data as a file, whole or absent."""
-    with atomic_write(path) as beside:
-        beside.write_text(json.dumps(as_json(words), indent=1, sort_keys=True) + "\n")
-    return path
-
-
-def read_json(path: Path) -> Any:
-    """What `write_json` wrote."""
-    return json.loads(path.read_text())
-
-
-def rows_by_name(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Rows of a table that was written, by their names."""
-    return {row["name"]: row for row in rows}

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,16 +19,16 @@ from animat.errors import AnimatError
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
-from animat.execution.pinned import PinnedProcesses
+from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.progress import Progress, Silent
 from animat.studies.parquet import write_parquet
 from animat.studies.places import results_file
-from animat.studies.results import ComparedReturns, Results, Score, read_typed, write_records, write_table
+from animat.studies.results import ComparedReturns, Results, Score, read_typed, write_named_records, write_records
 from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND, TOO_FEW
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 RESAMPLES = 10_000
 MOST_AT_ONCE = 64
@@ -139,8 +139,7 @@ def run_over_cultures(
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
-    with atomic_write(folder / MANIFEST) as unfinished:
-        unfinished.write_text(json.dumps({"cultures": list(studies)}, indent=1) + "\n")
+    write_whole(folder / MANIFEST, json.dumps({"cultures": list(studies)}, indent=1) + "\n")
     with _room(workers, executor) as (room, at_once):
         here = workers if room is None else None
         runs = {
@@ -153,13 +152,11 @@ def run_over_cultures(
     results = {name: read_typed(results_file(each.folder), Results) for name, each in ran.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
-    head = ["culture", *ComparedReturns.__dataclass_fields__]
-    rows = [(name, *asdict(row).values()) for name, compared in comparisons.items() for row in compared]
-    write_table(folder / COMPARISONS, head, rows)
-    write_records(folder / SUMMARY, OverCultures, summary)
+    compared = [(name, row) for name, rows in comparisons.items() for row in rows]
     scores = [(name, score) for name, each in results.items() for score in each.scores]
-    rows = [(name, *asdict(score).values()) for name, score in scores]
-    write_table(folder / SCORES, ["culture", *Score.__dataclass_fields__], rows)
+    write_named_records(folder / COMPARISONS, compared, ComparedReturns, "culture")
+    write_records(folder / SUMMARY, OverCultures, summary)
+    write_named_records(folder / SCORES, scores, Score, "culture")
     parquet = (folder / SCORES).with_suffix(".parquet")
     is_written = write_parquet(parquet, scores, Score, "culture")
     return RanCultures(folder, ran, failed, comparisons, summary, parquet if is_written else None)
@@ -174,7 +171,7 @@ def _room(workers: int | None, executor: Executor | None) -> Iterator[tuple[Exec
         # It trains all policies of a culture at once.
         yield None, 1
     else:
-        cores = sorted(os.sched_getaffinity(0))[:workers]
+        cores = own_cores(workers)
         with PinnedProcesses(cores) as ours:
             yield ours, len(cores)
 
@@ -245,21 +242,17 @@ class _Together:
             self._whole.update(self._ended + sum(self._shares.values()), self._studies, note)
 
 
-@dataclass(frozen=True)
 class _OfOne:
-    see: Callable[[float], None]
+    def __init__(self, see: Callable[[float], None]) -> None:
+        self._see = see
 
     def update(self, done: float, total: float, note: str = "") -> None:
         """Tell the others of it."""
-        self.see(done / total)
+        self._see(done / total)
 
 
 def over_cultures(found: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
-    """Each comparison over cultures.
-
-    Args:
-        found: the comparisons of each culture, the same ones in the same order.
-    """
+    """Each comparison over cultures, of which all have the same ones in the same order."""
     return tuple(_over(rows) for rows in zip(*found, strict=True))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from animat.report.html import Picture, Section, Table, write_page
+from animat.report.html import Picture, Section, table_of, write_page
 from animat.report.over_cultures import Compared, draw_over_cultures
 from animat.report.style import FORMATS, save_figure
 from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
@@ -36,25 +36,19 @@ def _drawn(found: RanCultures, i: int, row: OverCultures) -> Compared:
 
 def _in_short(study: Study, found: RanCultures) -> Section:
     points = tuple((f"{row.robot}, {row.comparison}", _told(row)) for row in found.summary)
-    means = "mean first", "mean second", "difference", "95 % interval"
-    head = ("comparison", "robot", *means, "larger in", "found better in")
-    rows = tuple(
-        (
-            row.comparison,
-            row.robot,
-            row.mean_first,
-            row.mean_second,
-            row.difference,
-            "–" if row.low_95 is None else f"{row.low_95:.1f} to {row.high_95:.1f}".replace("-", "−"),
-            f"{row.larger_in} of {row.cultures}",
-            row.found_better,
-        )
-        for row in found.summary
-    )
-    table = Table(
+    table = table_of(
         "Over cultures",
-        head,
-        rows,
+        found.summary,
+        [
+            ("comparison", "comparison"),
+            ("robot", "robot"),
+            ("mean first", "mean_first"),
+            ("mean second", "mean_second"),
+            ("difference", "difference"),
+            ("95 % interval", _interval),
+            ("larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
+            ("found better in", "found_better"),
+        ],
         note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
         "narrow of fewer than ten.",
         beside=SUMMARY,
@@ -72,6 +66,10 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         "be reached with so few policies, it only counts in how many cultures its mean return is the larger one."
     )
     return Section("Results in short", (said,), points, (table,), (picture,))
+
+
+def _interval(row: OverCultures) -> str:
+    return "–" if row.low_95 is None else f"{row.low_95:.1f} to {row.high_95:.1f}".replace("-", "−")
 
 
 def _told(row: OverCultures) -> str:

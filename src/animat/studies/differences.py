@@ -120,9 +120,7 @@ def came_out_otherwise(
 ) -> tuple[tuple[str, str], ...]:
     """For each comparison that differs from the paper or cannot tell: what came out, and what its optimum says to it.
 
-    Args:
-        rows: of the table of comparisons.
-        lost: how far binning moved P(x >= P50) of any condition, by the recording's minute.
+    By the recording's minute it is given how far binning moved P(x >= P50) of any condition.
     """
     told = []
     for row in rows:

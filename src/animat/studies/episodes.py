@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,7 +13,11 @@ from animat.evaluation.rollouts import Episodes
 from animat.studies.results import read_arrays, write_arrays
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame as DataFrame
+    from pandas import Series
+else:
+    # For annotations alone: pandas is loaded where tables are worked with.
+    DataFrame = Any
 
 COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "return", "iterations", "ended")
 """Of the table:

@@ -43,7 +43,7 @@ class Evaluate(StudyTask):
         setting = setting_of(study, self.spec, self.arm, timeline)
         networks = _networks(study, folder, self.spec, self.arm)
         robot, slug, n = self.spec.name, self.arm.slug, study.policies
-        first, last = first_minute(timeline), last_minute(timeline)
+        first, last = span_min(timeline)
         parts = []
         for at_min, episodes in study.minutes_of(self.arm, first, last).items():
             ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
@@ -83,10 +83,10 @@ class Control(StudyTask):
         arm, robot = replace(self.plain, delivery="chosen"), self.spec.name
         setting = setting_of(study, self.spec, arm, timeline)
         name = f"controls-{arm.thresholds}"
-        through = named_mapping(arm.mapping, arm.percentiles)
+        through = named_mapping(*arm.kind)
         networks = _networks(study, folder, self.spec, self.plain) if is_usual(self.plain) else None
         parts = []
-        first, last = first_minute(timeline), last_minute(timeline)
+        first, last = span_min(timeline)
         minutes = study.optimum_minutes(first, last) if arm.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
@@ -112,12 +112,7 @@ class Control(StudyTask):
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What policies are run in: an environment, and the neurons of every minute.
-
-    Attributes:
-        timeline: None without neurons.
-        action_labels: of discrete actions.
-    """
+    """What policies are run in: an environment, the neurons of every minute (None without), labels of its actions."""
 
     environment: Environment[Any]
     timeline: SimulatorTimeline | None
@@ -156,14 +151,9 @@ def is_usual(arm: Arm) -> bool:
     return arm.trained and arm.delivery == "chosen" and arm.through_neurons
 
 
-def first_minute(timeline: SimulatorTimeline | None) -> float:
-    """Of the recordings; 0 without any."""
-    return 0.0 if timeline is None else float(timeline.start_min[0])
-
-
-def last_minute(timeline: SimulatorTimeline | None) -> float:
-    """Of the recordings; 0 without any."""
-    return 0.0 if timeline is None else float(timeline.start_min[-1])
+def span_min(timeline: SimulatorTimeline | None) -> tuple[float, float]:
+    """The minutes of the first recording and of the last; 0 without any."""
+    return (0.0, 0.0) if timeline is None else (float(timeline.start_min[0]), float(timeline.start_min[-1]))
 
 
 def _networks(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Networks:

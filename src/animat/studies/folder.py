@@ -1,16 +1,16 @@
-"""A study's folder: whose it is, what in it is done, and that no two runs work in it at once."""
+"""A study's or a tuning's folder: whose it is, and that no two runs work in it at once."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from animat.differences import description_in, fingerprint_of, first_difference, of_another
+from animat.differences import description_in, first_difference, of_another, with_fingerprint
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
@@ -20,7 +20,7 @@ from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
 from animat.training.settings import LEARNER
-from animat.writing import LOCK, atomic_write, clear_away, exclusive_lock, is_unfinished
+from animat.writing import LOCK, clear_away, exclusive_lock, is_unfinished, write_whole
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
@@ -50,16 +50,15 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
             versions |= robot.versions
     if device is not None:
         versions["device"] = device
-    told: dict[str, Any] = {
-        "study": study.to_dict(),
-        "sources": sources,
-        # Another version may round otherwise, or draw other figures.
-        "versions": {"python": platform.python_version(), "learner": f"revision {LEARNER}", **versions},
-        "seeds": {"culture": study.culture.seed, "training and evaluation": study.seed},
-    }
-    # By way of JSON, in which a tuple and a list are the same.
-    told = json.loads(json.dumps(told))
-    return told | {"fingerprint": fingerprint_of(told)}
+    return with_fingerprint(
+        {
+            "study": study.to_dict(),
+            "sources": sources,
+            # Another version may round otherwise, or draw other figures.
+            "versions": {"python": platform.python_version(), "learner": f"revision {LEARNER}", **versions},
+            "seeds": {"culture": study.culture.seed, "training and evaluation": study.seed},
+        }
+    )
 
 
 def source_files(study: Study, base: Path) -> list[Path]:
@@ -107,51 +106,67 @@ def _place(file: Path, base: Path) -> str:
 
 
 @contextmanager
-def held(folder: Path, study: Study, manifest: dict[str, Any]) -> Iterator[None]:
-    """Make the folder this study's, or see that it is; keep other runs out; clear away what a killed one was writing.
+def held(
+    folder: Path,
+    what: str,
+    manifest: dict[str, Any],
+    file: str,
+    beside: Mapping[str, str],
+    own_folders: Iterable[str] = OWN_FOLDERS,
+) -> Iterator[None]:
+    """Make the folder this work's, or see that it is; keep other runs out; clear away what a killed one was writing.
 
-    Nothing in the folder is touched before it is known to be this study's.
+    Nothing in the folder is touched before it is known to be this work's.
+
+    Args:
+        folder: of the work.
+        what: it is, for messages: a `study`.
+        manifest: its description, with a fingerprint.
+        file: in which that lies.
+        beside: what is written beside it, by the files' names.
+        own_folders: all that it makes in its folder.
 
     Raises:
-        Mismatch: if it is another study's, holds other files, or another run is at work in it.
+        Mismatch: if it is another one's, holds other files, or another run is at work in it.
         InvalidFile: if it cannot be read or made.
     """
     if folder.exists() and not folder.is_dir():
-        raise InvalidFile(f"{folder}: expected a folder for the study, got a file")
-    _is_ours(folder, manifest)
+        raise InvalidFile(f"{folder}: expected a folder for the {what}, got a file")
+    files = {file: json.dumps(manifest, indent=1, sort_keys=True) + "\n", **beside}
+    _is_ours(folder, what, manifest, [*files])
     with exclusive_lock(folder):
-        if not _is_ours(folder, manifest):
-            for path, words in (
-                (folder / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True) + "\n"),
-                (folder / SPECIFICATION, _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)),
-            ):
-                with atomic_write(path) as beside:
-                    beside.write_text(words)
-        for leftover in [*folder.iterdir(), *(path for name in OWN_FOLDERS for path in (folder / name).rglob("*"))]:
+        if not _is_ours(folder, what, manifest, [*files]):
+            for name, words in files.items():
+                write_whole(folder / name, words)
+        for leftover in [*folder.iterdir(), *(path for name in own_folders for path in (folder / name).rglob("*"))]:
             if is_unfinished(leftover):
                 clear_away(leftover)
         yield
 
 
-def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
-    """Whether the study is already in the folder; not if it is free for it.
+def described_beside(study: Study) -> dict[str, str]:
+    """What lies beside a study's description: its specification, to be changed and run."""
+    return {SPECIFICATION: _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)}
+
+
+def _is_ours(folder: Path, what: str, manifest: dict[str, Any], files: list[str]) -> bool:
+    """Whether the work is already in the folder; not if it is free for it.
 
     Raises:
-        Mismatch: if it is another study's, or holds other files.
-        InvalidFile: if its description cannot be read.
+        Mismatch: if it is another one's, or holds other files.
+        InvalidFile: if its description, the first of its files, cannot be read.
     """
-    found = description_in(folder / MANIFEST, "study")
+    found = description_in(folder / files[0], what)
     if found is None:
-        others = [e for e in folder.iterdir() if not _is_passing(e)] if folder.is_dir() else []
-        if others:
-            raise Mismatch(f"{folder}: expected an empty folder or one of this study, got one with other files in it")
+        if folder.is_dir() and not all(map(_is_passing, folder.iterdir())):
+            raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
         return False
     if found["fingerprint"] == manifest["fingerprint"]:
-        return (folder / SPECIFICATION).exists()
-    # A study that stopped at its first step left a specification and no more.
+        return all((folder / name).exists() for name in files)
+    # What stopped at its first step left these and no more.
     begun = (path for path in folder.rglob("*") if not path.is_dir() and not _is_passing(path))
-    if any(path.name not in (MANIFEST, SPECIFICATION) for path in begun):
-        raise of_another(folder, "study", first_difference(found, manifest, ignoring=("fingerprint",)))
+    if any(path.name not in files for path in begun):
+        raise of_another(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
 
 

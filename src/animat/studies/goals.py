@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 from animat.goals.robot import RobotWithGoal
 from animat.report.html import Table
-from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED
+from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame
 from animat.studies.results import ObjectiveMet
 from animat.studies.specification import Study
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 
 def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
-    """Of each robot with a goal: what its policies and controls came to at each minute.
-
-    Args:
-        table: of episodes.
-    """
+    """Of each robot with a goal: what its policies and controls came to at each minute, by the table of episodes."""
     for spec in study.robots:
         robot = spec.robot()
         if not isinstance(robot, RobotWithGoal):

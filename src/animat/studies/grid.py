@@ -16,10 +16,8 @@ TABLES = ("robots", "arms", "comparisons")
 def without_lists(data: Mapping[str, Any]) -> dict[str, Any]:
     """A specification's plain data with all products named, `{key}` in a name replaced by each value.
 
-    What is no table of the right kind is left for the checks.
-
-    Raises:
-        InvalidArgument: for a name that does not tell products apart, or too many of them.
+    What is no table of the right kind is left for the checks. Raises InvalidArgument for a name that does not tell
+    products apart, or too many of them.
     """
     found = dict(data)
     for table in TABLES:

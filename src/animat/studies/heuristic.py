@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from animat.evaluation.verdict import beside
-from animat.studies.episodes import POLICY
+from animat.studies.episodes import POLICY, DataFrame
 from animat.studies.evaluating import is_usual
 from animat.studies.results import BesideHeuristic, Results
 from animat.studies.specification import RobotSpec, Study, named_mapping
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 HEURISTIC = "heuristic"
 OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few episodes to tell"
 
 
 def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[BesideHeuristic]:
-    """Each arm that is trained as usual, at each minute at which the rule was run too.
-
-    Args:
-        table: of episodes.
-    """
+    """Each arm that is trained as usual, at each minute at which the rule was run too, by the table of episodes."""
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
-    for arm in study.arms:
-        if not is_usual(arm):
-            continue
-        through = named_mapping(arm.mapping, arm.percentiles)
+    for arm in filter(is_usual, study.arms):
+        through = named_mapping(*arm.kind)
         heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
         policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")["return"]
         rule = {at_min: returns.to_numpy() for at_min, returns in heuristic}

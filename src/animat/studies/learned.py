@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from animat.report.html import Table, with_error
+from animat.report.html import Table, table_of, with_error
 from animat.studies.results import Score
 from animat.studies.specification import RobotSpec, Study
 from animat.studies.tabulating import AIM
@@ -26,51 +26,34 @@ def learned_of(study: Study, scores: Sequence[Score]) -> list[Score]:
 def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
     """Scores beside `AIM`, with what is known of the difference."""
     bodies = {spec.name: spec for spec in study.robots}
-    head = (
-        "robot",
-        "arm",
-        "mapping",
-        "at (min)",
-        "mean ± s.e.",
-        "random",
-        "optimum",
-        "run",
-        "without clock",
-        "score",
-        "of without clock",
-        "what is known",
-    )
-    cells = []
-    for row in rows:
-        error = None
-        if row.standard_deviation is not None:
-            error = row.standard_deviation / math.sqrt(row.policies)
-        cells.append(
-            (
-                row.robot,
-                row.arm,
-                row.mapping,
-                row.at_min,
-                with_error(row.mean_return, error),
-                row.random,
-                row.optimum,
-                row.optimum_run,
-                row.optimum_without_clock,
-                row.normalised_score,
-                row.score_without_clock,
-                known_of(row, bodies[row.robot]),
-            )
-        )
-    return Table(
+    return table_of(
         f"As good as the optimum: scores on the simulator trained on, beside {AIM:g}",
-        head,
-        tuple(cells),
+        rows,
+        [
+            ("robot", "robot"),
+            ("arm", "arm"),
+            ("mapping", "mapping"),
+            ("at (min)", "at_min"),
+            ("mean ± s.e.", _mean_with_error),
+            ("random", "random"),
+            ("optimum", "optimum"),
+            ("run", "optimum_run"),
+            ("without clock", "optimum_without_clock"),
+            ("score", "normalised_score"),
+            ("of without clock", "score_without_clock"),
+            ("what is known", lambda row: known_of(row, bodies[row.robot])),
+        ],
         note="Run: the return that the optimum's controller was seen to get. Without clock: what the same controller "
         "gets if it does not know the time left, as policies do not; a better one may exist, not above the optimum. Of "
         "without clock: the score with this in place of the optimum.",
         beside="tables/scores.csv",
         marked=tuple(i for i, row in enumerate(rows) if (row.normalised_score or 0.0) < AIM),
     )
+
+
+def _mean_with_error(row: Score) -> str:
+    spread = row.standard_deviation
+    return with_error(row.mean_return, None if spread is None else spread / math.sqrt(row.policies))
 
 
 def known_of(row: Score, spec: RobotSpec) -> str:

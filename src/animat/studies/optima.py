@@ -12,7 +12,7 @@ from animat.evaluation.resampling import Counted, few_of
 from animat.progress import Part, Progress
 from animat.robots.capabilities import lacking
 from animat.robots.grid import no_grid
-from animat.studies.evaluating import as_recorded, first_minute, last_minute, setting_of
+from animat.studies.evaluating import as_recorded, setting_of, span_min
 from animat.studies.places import optima_file
 from animat.studies.results import StudyOptimum, read_typed, write_typed
 from animat.studies.simulating import read_series
@@ -27,11 +27,8 @@ COARSER = 0.8
 
 def kinds_of(study: Study) -> list[Arm]:
     """One arm for each mapping and way to hold percentiles, delivered as chosen: each has its own optimum."""
-    kinds: dict[tuple[str, str], Arm] = {}
-    for arm in study.arms:
-        optimum = Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles)
-        kinds.setdefault((arm.mapping, arm.percentiles), optimum)
-    return list(kinds.values())
+    alike = [Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles) for arm in study.arms]
+    return list(dict.fromkeys(alike))
 
 
 def rough_kinds(study: Study) -> list[Arm]:
@@ -82,7 +79,7 @@ class FindOptima(StudyTask):
         if no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
         study, timeline = as_recorded(self.study, folder)
-        first, last = first_minute(timeline), last_minute(timeline)
+        first, last = span_min(timeline)
         kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
         resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:
@@ -136,8 +133,7 @@ def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]
     return [
         (kind, at)
         for kind in rough_kinds(study)
-        for arm in study.arms
-        if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles)
+        for arm in study.arms_of(kind)
         for at in study.minutes_of(arm, first, last)
     ]
 

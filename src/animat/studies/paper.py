@@ -47,12 +47,9 @@ COMPARISONS = (
 
 
 def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) -> Study:
-    """The paper's study on a virtual culture; quick: every step of it, with fewer policies, iterations, recordings.
+    """The paper's study on the virtual culture of a seed; another decides every draw of training and evaluation.
 
-    Args:
-        culture_seed: which virtual culture.
-        seed: decides every draw of training and evaluation.
-        quick: for a first look; its figures are no results.
+    Quick is for a first look, which gives no results: every step with fewer policies, iterations and recordings.
     """
     if not quick:
         return Study(

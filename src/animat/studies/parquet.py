@@ -13,19 +13,9 @@ MISSING = "fastparquet is not installed: pip install 'animat[parquet]'"
 
 
 def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name: str) -> bool:
-    """Write records, complete or absent.
+    """Write records, as `write_named_records` takes them, complete or absent; numbers that may be None are NaN there.
 
-    Args:
-        path: of the table.
-        named: of each row what comes before the record, and the record.
-        kind: of the records; numbers that may be None are NaN there.
-        name: of the first column.
-
-    Returns:
-        Whether it was written: not where fastparquet is missing.
-
-    Raises:
-        InvalidFile: if it cannot be written.
+    Returns whether it was written: not where fastparquet is missing.
     """
     try:
         import fastparquet

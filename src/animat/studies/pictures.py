@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, final
+from typing import final
 
 import numpy as np
 
@@ -27,22 +27,13 @@ from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
-from animat.report.style import FORMATS, save_figure
+from animat.report.style import FORMATS, Figure, save_figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.capabilities import lacking
-from animat.studies.episodes import POLICY, RANDOM, mean_returns
-from animat.studies.evaluating import as_recorded, first_minute, last_minute
-from animat.studies.figure_tables import (
-    write_array,
-    write_bursts,
-    write_conditions,
-    write_courses,
-    write_drift,
-    write_learning,
-    write_paths,
-    write_psth,
-)
-from animat.studies.optima import kinds_of, optima_of_all
+from animat.studies import figure_tables
+from animat.studies.episodes import POLICY, DataFrame, mean_returns
+from animat.studies.evaluating import as_recorded, span_min
+from animat.studies.optima import kinds_of
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
 from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
@@ -51,10 +42,6 @@ from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import TRAINED, References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 from animat.training.settings import SAC
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 
 @final
@@ -77,19 +64,19 @@ class CulturePictures(StudyTask):
             "responses": draw_response_histograms(responses),
         }
         tables = [
-            write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
-            write_bursts(folder, series),
-            write_conditions(folder, series),
+            figure_tables.write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
+            figure_tables.write_bursts(folder, series),
+            figure_tables.write_conditions(folder, series),
         ]
         progress.update(0.3, 1, "first recording")
         if first.channels.has_positions:
             figures["array"] = draw_array(first)
-            tables.append(write_array(folder, first))
+            tables.append(figure_tables.write_array(folder, first))
         if len(series) > 1:
             figures["first-and-last"] = draw_first_and_last(series)
             figures["over-time"] = draw_responses_over_time(series)
             figures["drift"] = draw_drift(series)
-            tables.append(write_drift(folder, drift_of(series)))
+            tables.append(figure_tables.write_drift(folder, drift_of(series)))
         return tables + _save(folder, "culture", figures, progress)
 
 
@@ -109,13 +96,14 @@ class RobotPictures(StudyTask):
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
-        rough = _over_time(study, folder, self.spec, table)
+        # At every recording, with the optimum on a rough grid.
+        rough = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
         curves = _curves(study, folder, self.spec, known, rough, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
-            tables.append(write_learning(folder, name, curves))
+            tables.append(figure_tables.write_learning(folder, name, curves))
         if study.comparisons:
             rows = [row for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(_pairs(study, rows, table, known), f"{name}: comparisons")
@@ -124,13 +112,15 @@ class RobotPictures(StudyTask):
             until_min = float(timeline.start_min[0]) + study.training_min
             drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
             figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
-            tables.append(write_courses(folder, name, courses))
+            tables.append(figure_tables.write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
         figures["controls"] = draw_controls(
             _controls(study, [row for row in results.controls if row.robot == name]), f"{name}: controls"
         )
         recorded = {each.name: Paths.load(paths_file(folder, self.spec, each)) for each in study.arms}
-        tables.append(write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded))
+        tables.append(
+            figure_tables.write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded)
+        )
         paths = {arm: of.whole() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
@@ -150,12 +140,13 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     return files
 
 
-Rough: TypeAlias = dict[tuple[str, str, float], tuple[float, float | None]]
-"""By mapping, percentiles and minute: the mean return of random actions, and the optimum on a rough grid if known."""
-
-
 def _curves(
-    study: Study, folder: Path, spec: RobotSpec, known: References, rough: Rough, timeline: SimulatorTimeline | None
+    study: Study,
+    folder: Path,
+    spec: RobotSpec,
+    known: References,
+    rough: References,
+    timeline: SimulatorTimeline | None,
 ) -> list[LearningCurve]:
     curves = []
     for arm in study.arms:
@@ -164,11 +155,9 @@ def _curves(
         told = learning_of(study, folder, spec, arm)
         random, optimum = [], []
         for at_min in _minutes_in_training(study, arm, timeline, told.shape[1]):
-            best = known.optimum(arm, at_min)
-            near = rough.get((arm.mapping, arm.percentiles, at_min), (None, None))
-            random.append(near[0] if arm.through_neurons else known.random(arm, at_min))
-            fallback = near[1] if arm.delivery == "chosen" else None
-            optimum.append(fallback if best is None else best.best_return)
+            random.append((rough if arm.through_neurons else known).random(arm, at_min))
+            best = known.optimum(arm, at_min) or rough.optimum(arm, at_min)
+            optimum.append(None if best is None else best.best_return)
         beside = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = told[0, :, 0]
         returns = over_rounds(iterations, told[:, :, 1], told[:, :, 2], round_of(study, spec))
@@ -184,29 +173,11 @@ def round_of(study: Study, spec: RobotSpec) -> int:
 def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, parts: int) -> list[float]:
     """The recording that answers in each part of a training."""
     if timeline is None or not arm.through_neurons:
-        return [last_minute(timeline)] * parts
-    start = first_minute(timeline)
+        return [span_min(timeline)[1]] * parts
+    start, _ = span_min(timeline)
     share = 1 / parts if arm.shadowing else 0.0
     rows = [timeline.row_at(start + study.training_min * share * part) for part in range(parts)]
     return [float(timeline.start_min[row]) for row in rows]
-
-
-def _over_time(study: Study, folder: Path, spec: RobotSpec, table: DataFrame) -> Rough:
-    """Random actions and the optimum on a rough grid (None where it was not computed) at every recording."""
-    if not study.needs_neurons:
-        return {}
-    optima = {
-        (optimum.mapping, optimum.percentiles, optimum.at_min): optimum.best_return
-        for optimum in optima_of_all(folder, spec.name, "over-time")
-    }
-    found: Rough = {}
-    random = table[(table["agent"] == RANDOM) & table["over_time"]]
-    for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
-        of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
-        for at_min, returns in of_kind.groupby("at_min")["return"]:
-            key = (kind.mapping, kind.percentiles, at_min)
-            found[key] = (float(returns.to_numpy().mean()), optima.get(key))
-    return found
 
 
 def _pairs(study: Study, rows: list[ComparedReturns], table: DataFrame, known: References) -> list[Pair]:
@@ -231,26 +202,26 @@ def _pairs(study: Study, rows: list[ComparedReturns], table: DataFrame, known: R
 
 
 def _courses(
-    study: Study, table: DataFrame, known: References, rough: Rough, timeline: SimulatorTimeline
+    study: Study, table: DataFrame, known: References, rough: References, timeline: SimulatorTimeline
 ) -> list[Courses]:
     every_min: list[float] = timeline.start_min.tolist()
     over_time = table[(table["agent"] == POLICY) & table["over_time"]]
     panels = []
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
         courses = []
-        for arm in study.arms:
-            if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles):
-                of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
-                returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
-                courses.append(Course(arm.name, np.array(every_min), returns))
-        at = [rough[kind.mapping, kind.percentiles, at_min] for at_min in every_min]
+        for arm in study.arms_of(kind):
+            of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
+            returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
+            courses.append(Course(arm.name, np.array(every_min), returns))
+        roughly = [rough.optimum(kind, at_min) for at_min in every_min]
+        levels = [None if each is None else each.best_return for each in roughly]
         optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
-                named_mapping(kind.mapping, kind.percentiles),
+                named_mapping(*kind.kind),
                 tuple(courses),
-                np.array([random for random, _ in at]),
-                None if at[0][1] is None else np.array([optimum for _, optimum in at], np.float64),
+                np.array([rough.random(kind, at_min) for at_min in every_min]),
+                None if levels[0] is None else np.array(levels, np.float64),
                 tuple(
                     (at_min, optimum.best_return)
                     for at_min, optimum in optima

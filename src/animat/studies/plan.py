@@ -13,12 +13,7 @@ ITERATIONS_PER_S = 110_000
 
 
 def plan_study(study: Study, base: Path) -> list[Job]:
-    """All jobs of a study.
-
-    Args:
-        study: the specification.
-        base: what the names of its files are relative to.
-    """
+    """All jobs of a study, whose files are named as seen from `base`."""
     # Tasks bring JAX along; a finished folder is recognised without it only in part, but the command line stays light.
     from animat.studies.evaluating import Evaluate
     from animat.studies.pictures import CulturePictures, RobotPictures
@@ -82,5 +77,4 @@ def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job
 
 def plain_arm(study: Study, kind: Arm) -> Arm:
     """Of the arms with a mapping, the one trained most plainly: its policies stand for the mapping."""
-    same = [c for c in study.arms if (c.mapping, c.percentiles) == (kind.mapping, kind.percentiles)]
-    return max(same, key=lambda c: (c.trained, c.delivery == "chosen", c.shadowing is True))
+    return max(study.arms_of(kind), key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
@@ -18,6 +18,7 @@ from animat.report.style import FORMATS, save_figure
 from animat.stimulation.protocol import Presentation
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
+from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
 from animat.studies.goals import goals_shown
 from animat.studies.heuristic import not_outperforming
@@ -40,9 +41,6 @@ from animat.studies.simulating import controllability, load_timeline, read_serie
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 
 @final

@@ -22,11 +22,7 @@ JOB = "record"
 @final
 @dataclass(frozen=True)
 class Record(StudyTask):
-    """Make the recordings, as NWB.
-
-    Attributes:
-        base: what a specification's file names are relative to.
-    """
+    """Make the recordings, as NWB; a specification's file names are relative to `base`."""
 
     sizes = ("culture.trials", "culture.pulses", "culture.channels")
 

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 from animat.evaluation.coupling import context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
-from animat.studies.episodes import COUPLING, POLICY, RANDOM, mean_returns
+from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
 from animat.studies.results import BesideReflex, StudyOptimum
 from animat.studies.specification import RobotSpec, Study, named_mapping
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 
 def beside_reflex(
@@ -22,11 +18,7 @@ def beside_reflex(
 ) -> Iterator[BesideReflex]:
     """Each arm that is trained as usual, at the minute at which the best coupling was run too.
 
-    Where there is no optimal return of all conditions there is no context gap, and no row.
-
-    Args:
-        table: of episodes.
-        optima: of all robots.
+    The table is of episodes. Where there is no optimal return of all conditions there is no context gap, and no row.
     """
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     known = {
@@ -34,12 +26,10 @@ def beside_reflex(
         for each in optima
         if each.robot == spec.name and each.left_out is None and each.best_return is not None
     }
-    for arm in study.arms:
-        if not is_usual(arm):
-            continue
-        of = at[at["arm"] == named_mapping(arm.mapping, arm.percentiles)]
+    for arm in filter(is_usual, study.arms):
+        of = at[at["arm"] == named_mapping(*arm.kind)]
         for at_min, coupled in of[of["agent"] == COUPLING].groupby("at_min")["return"]:
-            best = known.get((arm.mapping, arm.percentiles, at_min))
+            best = known.get((*arm.kind, at_min))
             policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY) & (at["at_min"] == at_min)]
             if best is None or not len(policies):
                 continue

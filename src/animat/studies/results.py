@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.optimum import bracket_findings
 from animat.recordings.findings import Finding
 from animat.records import read_record
-from animat.writing import atomic_write
+from animat.writing import atomic_write, write_whole
 
 T = TypeVar("T")
 
@@ -206,18 +206,12 @@ class Results:
 
 def write_typed(path: Path, value: Any) -> Path:
     """Write records, complete or absent: `read_typed` reads them."""
-    with atomic_write(path) as beside:
-        plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
-        beside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    return path
+    plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
+    return write_whole(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
 
 def read_typed(path: Path, kind: type[T]) -> T:
-    """Read what `write_typed` wrote.
-
-    Raises:
-        InvalidFile: if it cannot be read, or is of another version.
-    """
+    """Read what `write_typed` wrote; raises InvalidFile if it cannot be read, or is of another version."""
     try:
         return read_record(kind, json.loads(path.read_text()))
     except (OSError, ValueError, InvalidArgument) as error:
@@ -232,11 +226,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what `write_arrays` wrote.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
+    """Read what `write_arrays` wrote; raises InvalidFile if it cannot be read."""
     try:
         with path.open("rb") as file, np.load(file) as arrays:
             return dict(arrays)
@@ -256,3 +246,9 @@ def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) 
 def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
     """Write records as a CSV file, a column a field."""
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
+
+
+def write_named_records(path: Path, named: Iterable[tuple[str, Any]], kind: type, name: str) -> Path:
+    """The same with a first column of this name, which comes with each record."""
+    head = [name, *(field.name for field in fields(kind))]
+    return write_table(path, head, ((first, *astuple(row)) for first, row in named))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,21 +17,18 @@ from animat.execution.jobs import Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import describe_study, held, source_files, sums_of
+from animat.studies.folder import MANIFEST, describe_study, described_beside, held, source_files, sums_of
 from animat.studies.places import RECEIPTS, REPORT
 from animat.studies.plan import plan_study
-from animat.studies.specification import Study
+from animat.studies.specification import RobotSpec, Study
 
 
 @dataclass(frozen=True)
 class Ran:
-    """What a run of a study did.
+    """What a run of a study did: where, of how many jobs.
 
     Attributes:
-        folder: the study's.
-        report: its page.
-        jobs: how many there are.
-        done_now: those that this run did, with the processor seconds that each took; none if the folder was finished.
+        done_now: jobs that this run did, with the processor seconds that each took; none if the folder was finished.
     """
 
     folder: Path
@@ -73,7 +71,7 @@ def run_study(
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None
     manifest = describe_study(study, sums_of(source_files(study, base), base), gpu)
-    with held(folder, study, manifest):
+    with held(folder, "study", manifest, MANIFEST, described_beside(study)):
         jobs = plan_study(study, base)
         left = Jobs(jobs, folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s: dict[str, float] = {}
@@ -82,14 +80,19 @@ def run_study(
                 raise InvalidFile(
                     f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
                 )
-            for spec in study.robots:
-                if ":" in spec.kind:
-                    check_robot(spec.robot())
-            for arm in study.arms:
-                if ":" in arm.mapping:
-                    check_mapping(mapping_named(arm.mapping))
+            check_own(study.robots, [arm.mapping for arm in study.arms])
             took_s = left.run(
                 workers=workers, executor=executor, progress=progress or Silent(), has_gpu=gpu is not None
             )
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     return Ran(folder, folder / REPORT, len(jobs), took_s)
+
+
+def check_own(robots: Iterable[RobotSpec], mappings: Iterable[str]) -> None:
+    """Refuse robots and mappings of one's own that do not keep to the contract (InvalidArgument)."""
+    for spec in robots:
+        if ":" in spec.kind:
+            check_robot(spec.robot())
+    for mapping in mappings:
+        if ":" in mapping:
+            check_mapping(mapping_named(mapping))

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
-from animat.report.html import Table, cell, with_error
+from animat.report.html import Columns, Table, cell, table_of, with_error
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.optima import optima_of_all, rough_kinds
 from animat.studies.results import BesideHeuristic, BesideReflex, ComparedReturns, ControlReturns, Score, StudyOptimum
 from animat.studies.specification import Study, named_mapping
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
-
-Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
-"""Of a table that is shown: their names, and the field or a function of a row that gives the cell."""
 
 _MOST_LABELS = 12
 _MOST_ROWS = 40
@@ -46,9 +43,10 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
     ]
     if printed:
         columns += [("the paper's p (U it implies)", _printed), ("as in the paper", "as_in_paper")]
-    return Table(
+    return table_of(
         "Comparisons",
-        *_columns(rows, columns),
+        rows,
+        columns,
         note="The paper prints p and no U; U is the one that gives this p. Highlighted: not as in the paper."
         if printed
         else "",
@@ -59,23 +57,21 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
 
 def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
     """The same comparisons as mean returns, optima and scores."""
-    return Table(
+    return table_of(
         "The same comparisons as returns",
-        *_columns(
-            rows,
-            [
-                ("first", "first"),
-                ("second", "second"),
-                ("robot", "robot"),
-                ("mean first", "mean_first"),
-                ("mean second", "mean_second"),
-                ("random", "random_second"),
-                ("optimum first", _pair("optimum_first", "optimum_error_first")),
-                ("optimum second", _pair("optimum_second", "optimum_error_second")),
-                ("score first", "score_first"),
-                ("score second", "score_second"),
-            ],
-        ),
+        rows,
+        [
+            ("first", "first"),
+            ("second", "second"),
+            ("robot", "robot"),
+            ("mean first", "mean_first"),
+            ("mean second", "mean_second"),
+            ("random", "random_second"),
+            ("optimum first", _pair("optimum_first", "optimum_error_first")),
+            ("optimum second", _pair("optimum_second", "optimum_error_second")),
+            ("score first", "score_first"),
+            ("score second", "score_second"),
+        ],
         note=_SCORE_NOTE + " ±: how far it may lie from there, by the grid, or down to its controller's return.",
         beside="tables/comparisons.csv",
     )
@@ -83,24 +79,22 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
 
 def scores_shown(rows: Sequence[Score]) -> Table:
     """Every arm at every minute it was evaluated at."""
-    return Table(
+    return table_of(
         "Every arm",
-        *_columns(
-            rows,
-            [
-                ("robot", "robot"),
-                ("arm", "arm"),
-                ("at (min)", "at_min"),
-                ("policies", "policies"),
-                ("episodes", "episodes"),
-                ("mean", "mean_return"),
-                ("s.d.", "standard_deviation"),
-                ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
-                ("random", "random"),
-                ("optimum", "optimum"),
-                ("score", "normalised_score"),
-            ],
-        ),
+        rows,
+        [
+            ("robot", "robot"),
+            ("arm", "arm"),
+            ("at (min)", "at_min"),
+            ("policies", "policies"),
+            ("episodes", "episodes"),
+            ("mean", "mean_return"),
+            ("s.d.", "standard_deviation"),
+            ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
+            ("random", "random"),
+            ("optimum", "optimum"),
+            ("score", "normalised_score"),
+        ],
         note=_SCORE_NOTE,
         beside="tables/scores.csv",
     )
@@ -126,9 +120,10 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
             f" {len(without)} of {len(optima)} optima leave out conditions with fewer than {FEW_SAMPLES} responses, "
             "which would promise too much: no score is against these, as policies act on all conditions."
         )
-    return Table(
+    return table_of(
         "Optimal returns",
-        *_columns(optima, columns),
+        optima,
+        columns,
         note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses "
         "determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its "
@@ -142,17 +137,13 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
 
 
 def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
-    """How often each condition passes the median in every recording, in the data and in the simulator.
-
-    Args:
-        kept: what the simulator keeps of each recording, by its minute.
-    """
+    """How often each condition passes the median in every recording, in the data and in what the simulator kept."""
     kinds = rough_kinds(study)[:1]
     optima = {
         spec.name: {
             optimum.at_min: optimum.best_return
             for optimum in optima_of_all(folder, spec.name, "over-time")
-            if (optimum.mapping, optimum.percentiles) == (kinds[0].mapping, kinds[0].percentiles)
+            if (optimum.mapping, optimum.percentiles) == kinds[0].kind
         }
         for spec in study.robots
         if kinds
@@ -176,7 +167,7 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
         "have is not what the culture would give."
     )
     if kinds:
-        mapping = named_mapping(kinds[0].mapping, kinds[0].percentiles)
+        mapping = named_mapping(*kinds[0].kind)
         note += f" Optimum: the optimal return with {mapping} on a rough grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."
@@ -198,22 +189,20 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
 
 def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
     """Trained policies and the controls of their mapping, at every recording that anything is evaluated at."""
-    return Table(
+    return table_of(
         "Controls",
-        *_columns(
-            rows,
-            [
-                ("robot", "robot"),
-                ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
-                ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
-                ("control", "control"),
-                ("actors", "actors"),
-                ("mean return", _pair("mean_return", "standard_error")),
-                ("random", "random"),
-                ("optimum", "optimum"),
-                ("score", "normalised_score"),
-            ],
-        ),
+        rows,
+        [
+            ("robot", "robot"),
+            ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
+            ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
+            ("control", "control"),
+            ("actors", "actors"),
+            ("mean return", _pair("mean_return", "standard_error")),
+            ("random", "random"),
+            ("optimum", "optimum"),
+            ("score", "normalised_score"),
+        ],
         note="Trained policies stand beside their controls, as in the figures above. ±: standard error over actors, of "
         "one actor over its episodes. Optima are those of the culture as it answers, also beside silent and shuffled."
         + (
@@ -229,21 +218,19 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
 
 def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
     """Trained policies beside the heuristic policy, episode by episode."""
-    return Table(
+    return table_of(
         "Policies beside the heuristic policy",
-        *_columns(
-            rows,
-            [
-                ("robot", "robot"),
-                ("arm", "arm"),
-                ("at (min)", "at_min"),
-                ("policies", "mean_return"),
-                ("heuristic", "heuristic"),
-                ("p", "p"),
-                ("pairs won", "wins"),
-                ("the policies", "outcome"),
-            ],
-        ),
+        rows,
+        [
+            ("robot", "robot"),
+            ("arm", "arm"),
+            ("at (min)", "at_min"),
+            ("policies", "mean_return"),
+            ("heuristic", "heuristic"),
+            ("p", "p"),
+            ("pairs won", "wins"),
+            ("the policies", "outcome"),
+        ],
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
         "return is larger, ties half. Highlighted: learning brought no more than the heuristic policy did.",
         beside="tables/heuristic.csv",
@@ -253,31 +240,23 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
 
 def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
     """Trained policies beside the best coupling: context gap and context score."""
-    return Table(
+    return table_of(
         "Policies beside the best reflex",
-        *_columns(
-            rows,
-            [
-                ("robot", "robot"),
-                ("arm", "arm"),
-                ("at (min)", "at_min"),
-                ("best coupling", _pair("coupling", "coupling_standard_error")),
-                ("optimum", "optimum"),
-                ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
-                ("context score", _interval("score", "score_low_95", "score_high_95")),
-            ],
-        ),
+        rows,
+        [
+            ("robot", "robot"),
+            ("arm", "arm"),
+            ("at (min)", "at_min"),
+            ("best coupling", _pair("coupling", "coupling_standard_error")),
+            ("optimum", "optimum"),
+            ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
+            ("context score", _interval("score", "score_low_95", "score_high_95")),
+        ],
         note="Best coupling: a fixed rule from what is sensed to a stimulus, without memory and goal, found by a "
         "search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
         "score: (policies − coupling) / (optimum − coupling), where the task needs more. With 95 % intervals.",
         beside="tables/reflexes.csv",
     )
-
-
-def _columns(rows: Sequence[Any], columns: Columns) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
-    """Head and cells of a table: a column is a name and the field, or a function of the row."""
-    cells = tuple(tuple(of(row) if callable(of) else getattr(row, of) for _, of in columns) for row in rows)
-    return tuple(name for name, _ in columns), cells
 
 
 def _pair(value: str, error: str) -> Callable[[Any], str | None]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, final
@@ -31,7 +30,7 @@ from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
 from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 _FORMER = {"reach": "neighbour_exponent"}
 """What files of before call arrays of simulators."""
@@ -48,18 +47,28 @@ class Fit(StudyTask):
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        study, settings = self.study, self.study.simulators
-        series = read_series(study, folder)
-        timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
-        if len(timeline.conditions) < 2 and "one-condition" not in settings.allow:
+        study, series = self.study, read_series(self.study, folder)
+        timeline = fit_as(study, series)
+        if len(timeline.conditions) < 2 and "one-condition" not in study.simulators.allow:
             raise UnusableData(
-                "simulators.conditions: expected two or more for an agent to choose from, got one "
-                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                f"{one_condition(timeline)}; sort the stimuli by interval:5,10, electrode or pattern "
                 '(to allow it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
         save_timeline(timeline, folder / TIMELINE)
         return [folder / TIMELINE, _write_responses(folder / RESPONSES, series)]
+
+
+def fit_as(study: Study, series: list[Responses]) -> SimulatorTimeline:
+    """The simulators that a study's settings make of responses."""
+    settings = study.simulators
+    return fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+
+
+def one_condition(timeline: SimulatorTimeline) -> str:
+    """The beginning of an error of simulators of one condition."""
+    only = timeline.conditions[0].label
+    return f"simulators.conditions: expected two or more for an agent to choose from, got one ({only})"
 
 
 def _write_responses(path: Path, series: list[Responses]) -> Path:
@@ -121,11 +130,7 @@ def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
 
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
-    """Write the simulators as safetensors, with all that is no array as JSON in the metadata; the same bytes always.
-
-    Raises:
-        InvalidFile: if it cannot be written.
-    """
+    """Write the simulators as safetensors, with all that is no array as JSON in the metadata; the same bytes always."""
     from safetensors.numpy import save
 
     simulators = timeline.simulators
@@ -144,29 +149,24 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "fitted": timeline.fitted,
         **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
-    with atomic_write(path) as beside:
-        beside.write_bytes(save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
+    write_whole(path, save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:
-    """Read what `save_timeline` wrote.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
+    """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
+    from safetensors import SafetensorError, safe_open
 
     try:
-        data = path.read_bytes()
-        told: dict[str, Any] = json.loads(_metadata(data)["animat"])
+        with safe_open(path, framework="numpy") as file:
+            told: dict[str, Any] = json.loads(file.metadata()["animat"])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dictionary
         conditions = tuple(Condition(**each) for each in told["conditions"])
         labels = tuple(condition.label for condition in conditions)
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         readouts = Readouts.from_dict(told.get("readouts"))
         return SimulatorTimeline(
-            simulators=_simulators(told["kind"], load(data)),
+            simulators=_simulators(told["kind"], arrays),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),
@@ -176,7 +176,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             fitted=told["fitted"],
             readouts=readouts,
         )
-    except (OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError, AnimatError) as error:
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
         raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error
 
 
@@ -190,9 +190,3 @@ def _simulators(kind: str, arrays: dict[str, np.ndarray]) -> NeuronSimulator:
         arrays["kept"] = np.ones(before.shape[:2], np.float32)
         arrays["added"] = arrays["load_s"] = np.zeros_like(decay)
     return _KINDS[kind](**{name: jnp.asarray(array) for name, array in arrays.items()})
-
-
-def _metadata(data: bytes) -> dict[str, str]:
-    (length,) = struct.unpack("<Q", data[:8])
-    metadata: dict[str, str] = json.loads(data[8 : 8 + length])["__metadata__"]
-    return metadata

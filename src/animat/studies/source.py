@@ -90,11 +90,7 @@ class Source:
             SyntheticCulture(self.seed, patterns=self.trials, channels=self.channels)
 
     def protocol(self) -> Protocol:
-        """Of every recording of a virtual culture.
-
-        Raises:
-            InvalidArgument: for one that cannot be.
-        """
+        """Of every recording of a virtual culture; raises InvalidArgument for one that cannot be."""
         asked: dict[str, Any] = {} if self.places is None else {"places": self.places}
         if self.frequencies_hz is not None or self.places == "corners":
             asked["frequencies_hz"] = self.frequencies_hz or TWO_COMMANDS.frequencies_hz
@@ -102,11 +98,7 @@ class Source:
 
 
 def read_seeds(text: str) -> list[int]:
-    """Seeds that are written as numbers and ranges, such as `1-5, 8`.
-
-    Raises:
-        InvalidArgument: for anything else, a seed that comes twice, or too many.
-    """
+    """Seeds that are written as numbers and ranges, such as `1-5, 8`; InvalidArgument for all else, or too many."""
     seeds: list[int] = []
     for part in text.split(","):
         found = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", part)

@@ -181,6 +181,11 @@ class Arm:
         return self.mapping != "none"
 
     @property
+    def kind(self) -> tuple[str, str]:
+        """Its mapping and percentiles: arms that share them share controls and optima."""
+        return self.mapping, self.percentiles
+
+    @property
     def thresholds(self) -> str:
         """Its mapping and whether the percentiles are fixed, as a folder's name."""
         return self.mapping.replace(":", ".") + ("-held" if self.percentiles == "first" else "")
@@ -232,8 +237,7 @@ class Study:
 
     Attributes:
         title: of the report.
-        culture: the recordings.
-        simulators: how responses are read and fitted.
+        culture, simulators: the recordings, and how responses are read from them and fitted.
         robots, arms, comparisons: what is trained and what is compared.
         policies: of each arm on each robot.
         seed: decides every draw of training and evaluation.
@@ -323,6 +327,10 @@ class Study:
         """The arm of this name."""
         return next(arm for arm in self.arms if arm.name == name)
 
+    def arms_of(self, kind: Arm) -> list[Arm]:
+        """The arms of the same kind as one."""
+        return [arm for arm in self.arms if arm.kind == kind.kind]
+
     def minutes_of(self, arm: Arm, first_min: float, last_min: float) -> dict[float, int]:
         """Minutes that an arm is evaluated at, and in how many episodes: of its comparisons, and the last.
 
@@ -341,11 +349,8 @@ class Study:
     def at_recordings(self, start_min: Sequence[float]) -> Study:
         """The same study with every comparison at the minute of a recording: the nearest to its own, or the last.
 
-        Args:
-            start_min: when the recordings start, rising; none without neurons, where every minute is the same.
-
-        Raises:
-            InvalidArgument: for a comparison before the first recording, or after the last by more than an interval.
+        Recordings start at rising minutes; without neurons, where every minute is the same, there are none. Raises
+        InvalidArgument for a comparison before the first recording, or after the last by more than an interval.
         """
         settled = (replace(each, at_min=self._minute_of(each, start_min)) for each in self.comparisons)
         return replace(self, comparisons=tuple(settled))
@@ -377,11 +382,10 @@ class Study:
         """Everything as plain data."""
         plain = asdict(self)
         for robot in plain["robots"]:
-            if robot["goal"] is None:
-                # Studies of before have none, and go on.
-                del robot["goal"]
-            if not robot["lessons"]:
-                del robot["lessons"]
+            # Studies of before have none, and go on.
+            for name in ("goal", "lessons"):
+                if not robot[name]:
+                    del robot[name]
         for name in ("seeds", "folders", "places", "frequencies_hz"):
             if plain["culture"][name] is None:
                 del plain["culture"][name]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, final
+from typing import Any, TypeVar, final, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,8 +16,8 @@ from animat.evaluation.statistics import Comparison, compare, holm, interquartil
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
-from animat.studies.episodes import POLICY, RANDOM, mean_returns, read_episodes
-from animat.studies.evaluating import as_recorded, first_minute, last_minute
+from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
+from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import beside_heuristic
 from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
@@ -25,11 +25,8 @@ from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
 from animat.studies.reflex import beside_reflex
 from animat.studies.results import (
-    BesideHeuristic,
-    BesideReflex,
     ComparedReturns,
     ControlReturns,
-    ObjectiveMet,
     Results,
     Score,
     StudyOptimum,
@@ -42,9 +39,6 @@ from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
 from animat.writing import atomic_write
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 T = TypeVar("T")
 
@@ -70,7 +64,7 @@ class Tabulate(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
-        first, last = first_minute(timeline), last_minute(timeline)
+        first, last = span_min(timeline)
         table = all_episodes(study, folder)
         known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
@@ -85,17 +79,11 @@ class Tabulate(StudyTask):
             reflexes=tuple(row for spec in study.robots for row in beside_reflex(study, table, spec, optima)),
         )
         files = [write_typed(results_file(folder), results)]
-        for name, kind in (
-            ("scores", Score),
-            ("comparisons", ComparedReturns),
-            ("controls", ControlReturns),
-            ("heuristic", BesideHeuristic),
-            ("reflexes", BesideReflex),
-            ("optima", StudyOptimum),
-        ):
-            files.append(write_records(table_file(folder, name), kind, getattr(results, name)))
-        if results.goals:
-            files.append(write_records(table_file(folder, "goals"), ObjectiveMet, results.goals))
+        for name, kinds in get_type_hints(Results).items():
+            rows = getattr(results, name)
+            # Findings have columns of their own, and most studies have no goals.
+            if name != "findings" and (rows or name != "goals"):
+                files.append(write_records(table_file(folder, name), get_args(kinds)[0], rows))
         told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
         files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
@@ -133,33 +121,31 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
 
 
 class References:
-    """Random policies and optimal returns on a robot, for every mapping and minute.
+    """Random policies and optimal returns on a robot, for every mapping and minute, by the table of its episodes.
 
-    Args:
-        table: of the robot's episodes.
+    Over time: of the few episodes at every recording, with the optimum on a rough grid.
     """
 
-    def __init__(self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame) -> None:
+    def __init__(
+        self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame, *, over_time: bool = False
+    ) -> None:
         self._optima = {
             (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
-            for optimum in optima_of_all(folder, spec.name)
+            for optimum in optima_of_all(folder, spec.name, "over-time" if over_time else "optima")
         }
-        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & ~table["over_time"]]
+        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_kind = random[random["arm"] == named_mapping(kind.mapping, kind.percentiles)]
+            of_kind = random[random["arm"] == named_mapping(*kind.kind)]
             for at_min, returns in of_kind.groupby("at_min")["return"]:
-                self._random[kind.mapping, kind.percentiles, at_min] = float(returns.to_numpy().mean())
+                self._random[*kind.kind, at_min] = float(returns.to_numpy().mean())
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
         return self._of(self._random, arm, at_min)
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """The optimal return and how well it is known.
-
-        None for a control, which can do nothing, and where conditions with few responses were left out of it.
-        """
+        """None for a control, which can do nothing, and where conditions with few responses were left out of it."""
         if arm.delivery == "shuffled":
             return None
         return self._of(self._optima, arm, at_min)
@@ -178,7 +164,7 @@ class References:
     @staticmethod
     def _of(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
         if arm.through_neurons:
-            return known.get((arm.mapping, arm.percentiles, at_min))
+            return known.get((*arm.kind, at_min))
         # Without neurons every minute is the same.
         return next((value for (mapping, _, _), value in known.items() if mapping == arm.mapping), None)
 
@@ -305,15 +291,14 @@ def _comparisons(
 
 def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        through = named_mapping(kind.mapping, kind.percentiles)
+        through = named_mapping(*kind.kind)
         of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
         for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
-            for arm in study.arms:
-                if (arm.mapping, arm.percentiles) == (kind.mapping, kind.percentiles):
-                    means = performances(table, spec.name, arm, at_min)
-                    if arm.trained and len(means):
-                        rows.append((f"{TRAINED}{arm.name}", len(means), means))
+            for arm in study.arms_of(kind):
+                means = performances(table, spec.name, arm, at_min)
+                if arm.trained and len(means):
+                    rows.append((f"{TRAINED}{arm.name}", len(means), means))
             for agent, of_agent in of_minute.groupby("agent", sort=False):
                 means = mean_returns(of_agent)
                 # Over actors, as each is one sample; a control of one actor has its episodes for samples.

@@ -15,11 +15,7 @@ from animat.studies.specification import Study
 
 @dataclass(frozen=True)
 class StudyTask(Task):
-    """A task that is told what to do by a study's specification.
-
-    Attributes:
-        study: the specification.
-    """
+    """A task that is told what to do by a study's specification."""
 
     sizes: ClassVar[tuple[str, ...]] = ("policies", "episodes")
     """Settings of the study that its memory grows with."""

@@ -42,11 +42,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """A specification's file as plain data.
-
-    Raises:
-        InvalidFile: if it cannot be read, is no TOML or has nothing in it.
-    """
+    """A specification's file as plain data; raises InvalidFile if it cannot be read, is no TOML or is empty."""
     data = plain_file.read_toml(path, MOST_BYTES)
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
@@ -54,11 +50,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
-    """The study of a file's plain data.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
-    """
+    """The study of a file's plain data; errors as those of `read_study`."""
     for name in ("robots", "arms", "comparisons"):
         if isinstance(table := data.get(name), dict):
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")

@@ -10,6 +10,7 @@ from animat.coding.mapping import mapping_named
 from animat.devices import gpu_here
 from animat.execution.task import UNFINISHED
 from animat.execution.trains import Trains, Work, train_alone
+from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.studies.draws import draw_seed
 from animat.studies.places import TIMELINE, policies_folder
@@ -40,14 +41,21 @@ class TrainGroup(StudyTask, Trains):
     def prepare(self, folder: Path) -> Work:
         timeline = load_timeline(folder / TIMELINE) if self.arm.through_neurons else None
         training = training_of(self.study, self.spec, self.arm)
-        manifest = describe(training, timeline, device=gpu_here())
-        group = Group(training, self.members, timeline, manifest["fingerprint"], provenance_of(manifest))
         checkpoint = folder / UNFINISHED / self.spec.name / self.arm.slug / f"p{self.members[0]}.npz"
-        return Work(group, policies_folder(folder, self.spec, self.arm), checkpoint, description=manifest)
+        return work_on(training, self.members, timeline, policies_folder(folder, self.spec, self.arm), checkpoint)
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         work = self.prepare(folder)
         return train_alone(work, progress) if self.arm.trained else work.leave(untrained_policies(work.group))
+
+
+def work_on(
+    training: Training, members: tuple[int, ...], timeline: SimulatorTimeline | None, place: Path, checkpoint: Path
+) -> Work:
+    """Some policies of a training as work that describes itself in the folder of the policies."""
+    manifest = describe(training, timeline, device=gpu_here())
+    group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
+    return Work(group, place, checkpoint, description=manifest)
 
 
 def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:

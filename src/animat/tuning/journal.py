@@ -13,7 +13,7 @@ from typing import Literal
 from animat.errors import InvalidFile
 from animat.records import read_record
 from animat.tuning.space import Settings
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 JOURNAL = "journal.jsonl"
 
@@ -45,16 +45,11 @@ class Told:
 
 def write_journal(folder: Path, told: Sequence[Told]) -> None:
     """Write all of it; no times of day, so that the same search leaves the same bytes."""
-    with atomic_write(folder / JOURNAL) as beside:
-        beside.write_text("".join(json.dumps(asdict(each)) + "\n" for each in told))
+    write_whole(folder / JOURNAL, "".join(json.dumps(asdict(each)) + "\n" for each in told))
 
 
 def read_journal(folder: Path) -> list[Told]:
-    """What is in the folder's journal; nothing where there is none.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
+    """What is in the folder's journal, nothing where there is none; raises InvalidFile if it cannot be read."""
     path = folder / JOURNAL
     if not path.exists():
         return []

@@ -11,9 +11,8 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from animat.report.importance import draw_importance
 from animat.report.style import save_figure
-from animat.report.tuning_history import draw_history
+from animat.report.tuning import draw_history, draw_importance
 from animat.studies.places import RECORDINGS
 from animat.studies.specification import Arm, Simulators, Study
 from animat.studies.toml import study_to_toml
@@ -21,7 +20,7 @@ from animat.training.settings import SAC
 from animat.tuning.journal import Told
 from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
 from animat.tuning.specification import Tuning
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 BEST, RESULTS, HISTORY, IMPORTANCE = "best.toml", "results.json", "history.png", "importance.png"
 
@@ -95,10 +94,8 @@ def write_results(
     study = with_settings(tuning.study, best.settings)
     if study.culture.kind == "files":
         study = replace(study, culture=replace(study.culture, files=(RECORDINGS,)))
-    with atomic_write(folder / BEST) as beside:
-        beside.write_text(f"# {train_command(study)}\n# animat study {BEST}\n{study_to_toml(study)}")
-    with atomic_write(folder / RESULTS) as beside:
-        beside.write_text(json.dumps(tuned.to_dict(), indent=1) + "\n")
+    write_whole(folder / BEST, f"# {train_command(study)}\n# animat study {BEST}\n{study_to_toml(study)}")
+    write_whole(folder / RESULTS, json.dumps(tuned.to_dict(), indent=1) + "\n")
     robot, own = tuning.study.robots[0].name, finals[0]
     rungs = [(each.trial, each.chunks, each.means) for each in told]
     chosen = (best.trial, best.mean, best.standard_error)
@@ -116,34 +113,16 @@ def train_command(study: Study) -> str:
     spec, arm, simulators = study.robots[0], study.arms[0], study.simulators
     words = ["animat", "train", spec.kind or spec.name, "--mapping", arm.mapping]
     if arm.through_neurons:
-        words += [
-            "--recordings",
-            RECORDINGS,
-            "--simulator",
-            simulators.kind,
-            "--duration-min",
-            f"{study.training_min:g}",
-        ]
-        if simulators.kind == "histogram" and simulators.bins != Simulators().bins:
-            words += ["--bins", str(simulators.bins)]
-        if simulators.range_hz is not None:
-            words += ["--range-hz", f"{simulators.range_hz:g}"]
-        if simulators.conditions:
-            words += ["--conditions", simulators.conditions]
-        if simulators.readouts != Simulators().readouts:
-            words += ["--readouts", simulators.readouts]
-        if simulators.window_ms != Simulators().window_ms:
-            words += ["--window-ms", *(f"{ms:g}" for ms in simulators.window_ms)]
-        if simulators.burst_threshold is not None:
-            words += ["--burst-threshold", f"{simulators.burst_threshold:g}"]
-        if simulators.allow:
-            words += ["--allow", *simulators.allow]
+        words += ["--recordings", RECORDINGS, "--simulator", simulators.kind]
+        words += ["--duration-min", f"{study.training_min:g}"]
+        if simulators.kind == "histogram":
+            words += _unusual(simulators, Simulators(), "bins")
+        words += _unusual(simulators, Simulators(), "range_hz", "conditions", "readouts", "window_ms")
+        words += _unusual(simulators, Simulators(), "burst_threshold", "allow")
     words += ["--policies", str(study.policies), "--iterations", str(spec.trained_for)]
     words += ["--seed", str(study.seed)] * (study.seed != 1)
-    usual = Arm("usual")
     words += ["--shadowing", "off"] * (not arm.shadowing)
-    words += ["--percentiles", arm.percentiles] * (arm.percentiles != usual.percentiles)
-    words += ["--delivery", arm.delivery] * (arm.delivery != usual.delivery)
+    words += _unusual(arm, Arm("usual"), "percentiles", "delivery")
     if spec.parameters:
         words += ["--parameters", *(f"{name}={value!r}" for name, value in spec.parameters.items())]
     defaults = asdict(SAC())
@@ -151,6 +130,16 @@ def train_command(study: Study) -> str:
     if given:
         words += ["--sac", *(f"{name}={value!r}" for name, value in given.items())]
     return shlex.join(words)
+
+
+def _unusual(given: Any, usual: Any, *names: str) -> list[str]:
+    """The options of settings that are not the usual ones."""
+    words = []
+    for name in names:
+        if (value := getattr(given, name)) != getattr(usual, name):
+            values = value if isinstance(value, tuple) else (value,)
+            words += [f"--{name.replace('_', '-')}", *(f"{x:g}" if isinstance(x, float) else str(x) for x in values)]
+    return words
 
 
 def settings_in_words(settings: Mapping[str, Any]) -> str:

@@ -5,28 +5,26 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from animat.coding.checking import check_mapping
-from animat.coding.mapping import mapping_named
 from animat.errors import InvalidFile, UnusableData
 from animat.execution.jobs import Job, Jobs, expect_workers
-from animat.execution.pinned import PinnedProcesses
+from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
-from animat.robots.checking import check_robot
 from animat.studies.draws import draw_seed
-from animat.studies.folder import source_files, sums_of
-from animat.studies.places import RECEIPTS
+from animat.studies.folder import held, source_files, sums_of
+from animat.studies.places import OWN_FOLDERS, RECEIPTS
 from animat.studies.plan import ITERATIONS_PER_S
 from animat.studies.recording import JOB, Record
+from animat.studies.run import check_own
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
-from animat.tuning.folder import describe_tuning, held
+from animat.tuning.folder import MANIFEST, describe_tuning
 from animat.tuning.journal import Told, read_journal, write_journal
 from animat.tuning.results import Final, Tuned, write_results
 from animat.tuning.search import Search, expect_optuna, importance_of
@@ -54,10 +52,7 @@ def tune(
     Args:
         tuning: the specification.
         folder: where everything goes; made if it is missing.
-        base: what the specification's names of files are relative to.
-        workers: processes, each on a core of its own; None: one a core. Not with an executor.
-        executor: where tasks are run, in view of the folder; it stays open. None: processes on this machine.
-        progress: told how far it is, and what runs.
+        base, workers, executor, progress: as of `animat.studies.run.run_study`.
 
     Raises:
         Mismatch: if the folder is another tuning's, its recordings have changed, or another run is at work in it.
@@ -69,9 +64,15 @@ def tune(
     expect_optuna()
     expect_workers(workers, executor)
     folder, base, progress = Path(folder).absolute(), Path(base).absolute(), progress or Silent()
-    _expect_ours_to_keep_to_the_contract(tuning)
-    manifest = describe_tuning(tuning, sums_of(source_files(tuning.study, base), base))
-    with held(folder, manifest), _running_on(executor, workers) as at:
+    study = tuning.study
+    # Looked at before there is a folder.
+    check_own(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
+    manifest = describe_tuning(tuning, sums_of(source_files(study, base), base))
+    # Processes of ours stay from one part of the work to the next.
+    running_on: AbstractContextManager[Executor] = (
+        PinnedProcesses(own_cores(workers)) if executor is None else nullcontext(executor)
+    )
+    with held(folder, "tuning", manifest, MANIFEST, {}, (*OWN_FOLDERS, FINALS)), running_on as at:
         run = _Run(tuning, folder, manifest["fingerprint"], at, progress)
         run.fit(base)
         told = run.search()
@@ -229,24 +230,3 @@ class _Run:
 
 def _choices(among: Any) -> tuple[Any, ...]:
     return among if isinstance(among, tuple) else ()
-
-
-def _expect_ours_to_keep_to_the_contract(tuning: Tuning) -> None:
-    """Robots and mappings of one's own are looked at before there is a folder."""
-    spec = tuning.study.robots[0]
-    if ":" in spec.kind:
-        check_robot(spec.robot())
-    arm = tuning.study.arms[0]
-    for mapping in (arm.mapping, *_choices(tuning.space.get("mapping"))):
-        if ":" in mapping:
-            check_mapping(mapping_named(mapping))
-
-
-@contextmanager
-def _running_on(executor: Executor | None, workers: int | None) -> Iterator[Executor]:
-    """The executor that was lent, or processes of ours, which stay from one part of the work to the next."""
-    if executor is not None:
-        yield executor
-        return
-    with PinnedProcesses(sorted(os.sched_getaffinity(0))[:workers]) as ours:
-        yield ours

@@ -26,12 +26,6 @@ class Search:
 
     It is in memory, and made again from the journal at each start. Optuna's own journal file would hold times of day,
     and trials that a kill had left half told: it would not be the same twice.
-
-    Args:
-        tuning: what is searched, from which seed.
-
-    Raises:
-        AnimatError: if Optuna is not installed.
     """
 
     def __init__(self, tuning: Tuning) -> None:
@@ -115,9 +109,5 @@ def _distribution(name: str, among: Range | tuple[Value, ...]) -> BaseDistributi
 
 
 def expect_optuna() -> Any:
-    """Optuna, which is imported nowhere else.
-
-    Raises:
-        AnimatError: if it is not installed.
-    """
+    """Optuna, which is imported nowhere else; raises AnimatError if it is not installed."""
     return expect_extra("optuna", package="Optuna", extra="tune", what="tuning")

@@ -123,11 +123,7 @@ class SideBySide:
             np.savez(opened, done=np.array(done), **arrays)
 
     def resume(self, files: Sequence[Path]) -> int:
-        """Go on from what was kept, of all or of each trial in order; returns how many chunks are done.
-
-        Raises:
-            InvalidFile: if a file cannot be read.
-        """
+        """Go on from what was kept, of all or of each trial in order; returns how many chunks are done."""
         like = jax.eval_shape(self._beginning, self._numbers, self._keys)
         leaves, structure = jax.tree.flatten(like)
         read: list[list[np.ndarray]] = []

@@ -13,17 +13,11 @@ from animat.records import Flag, Number, read_record, record
 from animat.studies.specification import Study
 from animat.training.settings import SAC
 
-NUMBERS = (
-    "learning_rate",
-    "discount",
-    "tau",
-    "reward_scale",
-    "initial_alpha",
-    "target_entropy_ratio",
-    "entropy_nats",
-)
+NUMBERS = ("learning_rate", "discount", "tau", "reward_scale", "initial_alpha", "target_entropy_ratio", "entropy_nats")
 """Settings of the algorithm that a compiled program takes as numbers: trials that differ in nothing else share one."""
-THROUGH_NEURONS = ("mapping", "simulator", "conditions", "readouts")
+_OF_SIMULATORS = {"simulator": "kind", "conditions": "conditions", "readouts": "readouts"}
+"""Settings of a study's simulators, and their fields there."""
+THROUGH_NEURONS = ("mapping", *_OF_SIMULATORS)
 FITTING = ("environments", "replay")
 """Settings of the algorithm that depend on each other: one is a multiple of the other."""
 SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
@@ -165,14 +159,10 @@ def _whole(value: Any, own: Any) -> Any:
 
 def own_settings(study: Study) -> dict[str, Any]:
     """What a study of one robot and one arm has for every setting that can be searched."""
-    algorithm = asdict(SAC(**study.algorithm))  # type: ignore[arg-type]
-    kind, conditions = study.simulators.kind, study.simulators.conditions
     return {
-        **algorithm,
+        **asdict(SAC(**study.algorithm)),  # type: ignore[arg-type]
         "mapping": study.arms[0].mapping,
-        "simulator": kind,
-        "conditions": conditions,
-        "readouts": study.simulators.readouts,
+        **{name: getattr(study.simulators, field) for name, field in _OF_SIMULATORS.items()},
     }
 
 
@@ -186,15 +176,9 @@ def first_settings(study: Study, space: Space) -> list[Settings]:
 
 
 def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
-    """The study with settings in place of its own.
-
-    Raises:
-        InvalidArgument: for a value that a setting may not have.
-    """
+    """The study with settings in place of its own; raises InvalidArgument for a value that a setting may not have."""
     changed: dict[str, Any] = dict(settings)
-    arm, simulators = study.arms[0], study.simulators
-    arm = replace(arm, mapping=changed.pop("mapping", arm.mapping))
-    kind, conditions = changed.pop("simulator", simulators.kind), changed.pop("conditions", simulators.conditions)
-    readouts = changed.pop("readouts", simulators.readouts)
-    simulators = replace(simulators, kind=kind, conditions=conditions, readouts=readouts)
+    arm = replace(study.arms[0], mapping=changed.pop("mapping", study.arms[0].mapping))
+    of_simulators = {field: changed.pop(name) for name, field in _OF_SIMULATORS.items() if name in changed}
+    simulators = replace(study.simulators, **of_simulators)
     return replace(study, arms=(arm,), simulators=simulators, algorithm={**study.algorithm, **changed})

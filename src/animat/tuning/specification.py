@@ -60,12 +60,9 @@ class Tune:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Everything that decides how a tuning comes out, but for recordings in files.
+    """Everything that decides how a tuning comes out, but for recordings in files: how is searched, and what.
 
-    Attributes:
-        study: of one robot and one arm, with the settings that the search begins with.
-        tune: how is searched.
-        space: what is searched.
+    The study is of one robot and one arm, with the settings that the search begins with.
     """
 
     study: Study
@@ -107,11 +104,7 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
 
 
 def read_tuning(path: str | os.PathLike[str]) -> Tuning:
-    """Read a study's file with a table `[tune]`.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
-    """
+    """Read a study's file with a table `[tune]`; errors as those of `animat.studies.toml.read_study`."""
     data = read_toml(path)
     tune = data.pop("tune", {})
     if not data:

@@ -14,9 +14,9 @@ import numpy as np
 
 from animat.errors import UnusableData
 from animat.evaluation.rollouts import roll_out
-from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
-from animat.studies.simulating import load_timeline, read_series, save_timeline
+from animat.studies.simulating import fit_as, load_timeline, one_condition, read_series, save_timeline
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
@@ -25,7 +25,7 @@ from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
 from animat.tuning.side_by_side import SideBySide
 from animat.tuning.space import NUMBERS, Settings, with_settings
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 
 def timeline_file(study: Study) -> Path:
@@ -44,14 +44,9 @@ class Fit(StudyTask):
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        settings = self.study.simulators
-        series = read_series(self.study, folder)
-        timeline = fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
+        timeline = fit_as(self.study, read_series(self.study, folder))
         if len(timeline.conditions) < 2:
-            raise UnusableData(
-                "simulators.conditions: expected two or more for an agent to choose from, got one "
-                f"({timeline.conditions[0].label})"
-            )
+            raise UnusableData(one_condition(timeline))
         save_timeline(timeline, folder / timeline_file(self.study))
         return [folder / timeline_file(self.study)]
 
@@ -139,9 +134,8 @@ class TrainTrials(StudyTask):
                 returns = ran.returns.mean(axis=1).tolist()
                 if not np.isfinite(returns).all():
                     returns = None
-            files.append(returns_file(place, trial, last, self.members[0]))
-            with atomic_write(files[-1]) as beside:
-                beside.write_text(json.dumps(returns) + "\n")
+            file = returns_file(place, trial, last, self.members[0])
+            files.append(write_whole(file, json.dumps(returns) + "\n"))
             if self.goes_on:
                 files.append(kept_file(place, trial, last, self.members[0]))
                 together.keep(files[-1], last, i)

@@ -20,9 +20,7 @@ _MOST_RETURNS = 200
 def by_agent(episodes: Sequence[Episode], folder: Path) -> list[dict[str, Any]]:
     """Of each agent: how many episodes came to their end, their returns and mean with its 95 % interval, as it narrows.
 
-    Args:
-        episodes: begun so far.
-        folder: of the session, with a prediction or without.
+    The folder is the session's, with a prediction or without.
     """
     predicted = _predicted(folder)
     returns: dict[str, list[float]] = {name: [] for name in predicted}

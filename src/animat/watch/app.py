@@ -9,7 +9,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from animat.errors import AnimatError, InvalidArgument, first_line
 from animat.watch.cultures import CulturesView
@@ -23,6 +23,7 @@ from animat.watch.stopping import stop_session
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
+from animat.watch.view import View
 
 _FILES = {
     "": ("index.html", "text/html"),
@@ -33,19 +34,6 @@ _FILES = {
 """Of the page, by their addresses."""
 _MOST_VIEWS = 8
 """That are kept open."""
-
-
-class View(Protocol):
-    """Something that is watched."""
-
-    def about(self) -> dict[str, Any]:
-        """What does not change while it goes on."""
-
-    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How it is, in the seconds before a time."""
-
-    def close(self) -> None:
-        """Let go of files."""
 
 
 _VIEWS: dict[Kind, Callable[[Path], View]] = {
@@ -59,11 +47,7 @@ _VIEWS: dict[Kind, Callable[[Path], View]] = {
 
 
 class Watched:
-    """A folder and the views of what is in it; asked by one thread at a time.
-
-    Args:
-        folder: that is watched; it may come to be later.
-    """
+    """A folder, which may come to be later, and the views of what is in it; asked by one thread at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -127,7 +111,8 @@ def app_for(folder: Path, token: str, port: int) -> App:
     from starlette.routing import Route
 
     watched = Watched(folder)
-    pages = {address: (_file(name), kind) for address, (name, kind) in _FILES.items()}
+    own = importlib.resources.files("animat.watch") / "page"
+    pages = {address: ((own / name).read_bytes(), kind) for address, (name, kind) in _FILES.items()}
 
     async def file(request: Request) -> Response:
         content, kind = pages[request.url.path.removeprefix("/")]
@@ -181,10 +166,6 @@ def _answered(answer: Callable[[Any], Any], asked: Any) -> tuple[int, str, bytes
     except Exception as error:
         # Anything may be in a file.
         return 500, "application/json", _told(f"cannot be shown: {first_line(error)}")
-
-
-def _file(name: str) -> bytes:
-    return (importlib.resources.files("animat.watch") / "page" / name).read_bytes()
 
 
 def _told(message: str) -> bytes:

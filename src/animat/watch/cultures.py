@@ -14,8 +14,8 @@ from animat.watch.blocks import facts, table, time_left
 from animat.watch.files import json_of, newest_s
 from animat.watch.held import is_held, state_of
 from animat.watch.plain import listed, mapped, text
-from animat.watch.speed import Speed
 from animat.watch.study import StudyView
+from animat.watch.view import View, in_blocks, titled
 
 _MANIFEST, _DONE, _COMPARISONS = "cultures.json", "jobs/report.json", "tables/comparisons.csv"
 _MOST_CULTURES, _MOST_BYTES = 10_000, 2**20
@@ -24,24 +24,20 @@ _Means = list[tuple[str, str, float, float]]
 """Of one culture each comparison and robot, and the means of both arms."""
 
 
-class CulturesView:
-    """The folder of a study over many cultures, looked at again and again."""
+class CulturesView(View):
+    """The folder of a study over many cultures."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._speed = Speed()
+        super().__init__(folder)
         self._studies: dict[str, StudyView] = {}
         self._compared: dict[str, _Means] = {}
 
-    def close(self) -> None:
-        """Nothing is kept open."""
-
     def about(self) -> dict[str, Any]:
         """How many cultures are studied."""
-        return {"generation": 0, "title": f"study over {len(self._names()):,} cultures"}
+        return titled(f"study over {len(self._names()):,} cultures")
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How far the cultures are; a study has no clock of its own."""
+        """How far the cultures are."""
         names = self._names()
         done = [name for name in names if (self.folder / name / _DONE).exists()]
         begun = [name for name in names if name not in done and (self.folder / name).is_dir()]
@@ -58,16 +54,12 @@ class CulturesView:
             ("time left", time_left(self._speed.left_s(len(names) - worked), state)),
         ]
         under_way = [[name, f"{100 * share:.0f} %"] for name, share in running.items()]
-        return {
-            "generation": 0,
-            **state,
-            "damage": "",
-            "blocks": [
-                facts("Cultures", rows, "The list at the top has each culture's own page."),
-                table("Running", ["culture", "done"], under_way, "" if under_way else "nothing runs now"),
-                self._comparisons(done),
-            ],
-        }
+        blocks = [
+            facts("Cultures", rows, "The list at the top has each culture's own page."),
+            table("Running", ["culture", "done"], under_way, "" if under_way else "nothing runs now"),
+            self._comparisons(done),
+        ]
+        return in_blocks(state, blocks)
 
     def _share(self, name: str) -> float:
         if name not in self._studies:

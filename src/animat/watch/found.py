@@ -28,13 +28,7 @@ _PASSED_OVER = ("jobs", "figures", "tables", "checkpoints")
 
 @dataclass(frozen=True)
 class Found:
-    """Something that can be watched.
-
-    Attributes:
-        kind: what it is.
-        place: of its folder in the one that is watched, "" for that itself.
-        changed_s: when something in it changed last.
-    """
+    """Something that can be watched: where in the folder that is watched ("": itself), and when it changed last."""
 
     kind: Kind
     place: str
@@ -53,11 +47,7 @@ def find(folder: Path) -> list[Found]:
 
 
 def place_within(folder: Path, place: str) -> Path:
-    """A folder below the one that is watched, by its place there.
-
-    Raises:
-        InvalidArgument: for one that is outside of it.
-    """
+    """A folder below the one that is watched, by its place there; raises InvalidArgument for one outside of it."""
     try:
         inside = (folder / place).resolve()
     except (OSError, ValueError) as error:

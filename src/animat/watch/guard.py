@@ -30,12 +30,8 @@ HEADERS = (
 class Guard:
     """Answers 403 to whatever is not asked by the page, or by its address, and hands the rest on without the token.
 
-    A name that leads here (DNS rebinding) is in `Host`, another page in `Origin`; neither knows the token.
-
-    Args:
-        app: what answers.
-        token: that every address begins with.
-        port: that is listened on.
+    A name that leads here (DNS rebinding) is in `Host`, another page in `Origin`; neither knows the token, with which
+    every address begins.
     """
 
     def __init__(self, app: App, token: str, port: int) -> None:

@@ -25,13 +25,7 @@ def is_held(folder: Path) -> bool | None:
 
 
 def state_of(folder: Path, changed_s: float, *, is_done: bool) -> dict[str, Any]:
-    """How work in a folder stands, in words.
-
-    Args:
-        folder: of the work.
-        changed_s: when something of it changed last.
-        is_done: whether nothing is left to do.
-    """
+    """How work in a folder stands, in words, by when something of it changed last and whether nothing is left to do."""
     if is_done:
         return {"state": "ended", "message": "all of it is done"}
     held = is_held(folder)

@@ -26,9 +26,7 @@ _COLOURS = {"random actions": "grey", "best coupling": "green", "optimal return"
 def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tuple[list[tuple[str, float]], str]:
     """Returns to compare with, by name; and in words where they come from and which are not known.
 
-    Args:
-        manifest: the description of the training.
-        evaluation: of its policies (`animat.evaluation.table.Evaluation.to_dict`); empty where there is none.
+    They are in the training's description and in an evaluation of its policies, which is empty where there is none.
     """
     rows = {str(row.get("name")): number(row.get("mean_return")) for row in map(mapped, listed(evaluation.get("rows")))}
     optimum = mapped(evaluation.get("optimum")).get("value")
@@ -63,8 +61,7 @@ def learning_charts(
         curves: of the policies that have some, by number; columns as `CURVE`.
         swaps: after how many iterations simulators are refreshed, and what with.
         iterations: of the whole training.
-        levels: returns to compare with, each a name and a line.
-        missing: which of them are not known, and what computes them.
+        levels, missing: as of `levels_of`.
     """
     series, last = _series(curves, "mean_return")
     told = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."

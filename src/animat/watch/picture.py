@@ -27,12 +27,9 @@ def is_drawn(loop: dict[str, Any]) -> bool:
 
 
 def picture_of(loop: dict[str, Any], record: Record, earlier: list[list[float | None]]) -> bytes | None:
-    """A picture as PNG; None for a robot that is not known here, or cannot be drawn.
+    """A picture as PNG of the robot in a session's header; None for one that is not known here, or cannot be drawn.
 
-    Args:
-        loop: of the session's header, with the robot and its goal.
-        record: with a tick.
-        earlier: the observations of the episode before it.
+    The record has a tick; the earlier observations are of its episode.
     """
     tick = mapped(record.words.get("tick"))
     observation, command = numbers(tick.get("observation")), numbers(tick.get("command"))

@@ -16,29 +16,27 @@ from animat.watch.found import changed, recordings_in
 from animat.watch.held import is_held
 from animat.watch.plain import text
 from animat.watch.spikes import packed_spikes
+from animat.watch.view import View, in_blocks, titled
 
 _MOST_SPAN_S = 60.0
 _LARGEST = 2**31
 """Bytes of a file that is read for a look."""
 
 
-class RecordingView:
-    """A folder of recordings, looked at again and again; what changed last is read anew."""
+class RecordingView(View):
+    """A folder of recordings, of which what changed last is read anew."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        super().__init__(folder)
         self._key: Any = None
         self._recording: Recording | None = None
         self._inspection: Inspection | None = None
         self._trouble = ""
         self._shares: dict[Path, tuple[float, dict[str, float]]] = {}
 
-    def close(self) -> None:
-        """Nothing is kept open."""
-
     def about(self) -> dict[str, Any]:
         """What it is."""
-        return {"generation": 0, "title": "recordings"}
+        return titled("recordings")
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         """The newest recording, and the seconds of it before a time."""
@@ -60,14 +58,11 @@ class RecordingView:
             blocks += [raster, _rates(recording)]
         blocks += [_shares(self._shares, len(times)), *_inspected(self._inspection)]
         is_broken = running is False and self.folder / UNDER_WAY in times
-        return {
-            "generation": 0,
+        state = {
             "state": "running" if running else "silent" if is_broken else "ended",
             "message": _message(len(whole), newest, recording, running=bool(running), is_broken=is_broken),
-            "damage": self._trouble,
-            **found,
-            "blocks": blocks,
         }
+        return in_blocks({**state, **found}, blocks, self._trouble)
 
     def _facts(self, whole: int, newest: Path) -> list[tuple[str, Any]]:
         shown = "the one under way, as far as it is" if newest.name == UNDER_WAY else newest.name

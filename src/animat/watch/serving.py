@@ -28,11 +28,7 @@ _LINGER_S = 60.0
 
 
 def expect_installed() -> None:
-    """Refuse where what the page needs is not installed.
-
-    Raises:
-        AnimatError: saying how to install it.
-    """
+    """Refuse where what the page needs is not installed (AnimatError, saying how to install it)."""
     if missing := [name for name in _NEEDS if find_spec(name) is None]:
         raise AnimatError(f"the page needs {' and '.join(missing)}: pip install 'animat[watch]'")
 
@@ -91,14 +87,10 @@ class _Noted:
 
 
 def _end_after(process: int, app: _Noted, server: Any) -> None:
-    while _runs(process) or time.monotonic() - app.asked_s < _LINGER_S:
+    # Whoever loses the process that started it gets another parent.
+    while os.getppid() == process or time.monotonic() - app.asked_s < _LINGER_S:
         time.sleep(1.0)
     server.should_exit = True
-
-
-def _runs(process: int) -> bool:
-    """Whether the process that started this one is still there: whoever loses it gets another parent."""
-    return os.getppid() == process
 
 
 @contextmanager

@@ -17,8 +17,9 @@ from animat.watch.held import is_held
 from animat.watch.picture import is_drawn
 from animat.watch.plain import listed, mapped, number, numbers, text, whole
 from animat.watch.spikes import packed
-from animat.watch.sums import Sums
+from animat.watch.sums import Sums, first_readout
 from animat.watch.tail import Tail
+from animat.watch.view import View
 
 MOST_SPAN_S = 60.0
 """That is shown at once."""
@@ -34,15 +35,11 @@ _NO_TIME = 64
 """Records in a row without a time, at most."""
 
 
-class SessionView:
-    """A session's folder, looked at again and again.
-
-    Args:
-        folder: with a log in it.
-    """
+class SessionView(View):
+    """A session's folder, with a log in it."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        super().__init__(folder)
         self.tail = Tail(folder / LOG_FILE)
         self._generation = -1
         self._agents: list[dict[str, Any]] = []
@@ -50,11 +47,9 @@ class SessionView:
         self._agents_until_s, self._done = 0.0, 0
 
     def close(self) -> None:
-        """Let go of its log."""
         self.tail.close()
 
     def about(self) -> dict[str, Any]:
-        """What does not change while it goes on."""
         self._look()
         header, words = self._header, self._words
         loop, channels = mapped(words.get("loop")), header.channels
@@ -74,7 +69,7 @@ class SessionView:
             "thresholds": _thresholds(loop.get("mapping")),
             "adaptive": bool(loop.get("adaptive")),
             "burst_threshold": number(loop.get("burst_threshold")),
-            "percentiles_hz": _first_readout(loop.get("percentiles")),
+            "percentiles_hz": first_readout(listed(loop.get("percentiles"))),
             "planned": len(listed(words.get("turns"))),
             "limits": {text(name): number(value) for name, value in mapped(words.get("limits")).items()},
             "account": {text(name): number(value) for name, value in mapped(words.get("account")).items()},
@@ -87,11 +82,7 @@ class SessionView:
         }
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """The seconds before a time.
-
-        Args:
-            to_s: on the session's clock; None: now, or its end.
-            span_s: how many.
+        """The seconds before a time on the session's clock; None: now, or its end.
 
         Raises:
             InvalidFile: if there is no session any more.
@@ -298,11 +289,6 @@ def _span(words: dict[str, Any]) -> tuple[float, float] | None:
     if words.get("kind") != "seen" or start is None or duration is None or number(start + duration) is None:
         return None
     return start, start + duration
-
-
-def _first_readout(percentiles: Any) -> list[float | None]:
-    of = listed(percentiles)
-    return numbers(of[0] if of and isinstance(of[0], list) else of)
 
 
 def _thresholds(mapping: Any) -> list[int]:

@@ -11,7 +11,7 @@ from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, mean_of_episodes, newest_s, told_by_jobs
 from animat.watch.held import state_of
 from animat.watch.plain import listed, mapped, number, text
-from animat.watch.speed import Speed
+from animat.watch.view import View, in_blocks, titled
 
 _UNFINISHED = ".unfinished"
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
@@ -19,17 +19,13 @@ _CONTEXT = "context study"
 _FAILED = "A job that fails ends the study, and its command says which: the folder does not keep it."
 
 
-class StudyView:
-    """A study's folder, looked at again and again."""
+class StudyView(View):
+    """A study's folder."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._speed = Speed()
+        super().__init__(folder)
         self._planned: list[tuple[str, float]] | None = None
         self._why_not = ""
-
-    def close(self) -> None:
-        """Nothing is kept open."""
 
     def about(self) -> dict[str, Any]:
         """What is studied."""
@@ -37,10 +33,10 @@ class StudyView:
         names = [mapped(each).get("name", "robot") for each in listed(mapped(manifest.get("study")).get("robots"))]
         names += listed(mapped(manifest.get(_CONTEXT)).get("robots"))
         robots, kind = ", ".join(map(text, names)), _CONTEXT if _CONTEXT in manifest else "study"
-        return {"generation": 0, "title": f"{kind} {f'of {robots}' if robots else ''}".strip()}
+        return titled(f"{kind} {f'of {robots}' if robots else ''}".strip())
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How far it is; a study has no clock of its own."""
+        """How far it is."""
         self._manifest()
         done = done_jobs(self.folder)
         told = running_jobs(self.folder, done)
@@ -61,18 +57,14 @@ class StudyView:
             ("failed", "none" if is_running or is_done else "its command said which, if any"),
             ("time left", time_left(self._speed.left_s(total - worked), state)),
         ]
-        return {
-            "generation": 0,
-            **state,
-            "damage": "",
-            "blocks": [
-                facts("Jobs", rows, _FAILED),
-                running_table(told if is_running else {}),
-                results_table(self.folder),
-                table("Done", ["job", "files"], [[n, files] for n, files in list(done.items())[-_MOST_SHOWN:]]),
-                table("Waiting", ["job"], [[each] for each in waiting[:_MOST_SHOWN]]),
-            ],
-        }
+        blocks = [
+            facts("Jobs", rows, _FAILED),
+            running_table(told if is_running else {}),
+            results_table(self.folder),
+            table("Done", ["job", "files"], [[n, files] for n, files in list(done.items())[-_MOST_SHOWN:]]),
+            table("Waiting", ["job"], [[each] for each in waiting[:_MOST_SHOWN]]),
+        ]
+        return in_blocks(state, blocks)
 
     def share(self) -> float | None:
         """How much of the work is done, by what jobs cost; None where that is not known."""
@@ -81,10 +73,7 @@ class StudyView:
         return worked / total if total else None
 
     def _manifest(self) -> dict[str, Any]:
-        found = json_of(self.folder / "study.json")
-        if not isinstance(found, dict):
-            raise InvalidFile(f"{self.folder / 'study.json'}: expected the description of a study, got none")
-        return found
+        return self._described("study.json", "study")
 
     def _plan(self, done: dict[str, int]) -> list[tuple[str, float]] | None:
         """All jobs with what they cost, by the study's specification; None where that cannot be known."""

@@ -19,11 +19,7 @@ _LOOKS = 64
 
 
 class Sums:
-    """The totals of a log's records, as far as they were counted.
-
-    Args:
-        tail: the log.
-        pulses: of a trial.
+    """The totals of a log's records, with so many pulses a trial, as far as they were counted.
 
     Attributes:
         counted: of the log's records.
@@ -80,7 +76,7 @@ class Sums:
                 when, what = number(words.get("asked_at_s")), f"{text(words['what'])}: {text(words['message'])}"
                 self.faults = [*self.faults, (when, what)][-_MOST_TOLD:]
             elif kind == "percentiles":
-                self._add_percentiles(words["percentiles_hz"])
+                self.percentiles.append((self._end_s, first_readout(words["percentiles_hz"])))
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
             self.strange += 1
         self.totals.append(total)
@@ -91,10 +87,10 @@ class Sums:
         self._total += tick["reward"] or 0.0
         return self._total
 
-    def _add_percentiles(self, percentiles_hz: list[Any]) -> None:
-        # Of several readouts the first one's.
-        first = percentiles_hz[0] if percentiles_hz and isinstance(percentiles_hz[0], list) else percentiles_hz
-        self.percentiles.append((self._end_s, numbers(first)))
+
+def first_readout(percentiles: Any) -> list[float | None]:
+    """The percentiles of one readout; of several those of the first."""
+    return numbers(percentiles[0] if percentiles and isinstance(percentiles[0], list) else percentiles)
 
 
 def _expect_fit(words: dict[str, Any]) -> None:

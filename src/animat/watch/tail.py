@@ -11,11 +11,15 @@ import time
 import zlib
 from array import array
 from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, record_of, words_of
 from animat.errors import InvalidFile
+
+T = TypeVar("T")
 
 _KEPT = 4096
 """Records that are kept as they were read: those of the last seconds are asked for again and again."""
@@ -28,9 +32,6 @@ _LOOKS = 512
 
 class Tail:
     """A log that may grow.
-
-    Args:
-        path: of the log.
 
     Attributes:
         generation: another number once another file is in its place, or it became shorter.
@@ -95,46 +96,30 @@ class Tail:
         if number in self._kept:
             self._kept.move_to_end(number)
             return self._kept[number]
-        found = self._fetched(number)
+        found = self._read(number, record_of)
         if found is not None:
             self._kept[number] = found
             if len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return found
 
-    def _fetched(self, number: int) -> Record | None:
-        data = self._data(number)
-        if data is None:
-            return None
-        try:
-            return record_of(self.path, data)
-        except InvalidFile:
-            self._ends_before(number)
-            return None
-
     def peek(self, number: int) -> dict[str, Any] | None:
         """The words of a record that is looked at once and not kept; None where it is not whole."""
         if (kept := self._kept.get(number)) is not None:
             return kept.words
-        data = self._data(number)
-        if data is None:
-            return None
-        try:
-            return words_of(self.path, data)
-        except InvalidFile:
-            self._ends_before(number)
-            return None
+        return self._read(number, words_of)
 
-    def _data(self, number: int) -> bytes | None:
-        """The bytes of a record, if they are those that were written."""
+    def _read(self, number: int, made_of: Callable[[Path, bytes], T]) -> T | None:
+        """What is made of the bytes of a record, if they are those that were written."""
         if self._file is None or not 0 <= number < len(self):
             return None
         place, end = self._places[number], self._places[number + 1]
         data = os.pread(self._file, end - place, place)
-        if len(data) < end - place or zlib.crc32(memoryview(data)[HEAD.size :]) != HEAD.unpack_from(data)[3]:
-            self._ends_before(number)
-            return None
-        return data
+        if len(data) == end - place and zlib.crc32(memoryview(data)[HEAD.size :]) == HEAD.unpack_from(data)[3]:
+            with suppress(InvalidFile):
+                return made_of(self.path, data)
+        self._ends_before(number)
+        return None
 
     def _ends_before(self, number: int) -> None:
         """From a damaged record on nothing is shown."""

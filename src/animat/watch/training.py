@@ -18,30 +18,27 @@ from animat.watch.held import state_of
 from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
 from animat.watch.speed import Speed
+from animat.watch.view import View, in_blocks, titled
 
 _UNFINISHED = ".unfinished"
 _MOST_POLICIES = 1000
 
 
-class TrainingView:
-    """A training's folder, looked at again and again."""
+class TrainingView(View):
+    """A training's folder."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._speed = Speed()
+        super().__init__(folder)
         self._curves: dict[Path, tuple[float, Any]] = {}
-
-    def close(self) -> None:
-        """Nothing is kept open."""
 
     def about(self) -> dict[str, Any]:
         """What is trained."""
         training = self._training()
         robot = text(mapped(training.get("robot")).get("name", "robot"))
-        return {"generation": 0, "title": f"training of {robot} policies"}
+        return titled(f"training of {robot} policies")
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How far it is; a training has no clock of its own."""
+        """How far it is."""
         training, simulators = self._training(), mapped(self._manifest().get("simulators"))
         planned = min(whole(training.get("policies")) or 0, _MOST_POLICIES)
         iterations = number(training.get("iterations")) or 0
@@ -66,22 +63,13 @@ class TrainingView:
             *_in_use(training, simulators, share),
             ("algorithm", ", ".join(f"{text(k)} {short(v)}" for k, v in mapped(training.get("algorithm")).items())),
         ]
-        return {
-            "generation": 0,
-            **state,
-            "damage": "",
-            "blocks": [
-                facts("So far", rows),
-                *learning_charts(curves, _swaps(training, simulators, iterations), iterations, levels, missing),
-                _table(planned, curves, shares, told, self._assessed(training)),
-            ],
-        }
+        swaps = _swaps(training, simulators, iterations)
+        charts = learning_charts(curves, swaps, iterations, levels, missing)
+        policies = _table(planned, curves, shares, told, self._assessed(training))
+        return in_blocks(state, [facts("So far", rows), *charts, policies])
 
     def _manifest(self) -> dict[str, Any]:
-        found = json_of(self.folder / "training.json")
-        if not isinstance(found, dict):
-            raise InvalidFile(f"{self.folder / 'training.json'}: expected the description of a training, got none")
-        return found
+        return self._described("training.json", "training")
 
     def _training(self) -> dict[str, Any]:
         return mapped(self._manifest().get("training"))

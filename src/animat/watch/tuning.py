@@ -3,39 +3,31 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import chart, curve, duration, facts, table, time_left
-from animat.watch.files import json_of, newest_s, told_by_jobs
+from animat.watch.files import newest_s, told_by_jobs
 from animat.watch.held import state_of
 from animat.watch.plain import listed, mapped, number, short, text, whole
-from animat.watch.speed import Speed
 from animat.watch.study import running_table
+from animat.watch.view import View, in_blocks, titled
 
 _MOST_SHOWN = 300
 
 
-class TuningView:
-    """A tuning's folder, looked at again and again."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._speed = Speed()
-
-    def close(self) -> None:
-        """Nothing is kept open."""
+class TuningView(View):
+    """A tuning's folder."""
 
     def about(self) -> dict[str, Any]:
         """What is tuned."""
         study = mapped(self._manifest().get("study"))
         robots = ", ".join(text(mapped(each).get("name", "robot")) for each in listed(study.get("robots")))
-        return {"generation": 0, "title": f"tuning {f'on {robots}' if robots else ''}".strip()}
+        return titled(f"tuning {f'on {robots}' if robots else ''}".strip())
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How far it is; a tuning has no clock of its own."""
+        """How far it is."""
         planned = whole(mapped(self._manifest().get("tune")).get("trials")) or 0
         trials = self._trials()
         told = {n: each for n, each in self._told().items() if each[0] < 1}
@@ -55,17 +47,8 @@ class TuningView:
             ("time left", self._left(planned - len(trials)) if is_running else time_left(None, state)),
             ("best so far", "none yet" if best is None else f"trial {best['trial']}, {best['last']:.1f}"),
         ]
-        return {
-            "generation": 0,
-            **state,
-            "damage": "",
-            "blocks": [
-                facts("Trials", rows),
-                _chart(trials),
-                running_table(told if is_running else {}, "whole"),
-                _table(trials),
-            ],
-        }
+        running = running_table(told if is_running else {}, "whole")
+        return in_blocks(state, [facts("Trials", rows), _chart(trials), running, _table(trials)])
 
     def _left(self, trials: int) -> str:
         if trials <= 0:
@@ -73,10 +56,7 @@ class TuningView:
         return f"{duration(self._speed.left_s(trials))} of trials, then the finals"
 
     def _manifest(self) -> dict[str, Any]:
-        found = json_of(self.folder / "tune.json")
-        if not isinstance(found, dict):
-            raise InvalidFile(f"{self.folder / 'tune.json'}: expected the description of a tuning, got none")
-        return found
+        return self._described("tune.json", "tuning")
 
     def _told(self) -> dict[str, tuple[float, str, float]]:
         found: dict[str, tuple[float, str, float]] = {}

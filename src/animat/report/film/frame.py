@@ -25,12 +25,7 @@ COMMANDS = (ORANGE, BLUE, RED)
 
 
 class Frames:
-    """Draws a scene at any time.
-
-    Args:
-        scene: what is drawn.
-        picture: the robot as it is at a moment, None where it cannot be drawn.
-    """
+    """Draws a scene at any time; the picture is the robot at a moment, None where it cannot be drawn."""
 
     def __init__(self, scene: Scene, picture: Callable[[int], UInt8[np.ndarray, "height width 3"] | None]) -> None:
         self._scene, self._picture = scene, picture

@@ -48,12 +48,7 @@ def check_film(path: str | os.PathLike[str]) -> None:
 
 
 def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-    """Film a scene in real time; the file is complete or absent.
-
-    Args:
-        scene: what is shown.
-        path: of the film, .mp4 or .gif.
-        progress: told how many pictures are drawn.
+    """Film a scene in real time, as .mp4 or .gif; the file is complete or absent.
 
     Raises:
         InvalidArgument: as `check_film`.

@@ -1,15 +1,23 @@
-"""The history of a search: what every trial got, and how far it was trained."""
+"""A search: its history, what every trial got and how far it was trained, and the importance of each setting."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
-from animat.report.style import BLACK, BLUE, GREY, ORANGE, PURPLE, RED, SKY, add_common_legend, new_figure, style_axes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+)
 
 _MARKERS = "ov^sDP"
 
@@ -63,4 +71,19 @@ def draw_history(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style_axes(axes, title, "trial", "mean return of an episode")
     add_common_legend(figure, [axes], columns=3)
+    return figure
+
+
+def draw_importance(shares: Mapping[str, float], title: str) -> Figure:
+    """A bar a setting, by the shares of settings, which come the largest first and together are 1."""
+    figure = new_figure(6.0, 1.1 + 0.27 * len(shares))
+    axes = figure.subplots()
+    places = range(0, -len(shares), -1)
+    percent = [100 * share for share in shares.values()]
+    axes.barh(places, percent, height=0.65, color=BLUE)
+    for place, share in zip(places, percent, strict=True):
+        axes.annotate(f"{share:.0f}", (share, place), (3, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set_yticks(places, list(shares))
+    axes.set_xlim(0, max(1.0, 1.1 * max(percent)))
+    style_axes(axes, title, "importance (%)", "")
     return figure
