@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from scipy.stats import bootstrap, mannwhitneyu
 
 from animat.cli import main
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, UnusableData
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.statistics import compare
 from animat.studies import cultures
 from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
@@ -31,6 +31,7 @@ from animat.studies.source import Source, read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
+from animat.writing import exclusive_lock
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 
@@ -134,12 +135,20 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     found = run_over_cultures(study, tmp_path)
     assert list(found.ran) == ["culture-1", "culture-3"]
     assert found.failed == {"culture-2": "recording 1: no responses"}
+    assert json.loads((tmp_path / cultures.MANIFEST).read_text()) == {
+        "cultures": ["culture-1", "culture-2", "culture-3"],
+        "failed": found.failed,
+    }
     table = pd.read_csv(tmp_path / cultures.COMPARISONS)
     assert table["culture"].tolist() == ["culture-1", "culture-3"]
     assert table["mean_second"].tolist() == [1.0, 3.0]
     assert pd.read_csv(tmp_path / cultures.SUMMARY)["difference"].tolist() == [2.0]
     with pytest.raises(AnimatError, match="culture-2: recording 1: no responses"):
         run_over_cultures(replace(study, culture=Source(seeds="2")), tmp_path)
+    before = (tmp_path / cultures.MANIFEST).read_bytes()
+    with exclusive_lock(tmp_path), pytest.raises(Mismatch, match="another run"):
+        run_over_cultures(study, tmp_path)
+    assert (tmp_path / cultures.MANIFEST).read_bytes() == before
 
 
 def told_and_tables(study: Study, folder: Path) -> Ran:

@@ -78,6 +78,11 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     ]
     assert "on the simulator of minute 15" in with_lines["words"]
     assert "Not known: best coupling." in with_lines["words"]
+    # That of other policies says nothing about these.
+    (tmp_path / "evaluation.json").write_text(json.dumps({**told, "robot": "navigation", "mapping": "9-thresholds"}))
+    of_another = block(TrainingView(tmp_path).view(None, 8.0), "Learning curves")
+    assert of_another["series"] == chart["series"]
+    assert of_another["words"].endswith("The evaluation.json in this folder is of another robot.")
     # What is no evaluation is none.
     (tmp_path / "evaluation.json").write_text('[1, {"rows": 3}]')
     assert block(TrainingView(tmp_path).view(None, 8.0), "Learning curves") == chart
@@ -145,7 +150,7 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
     Receipt(planned[0].name, "x", {}, {"a": "b"}).save(tmp_path / names[3] / "jobs")
     view = CulturesView(tmp_path)
     assert view.about()["title"] == "study over 5 cultures"
-    with exclusive_lock(tmp_path / names[3]):
+    with exclusive_lock(tmp_path), exclusive_lock(tmp_path / names[3]):
         found = view.view(None, 8.0)
     rows = facts(found, "Cultures")
     assert (rows["cultures done"], rows["running"], rows["begun, not running"]) == ("3 of 5", 1, 1)
@@ -153,6 +158,16 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
     assert block(found, "Running")["rows"] == [[names[3], f"{100 * share:.0f} %"]]
     assert block(found, "Comparisons")["rows"] == [["a and b", "arm", 3.0, 4.0, "2 of 3"]]
     assert view.view(None, 8.0)["state"] == "silent"
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "culture-9").symlink_to(elsewhere)
+    told = {"cultures": [*names, "culture-9"], "failed": {names[4]: "no responses", "../x": "y"}}
+    (tmp_path / "cultures.json").write_text(json.dumps(told))
+    assert view.about()["title"] == "study over 5 cultures"
+    failed = view.view(None, 8.0)
+    assert (failed["state"], facts(failed, "Cultures")["failed"]) == ("ended", 1)
+    assert failed["message"] == "1 of the cultures failed; started again it goes on"
+    assert block(failed, "Failed")["rows"] == [[names[4], "no responses"]]
     for damage in (b"comparison,robot,mean_first,mean_second\na and b,arm,nan,4", b"\xff\x00", b"comparison\nx"):
         (tmp_path / names[0] / "tables" / "comparisons.csv").write_bytes(damage)
         compared = block(CulturesView(tmp_path).view(None, 8.0), "Comparisons")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND, TOO_FEW
-from animat.writing import write_whole
+from animat.writing import exclusive_lock, write_whole
 
 RESAMPLES = 10_000
 MOST_AT_ONCE = 64
@@ -134,19 +134,32 @@ def run_over_cultures(
 
     Raises:
         AnimatError: if the study of every culture failed, with what each failed of.
+        Mismatch: if another run is at work in the folder.
         InvalidArgument: for fewer workers than one, or any beside an executor.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
-    write_whole(folder / MANIFEST, json.dumps({"cultures": list(studies)}, indent=1) + "\n")
-    with _room(workers, executor) as (room, at_once):
-        here = workers if room is None else None
-        runs = {
-            name: partial(run_study, each, folder / name, base=base, workers=here, executor=room)
-            for name, each in studies.items()
-        }
-        ran, failed = _side_by_side(runs, min(at_once, MOST_AT_ONCE), room, progress or Silent())
+    with exclusive_lock(folder):
+        _name_cultures(folder, studies, {})
+        with _room(workers, executor) as (room, at_once):
+            here = workers if room is None else None
+            runs = {
+                name: partial(run_study, each, folder / name, base=base, workers=here, executor=room)
+                for name, each in studies.items()
+            }
+            ran, failed = _side_by_side(runs, min(at_once, MOST_AT_ONCE), room, progress or Silent())
+        _name_cultures(folder, studies, failed)
+        return _over_those_that_ran(folder, ran, failed)
+
+
+def _name_cultures(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
+    """Say which folders there are, and which of them failed of what."""
+    write_whole(folder / MANIFEST, json.dumps({"cultures": list(names), "failed": failed}, indent=1) + "\n")
+
+
+def _over_those_that_ran(folder: Path, ran: dict[str, Ran], failed: dict[str, str]) -> RanCultures:
+    """Write the tables over the cultures that are finished."""
     if not ran:
         raise AnimatError("; ".join(f"{which}: {why}" for which, why in failed.items()))
     results = {name: read_typed(results_file(each.folder), Results) for name, each in ran.items()}

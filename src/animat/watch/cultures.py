@@ -38,25 +38,28 @@ class CulturesView(View):
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         """How far the cultures are."""
-        names = self._names()
+        names, failed = self._names(), self._failed()
         done = [name for name in names if (self.folder / name / _DONE).exists()]
         begun = [name for name in names if name not in done and (self.folder / name).is_dir()]
         shares = {name: self._share(name) for name in begun if is_held(self.folder / name) is not False}
         self._speed.see(worked := len(done) + sum(shares.values()))
         changed_s = newest_s([self.folder, *(self.folder / name / "jobs" for name in begun)])
-        # Programs lock the folders of the cultures, not the one around them.
-        state = state_of(self.folder / next(iter(shares), ""), changed_s, is_done=len(done) == len(names))
+        state = state_of(self.folder, changed_s, is_done=len(done) == len(names))
         running = shares if state["state"] == "running" else {}
+        if failed and state["state"] == "silent":
+            state = {"state": "ended", "message": f"{len(failed)} of the cultures failed; started again it goes on"}
         rows: list[tuple[str, Any]] = [
             ("cultures done", f"{len(done):,} of {len(names):,}"),
             ("running", len(running)),
             ("begun, not running", len(begun) - len(running)),
+            ("failed", len(failed)),
             ("time left", time_left(self._speed.left_s(len(names) - worked), state)),
         ]
         under_way = [[name, f"{100 * share:.0f} %"] for name, share in running.items()]
         blocks = [
             facts("Cultures", rows, "The list at the top has each culture's own page."),
             table("Running", ["culture", "done"], under_way, "" if under_way else "nothing runs now"),
+            *([table("Failed", ["culture", "of what"], [[*each] for each in failed.items()])] if failed else ()),
             self._comparisons(done),
         ]
         return in_blocks(state, blocks)
@@ -90,8 +93,18 @@ class CulturesView(View):
             words += f" Left out, as their {_COMPARISONS} cannot be read: {left_out:,} of the cultures that are done."
         return table("Comparisons", head, rows, words, width="whole")
 
+    def _failed(self) -> dict[str, str]:
+        """Those that the last run could not finish, and what they failed of."""
+        found = mapped(mapped(json_of(self.folder / _MANIFEST)).get("failed"))
+        return {name: text(why) for name, why in list(found.items())[:_MOST_CULTURES] if _is_name(name)}
+
     def _names(self) -> list[str]:
-        found = [name for name in listed(mapped(json_of(self.folder / _MANIFEST)).get("cultures")) if _is_name(name)]
+        found = [
+            name
+            for name in listed(mapped(json_of(self.folder / _MANIFEST)).get("cultures"))
+            # A link may lead out of the folder.
+            if _is_name(name) and not (self.folder / name).is_symlink()
+        ]
         if not found:
             raise InvalidFile(f"{self.folder / _MANIFEST}: expected the names of cultures, got none")
         return found[:_MOST_CULTURES]

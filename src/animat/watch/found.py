@@ -22,7 +22,7 @@ _MARKS: tuple[tuple[Kind, str], ...] = (
     ("cultures", "cultures.json"),
 )
 """By which file each is known; the modules that write them import JAX, which a page has no need of."""
-_DEPTH, _MOST_FOLDERS, _MOST_FOUND = 4, 2000, 200
+_DEPTH, _MOST_FOLDERS, _MOST_FOUND = 4, 4000, 2000
 _PASSED_OVER = ("jobs", "figures", "tables", "checkpoints")
 
 
@@ -43,7 +43,8 @@ def find(folder: Path) -> list[Found]:
     found = [each for place in _folders(folder) for each in _in_folder(folder, place)]
     found.sort(key=lambda each: (-each.changed_s, each.place))
     # What all the others are part of is among them, however many came after it.
-    return found[:_MOST_FOUND] + [each for each in found[_MOST_FOUND:] if not each.place]
+    is_whole = [each for each in found[_MOST_FOUND:] if each.kind == "cultures" or not each.place]
+    return found[:_MOST_FOUND] + is_whole
 
 
 def place_within(folder: Path, place: str) -> Path:

@@ -28,6 +28,11 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
 
     They are in the training's description and in an evaluation of its policies, which is empty where there is none.
     """
+    training = mapped(manifest.get("training"))
+    own = {"robot": mapped(training.get("robot")).get("name"), "mapping": training.get("mapping")}
+    others = [name for name, value in own.items() if evaluation.get(name, value) != value]
+    if others:
+        evaluation = {}
     rows = {str(row.get("name")): number(row.get("mean_return")) for row in map(mapped, listed(evaluation.get("rows")))}
     optimum = mapped(evaluation.get("optimum")).get("value")
     known = {
@@ -44,7 +49,9 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
         told += " It is on the first simulator."
     if missing := [name for name, value in known.items() if value is None]:
         told += f" Not known: {', '.join(missing)}. animat evaluate --optimum --out evaluation.json, with the file in "
-        told += "this folder, has them shown."
+        told += "this folder, shows them."
+    if others:
+        told += f" The evaluation.json in this folder is of another {' and '.join(others)}."
     return [(name, value) for name, value in known.items() if value is not None], told.strip()
 
 
