@@ -148,7 +148,7 @@ def cell(value: Any) -> str:
         return "∞" if value > 0 else f"{MINUS}∞"
     whole = value == int(value) and abs(value) < 1e6
     # With the zeros at the end: 23.0 beside 22.4.
-    return (f"{int(value)}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
+    return (f"{int(value):,}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
 
 
 def with_error(value: float, error: float | None) -> str:

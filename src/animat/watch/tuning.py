@@ -62,7 +62,7 @@ class TuningView:
             "blocks": [
                 facts("Trials", rows),
                 _chart(trials),
-                running_table(told if is_running else {}, "whole"),
+                *([] if is_done else [running_table(told if is_running else {}, "whole")]),
                 _table(trials),
             ],
         }
@@ -122,7 +122,7 @@ def _chart(trials: list[dict[str, Any]]) -> dict[str, Any]:
     words = (
         "One dot for each trial: its mean return after its last rung. Trials that were stopped were trained for less."
     )
-    return chart("Trials", "trial", "mean return", series, words if series else "No trial has ended yet.")
+    return chart("Return of each trial", "trial", "mean return", series, words if series else "No trial has ended yet.")
 
 
 def _table(trials: list[dict[str, Any]]) -> dict[str, Any]:
