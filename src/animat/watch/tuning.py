@@ -53,7 +53,8 @@ class TuningView:
             ("diverged", states.count("diverged")),
             ("running", len(told) if is_running else 0),
             ("time left", self._left(planned - len(trials)) if is_running else time_left(None, state)),
-            ("best so far", "none yet" if best is None else f"trial {best['trial']}, {best['last']:.1f}"),
+            _won(mapped(json_of(self.folder / "results.json")))
+            or ("best so far", "none yet" if best is None else f"trial {best['trial']}, {best['last']:.1f}"),
         ]
         return {
             "generation": 0,
@@ -91,6 +92,16 @@ class TuningView:
         except InvalidFile:
             return []
         return [found for line in lines if (found := _trial(line)) is not None]
+
+
+def _won(results: dict[str, Any]) -> tuple[str, str] | None:
+    """The trial that came out best when the best ones were trained once more, once that is known."""
+    trial = whole(mapped(results.get("best")).get("trial"))
+    finals = {
+        whole(each.get("trial")): number(each.get("mean_return")) for each in map(mapped, listed(results.get("finals")))
+    }
+    mean = finals.get(trial)
+    return None if trial is None or mean is None else ("best, retrained", f"trial {trial}, {mean:.1f}")
 
 
 def _trial(line: str) -> dict[str, Any] | None:
