@@ -90,7 +90,9 @@ def learning_charts(
     for column, title, unit, meaning in _LEARNER:
         series, last = _series(curves, column)
         words = f"{'Not known' if last is None else f'{last:.3g}'} on average, at the last checkpoint. {meaning}"
-        if series and last is None:
+        if not series:
+            words = f"Known from the first checkpoint on. {meaning}"
+        elif last is None:
             words = "Not in these files: they were written before it was kept."
         charts.append(chart(title, "iterations", unit, series, words, until=iterations, width="third"))
     return charts

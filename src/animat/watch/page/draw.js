@@ -209,7 +209,8 @@ export function spanOf(values, least = 1e-9) {
   if (!known.length) return [0, 1];
   let low = Infinity, high = -Infinity;
   for (const each of known) { low = Math.min(low, each); high = Math.max(high, each); }
-  const more = Math.max((high - low) * 0.06, least, Math.abs(high) * 1e-6);
+  // Around a single value there is room too: ten equal numbers at an axis say nothing.
+  const more = Math.max((high - low) * 0.06, least, Math.abs(high) * (high > low ? 1e-6 : 0.1));
   return [low - more, high + more];
 }
 
