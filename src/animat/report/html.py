@@ -77,6 +77,10 @@ class Table:
     marked: tuple[int, ...] = ()
     folded: bool = False
 
+    def is_text(self, column: int) -> bool:
+        """Whether any row has a text in a column, by index; head and cells then stand at the left."""
+        return any(isinstance(row[column], str) for row in self.rows)
+
 
 @dataclass(frozen=True)
 class Section:
