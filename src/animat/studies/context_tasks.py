@@ -13,7 +13,7 @@ from animat.devices import gpu_here
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import Work, train_alone
-from animat.progress import Progress
+from animat.progress import InTurn, Progress
 from animat.records import Positive, Seed, Whole, as_json, record
 from animat.responses.responses import Responses
 from animat.studies.draws import draw_seed
@@ -215,7 +215,7 @@ class Judge(RobotTask):
             seed=self.drawn("judge"),
             optimum_resolution=self.study.optimum_resolution,
             interventions=True,
-            progress=progress,
+            progress=InTurn(progress, 2),
         )
         return [write_json(self.beside(folder, SIMULATED), evaluation.to_dict())]
 
@@ -250,7 +250,8 @@ class Measure(RobotTask):
                 seed=self.drawn("measure"),
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
-                progress=progress,
+                # Best coupling, prediction, closed loop, optimal return.
+                progress=InTurn(progress, 4),
             )
         if gap.session.ending.by != "plan":
             raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to go on")
