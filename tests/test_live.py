@@ -104,7 +104,7 @@ def test_recordings_are_watched_as_they_are_made(tmp_path: Path, monkeypatch: py
         assert len(until_s) > 1 and until_s == sorted(set(until_s))
         assert until_s[-1] <= read_recordings([file])[0].duration_s + 1e-9
     after = RecordingView(folder).view(None, 8.0)
-    assert (after["state"], dict(after["blocks"][0]["rows"])["whole ones"]) == ("ended", 3)
+    assert (after["state"], dict(after["blocks"][0]["rows"])["complete"]) == ("ended", 3)
     assert not (folder / under_way.UNDER_WAY).exists()
 
 
