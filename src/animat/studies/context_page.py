@@ -122,7 +122,8 @@ def _context_picture(study: ContextStudy, folder: Path) -> Picture:
         "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
         f"random); from the dashed line on a task is taken to need context. Right: how far the {study.policies} "
         "policies come from that reflex to the optimum. A point is a culture, with its 95 % interval on the culture's "
-        "simulator. Triangles: at least so much, as the optimal return is not known.",
+        "simulator; one that reaches the frame goes on beyond it. Triangles: at least so much, as the optimal return "
+        "is not known.",
         (*(f"{_GAPS}.{ending}" for ending in FORMATS[1:]), TABLE),
     )
 
