@@ -270,7 +270,7 @@ def test_figures_name_units_and_conditions() -> None:
     responses = extract_responses(source)
     labels = [condition.label for condition in responses.conditions]
     raster = draw_raster(source, responses)
-    legend = [text.get_text() for text in axes_of(raster)[1].get_legend().get_texts()]
+    legend = [text.get_text() for text in raster.legends[0].get_texts()]
     assert legend == ["window 2-10 ms", "stimulus"]
     assert [text.get_text() for text in axes_of(raster)[1].get_yticklabels()] == labels
     histograms = draw_response_histograms(responses)

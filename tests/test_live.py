@@ -90,7 +90,7 @@ def test_recordings_are_watched_as_they_are_made(tmp_path: Path, monkeypatch: py
             super().__call__(so_far)
             found = RecordingView(folder).view(None, 8.0)
             facts = dict(found["blocks"][0]["rows"])
-            seen.append((found["state"], facts["whole ones"], facts["shown"], found["end_s"]))
+            seen.append((found["state"], facts["complete"], facts["shown"], found["end_s"]))
 
     monkeypatch.setattr(under_way, "EVERY_S", 0.0)
     monkeypatch.setattr(shadowing, "UnderWay", Watched)
@@ -104,7 +104,7 @@ def test_recordings_are_watched_as_they_are_made(tmp_path: Path, monkeypatch: py
         assert len(until_s) > 1 and until_s == sorted(set(until_s))
         assert until_s[-1] <= read_recordings([file])[0].duration_s + 1e-9
     after = RecordingView(folder).view(None, 8.0)
-    assert (after["state"], dict(after["blocks"][0]["rows"])["whole ones"]) == ("ended", 3)
+    assert (after["state"], dict(after["blocks"][0]["rows"])["complete"]) == ("ended", 3)
     assert not (folder / under_way.UNDER_WAY).exists()
 
 

@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from animat.progress import Bar, Part, Phase, in_phase
+from animat.progress import Bar, InTurn, Part, Phase, in_phase
 
 SCRIPT = """
 from animat.progress import Bar
@@ -167,3 +167,21 @@ def test_parts_make_up_the_whole() -> None:
         (0.5, 8, "first"), (1.0, 8, "done"), (1.5, 8, "first"), (2.0, 8, "done"),
         (3.5, 8, ""), (5.0, 8, "done"), (6.5, 8, ""), (8.0, 8, "done"),
     ]  # fmt: skip
+
+
+def test_phases_of_a_part_never_go_back() -> None:
+    seen: list[float] = []
+
+    class Seen:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            seen.append(done / total)
+
+    whole = InTurn(Seen(), 4)
+    for done in (0, 5, 10):
+        whole.update(done, 10)
+    # Of a phase that tells nothing nothing is added.
+    for title in ("silent", "second", "third", "one more than planned"):
+        phase = in_phase(whole, title)
+        for done in () if title == "silent" else (0, 1):
+            phase.update(done, 1)
+    assert seen == [0, 0.125, 0.25, 0.25, 0.5, 0.5, 0.75, 0.75, 1]

@@ -98,12 +98,12 @@ def test_the_page_shows_a_recording_as_far_as_it_is(tmp_path: Path, monkeypatch:
     assert facts(begun, "Recordings")["stimuli"] == 30
     assert str(begun["message"]).endswith("s of the one under way are shown")
     assert 0 < begun["end_s"] < series[0].duration_s
-    assert facts(of_the_next, "Recordings")["whole ones"] == 1
+    assert facts(of_the_next, "Recordings")["complete"] == 1
     # Beside what is known of the next is the one before.
     assert len(block(of_the_next, "P(x >= P50) of each condition")["head"]) == 3
     assert not (tmp_path / UNDER_WAY).exists()
     ended = looking.view.view(None, 1.0)
-    assert (ended["state"], ended["message"]) == ("ended", "2 are there")
+    assert (ended["state"], ended["message"]) == ("ended", "2 recordings")
 
 
 def test_one_that_fails_leaves_nothing_and_one_that_was_killed_is_told(tmp_path: Path) -> None:

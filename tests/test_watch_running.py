@@ -159,7 +159,7 @@ def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: 
         wait_for(lambda: said("#pause") == "Follow")
         browser.find_element("id", "stop").click()
         assert_no_more_pulses(folder, ended)
-        wait_for(lambda: said("#state").startswith("■ ended: person"))
+        wait_for(lambda: said("#state").startswith("■ ended: stopped by a person"))
         browser.find_element("id", "pause").click()
         with (folder / "ticks.csv").open(newline="") as file:
             *_, row = csv.DictReader(file)

@@ -68,7 +68,9 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     *policies, mean = chart["series"]
     assert [each["y"] for each in policies] == [[None] * 3 + list(np.arange(3.0, 30) + more) for more in (0, 10)]
     assert mean["y"][3:] == list(np.arange(3.0, 30) + 5)
-    assert "Not known: random actions, best coupling, optimal return. animat evaluate" in chart["words"]
+    assert (
+        "Not known: random actions, best coupling, optimal return. To show them, run animat evaluate" in chart["words"]
+    )
     told = {"rows": [{"name": "random", "mean_return": -2.5}], "optimum": {"value": 50.0}, "recorded_at_min": 15.0}
     (tmp_path / "evaluation.json").write_text(json.dumps(told))
     with_lines = block(TrainingView(tmp_path).view(None, 8.0), "Learning curves")
@@ -214,6 +216,11 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     # One that came further counts before one that did well at the first rung.
     assert rows["best so far"] == "trial 0, 4.0"
     assert block(found, "Journal")["rows"][-1] == [0, "complete", 4.0, "discount 0.9877"]
+    finals = [{"trial": 0, "mean_return": 3.0}, {"trial": 1, "mean_return": 6.25}]
+    (tmp_path / "results.json").write_text(json.dumps({"best": {"trial": 1}, "finals": finals}))
+    found = TuningView(tmp_path).view(None, 8.0)
+    assert facts(found, "Trials")["best, retrained"] == "trial 1, 6.2"
+    assert "Running" not in [each["title"] for each in found["blocks"]]
 
 
 def test_recordings_are_inspected_one_after_the_other(tmp_path: Path) -> None:

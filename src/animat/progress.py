@@ -53,10 +53,29 @@ class Part:
         self._whole.update(self._before + self._units * done / total, self._total, note or self._note)
 
 
+class InTurn:
+    """Work in so many phases as one progress that never goes back: each phase is an equal part of the whole."""
+
+    def __init__(self, whole: Progress, phases: int) -> None:
+        self._whole, self._last = whole, phases - 1
+        self._phase, self._was_told = 0, False
+
+    def begin(self) -> None:
+        """The next phase begins, if anything was told of the one before."""
+        self._phase = min(self._phase + self._was_told, self._last)
+        self._was_told = False
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        """Move the whole on by as much of the phase."""
+        self._was_told = True
+        self._whole.update(self._phase + done / total, self._last + 1, note)
+
+
 def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: str = "") -> Progress:
     """The progress of another phase of the work, whose length says nothing about that of the others.
 
-    A `Bar` shows each phase by itself, one below the other; any other progress is told the phases one after the other.
+    A `Bar` shows each phase by itself, one below the other, and `InTurn` lets each be a part of the whole; any other
+    progress is told the phases one after the other.
 
     Args:
         progress: of the whole work; None: silent.
@@ -66,6 +85,8 @@ def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: s
     """
     if isinstance(progress, Bar):
         progress.begin(title, amount, unit)
+    elif isinstance(progress, InTurn):
+        progress.begin()
     return Silent() if progress is None else progress
 
 

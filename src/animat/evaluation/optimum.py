@@ -111,11 +111,11 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, standa
         return ()  # Neither has NaN, where the controller was not run, anything to tell.
     told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± "
     if apart > 0:
-        told += f"{standard_error:.2f} part: the optimal return lies between the two"
+        told += f"{standard_error:.2f} differ: the optimal return lies between the two"
     else:
         told += (
-            f"{standard_error:.2f}, which can be had, part: the grid is too rough, take a higher resolution (or the "
-            f"{CLASSES} classes of what a memory simulator remembers are)"
+            f"{standard_error:.2f}, which is achievable, differ: the grid is too rough, take a higher resolution (or "
+            f"the {CLASSES} classes of what a memory simulator remembers are)"
         )
     return (Finding("optimum", "warning", told, apart),)
 

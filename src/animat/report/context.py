@@ -40,7 +40,7 @@ def draw_context(
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "The task: is a reflex enough?", "context gap (0: a reflex does it all, 1: it does nothing)", "")
     style_axes(right, "The policies: more than a reflex?", "context score (0: the best reflex, 1: optimal)", "")
-    left.axvline(admitted, color=ORANGE, linewidth=1, linestyle="--", label=f"{admitted:g}: admitted")
+    left.axvline(admitted, color=ORANGE, linewidth=1, linestyle="--", label=f"from {admitted:g} on: needs context")
     for axes, found, colour in ((left, gaps, BLUE), (right, scores, BLACK)):
         axes.axvline(0, color=GREY, linewidth=0.8)
         _points(axes, found, colour, "not known" if axes is left else "none: no task beyond a reflex, or not known")

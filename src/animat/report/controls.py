@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 from animat.report.minus import with_minus
 from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, Figure, add_common_legend, grid_of_panels, style_axes
+
+_MOST_LETTERS = 36
+"""Of a title over a panel."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ def draw_controls(panels_of: Sequence[Controls], title: str) -> Figure:
             axes.axvline(controls.optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
         if controls.random is not None:
             axes.axvline(controls.random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
-        style_axes(axes, controls.title, "mean return and its standard error", "")
+        style_axes(axes, fill(controls.title, _MOST_LETTERS), "mean return and its standard error", "")
         axes.locator_params(axis="x", nbins=5)
         axes.grid(axis="y", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=4)

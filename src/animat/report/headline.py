@@ -66,7 +66,7 @@ def draw_headline(rows: Sequence[ArmReturns], *, narrow: bool = False) -> Figure
         axes.set_yticks(range(len(own)), [row.arm for row in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
-    add_common_legend(figure, panels, columns=2 if narrow else 5)
+    add_common_legend(figure, panels, columns=2 if narrow else 3 if len(robots) == 1 else 5)
     return figure
 
 

@@ -77,6 +77,10 @@ class Table:
     marked: tuple[int, ...] = ()
     folded: bool = False
 
+    def is_text(self, column: int) -> bool:
+        """Whether any row has a text in a column, by index; head and cells then stand at the left."""
+        return any(isinstance(row[column], str) for row in self.rows)
+
 
 Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
 """Of a table of records: their names, and the field or a function of a record that gives the cell."""
@@ -150,7 +154,7 @@ def cell(value: Any) -> str:
         return "∞" if value > 0 else f"{MINUS}∞"
     whole = value == int(value) and abs(value) < 1e6
     # With the zeros at the end: 23.0 beside 22.4.
-    return (f"{int(value)}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
+    return (f"{int(value):,}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
 
 
 def with_error(value: float, error: float | None) -> str:

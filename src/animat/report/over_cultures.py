@@ -28,11 +28,11 @@ class Compared:
 def draw_over_cultures(rows: Sequence[Compared]) -> Figure:
     """A panel a robot, a line a comparison: a point for each culture, their mean with its interval."""
     robots = list(dict.fromkeys(row.robot for row in rows))
-    figure = new_figure(4.4 * len(robots), 1.3 + 0.5 * max(sum(row.robot == robot for row in rows) for robot in robots))
+    figure = new_figure(4.4 * len(robots), 1.5 + 0.5 * max(sum(row.robot == robot for row in rows) for robot in robots))
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=True):
         own = [row for row in rows if row.robot == robot]
-        style_axes(axes, robot, "difference of the mean return, second arm less first", "")
+        style_axes(axes, robot, "difference of the mean returns,\nsecond arm less first", "")
         axes.axvline(0, color=GREY, linewidth=0.8)
         for place, row in enumerate(own):
             places = [place + 0.16] * len(row.differences)

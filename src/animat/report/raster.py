@@ -6,7 +6,17 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Recording
-from animat.report.style import BLACK, RED, WINDOW, Axes, Figure, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import (
+    BLACK,
+    RED,
+    WINDOW,
+    Axes,
+    Figure,
+    add_common_legend,
+    condition_colours,
+    new_figure,
+    style_axes,
+)
 from animat.responses.responses import Responses
 from animat.responses.windows import spikes_in
 from animat.tables import evenly
@@ -29,6 +39,7 @@ def draw_raster(recording: Recording, responses: Responses) -> Figure:
     upper, lower = figure.subplots(2, 1, height_ratios=[1, 1.25])
     _draw_stretch(upper, recording)
     _draw_stimuli(lower, recording, responses, -20.0, to_ms)
+    add_common_legend(figure, [lower], columns=2)
     return figure
 
 
@@ -46,14 +57,12 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
     )
     # Whatever else falls into it.
     inside = times_s[(times_s >= from_s) & (times_s <= to_s)]
-    for i, time_s in enumerate(inside):
-        axes.axvline(time_s, color=RED, linewidth=1, label="stimulus" if i == 0 else None)
+    for time_s in inside:
+        axes.axvline(time_s, color=RED, linewidth=1)
     axes.set_xlim(from_s, to_s)
     axes.set_ylim(-1, len(recording.channels))
     title = f"{len(inside)} stimuli in the middle of the recording, each spike a dot" if len(inside) else "every spike"
     style_axes(axes, title, "time (s)", "channel (row)")
-    if len(inside):
-        add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_ms: float, to_ms: float) -> None:
@@ -93,7 +102,6 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     style_axes(
         axes, f"{thinned}{len(times_s):,} stimuli, a row each; {each}", "time from stimulus (ms)", "stimulus (row)"
     )
-    add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_rates(

@@ -45,7 +45,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
         axes.set_xlim(0, edges_hz[-1])
         axes.set_ylim(-len(shown) + 0.9, 1.0)
         axes.tick_params(labelbottom=True)
-        style_axes(axes, condition.label, "", "start of the recording (min)" if i % columns == 0 else "")
+        style_axes(axes, condition.label, "", "start (min)" if i % columns == 0 else "")
     for axes in panels[len(conditions) :]:
         axes.set_visible(False)
     left_out = []

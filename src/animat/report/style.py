@@ -123,5 +123,5 @@ def grid_of_panels(
         axes.set_visible(False)
     for axes in panels[:n]:
         # A shared axis has its numbers at every panel all the same.
-        axes.tick_params(labelbottom=True)
+        axes.tick_params(labelbottom=True, labelleft=True)
     return figure, list(panels[:n])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +29,17 @@ def write_context_page(study: ContextStudy, found: RanContext) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"{name}.{ending}")
     sections = [
-        Section("Results in short", points=tuple((robot, in_short(rows)) for robot, rows in by_robot.items()),
+        Section("Results in short", (on_every_culture(by_robot),),
+                points=tuple((robot, in_short(rows)) for robot, rows in by_robot.items()),
                 pictures=(_context_picture(study, found.folder),)),
         _whose_work(study, found, lost),
-        Section("Every culture", tables=(_table(found.rows),)),
+        Section("Every culture", tables=(_on_the_simulator(found.rows), _on_the_culture(found.rows))),
     ]  # fmt: skip
     cultures = ", ".join(map(str, study.cultures))
+    named = f"Virtual culture{'' if len(study.cultures) == 1 else 's'} {cultures}"
     lead = (
-        f"Virtual cultures {cultures}; {study.policies} policies of each robot on every one, on the simulator and in "
-        "closed loop on the culture."
+        f"{named}; {study.policies} policies of each robot on every one, on the simulator and in closed loop on the "
+        "culture."
     )
     return write_page(
         found.folder / REPORT, "Does it need context, and whose work is it?", lead, sections, [f"Seed {study.seed}."]
@@ -61,6 +63,16 @@ def _has_something(row: ContextRow) -> bool:
     return row.policies - row.random > 0.1 * (best - row.random) > 0
 
 
+def on_every_culture(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
+    """In two sentences, of all robots: which tasks ask for more than a reflex, and where the policies do more."""
+    needs = [robot for robot, rows in by_robot.items() if rows and all(row.needs_context for row in rows)]
+    has = [robot for robot, rows in by_robot.items() if rows and all(row.has_context for row in rows)]
+    return (
+        f"The task needs more than a reflex on every culture for {', '.join(needs) or 'no robot'}. The policies do "
+        f"significantly more than the best reflex on every culture for {', '.join(has) or 'no robot'}."
+    )
+
+
 def in_short(rows: Sequence[ContextRow]) -> str:
     """In two sentences, of one robot on all cultures: what the task asks for, and what the policies do."""
     n, needs = sum(row.gap is not None for row in rows), sum(row.needs_context for row in rows)
@@ -70,15 +82,21 @@ def in_short(rows: Sequence[ContextRow]) -> str:
     gaps = [row.gap for row in rows if row.gap is not None]
     least = "at least " if any(row.is_least for row in rows) else ""
     between = f" (context gap {least}{_range(gaps)})" if gaps else ""
-    asked = f"A reflex leaves half of the task or more undone on {needs} of {n} cultures{between}."
+    cultures = "culture" if n == 1 else "cultures"
+    asked = f"A reflex leaves half of the task or more undone on {needs} of {n} {cultures}{between}."
     scores = [row.score for row in rows if row.score is not None]
     scored = f" (context score {least}{_range(scores)})" if scores else ""
     return f"{asked} The policies do significantly more than the best reflex on {has} of {n}{scored}."
 
 
 def _range(values: Sequence[float]) -> str:
-    low, high = (f"{value:.2f}".replace("-", "−") for value in (min(values), max(values)))
+    low, high = (_hundredths(value) for value in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
+
+
+def _hundredths(value: float) -> str:
+    # Adding 0 takes the minus from a zero.
+    return f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
 
 
 def _estimate(row: ContextRow, name: str) -> Estimate:
@@ -104,7 +122,8 @@ def _context_picture(study: ContextStudy, folder: Path) -> Picture:
         "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
         f"random); from the dashed line on a task is taken to need context. Right: how far the {study.policies} "
         "policies come from that reflex to the optimum. A point is a culture, with its 95 % interval on the culture's "
-        "simulator. Triangles: at least so much, as the optimal return is not known.",
+        "simulator; one that reaches the frame goes on beyond it. Triangles: at least so much, as the optimal return "
+        "is not known.",
         (*(f"{_GAPS}.{ending}" for ending in FORMATS[1:]), TABLE),
     )
 
@@ -127,7 +146,7 @@ def _lost_table(lost: dict[str, dict[str, list[float]]]) -> Table:
     return Table("Lost", ("", *lost), tuple(rows), note=note, beside=WHOSE_WORK)
 
 
-def _table(rows: Sequence[ContextRow]) -> Table:
+def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
     columns: Columns = [
         ("robot", "robot"),
         ("culture", "culture"),
@@ -139,23 +158,34 @@ def _table(rows: Sequence[ContextRow]) -> Table:
         ("gap", _gap),
         ("score, 95 %", _score),
         ("bits", "bits"),
-        ("measured: random", "measured_random"),
-        ("measured: heuristic", "measured_heuristic"),
-        ("measured: best coupling", "measured_coupling"),
-        ("measured: policies", "measured_policies"),
-        ("predicted: policies", "predicted_policies"),
     ]
     note = (
-        "Mean returns on the simulator of the last recording; measured: in closed loop on the culture, from where its "
-        "recordings ended, beside the returns predicted for the same policies. Bits: goal information, of robots with "
-        "several goals. ≥: no optimal return is known. The gap is then with the best of policies and heuristic in its "
-        "place, and the score with the highest return of any episode: both are at least that."
+        "Mean returns on the simulator of the last recording. Bits: goal information, of robots with several goals. ≥: "
+        "no optimal return is known. The gap is then with the best of policies and heuristic in its place, and the "
+        "score with the highest return of any episode: both are at least that."
     )
-    return table_of("Tasks and cultures", rows, columns, note=note, beside=TABLE)
+    return table_of("On the simulator", rows, columns, note=note, beside=TABLE)
+
+
+def _on_the_culture(rows: Sequence[ContextRow]) -> Table:
+    columns: Columns = [
+        ("robot", "robot"),
+        ("culture", "culture"),
+        ("random", "measured_random"),
+        ("heuristic", "measured_heuristic"),
+        ("best coupling", "measured_coupling"),
+        ("policies", "measured_policies"),
+        ("policies, predicted", "predicted_policies"),
+    ]
+    note = (
+        "Mean returns measured in closed loop on the culture, from where its recordings ended, beside the returns "
+        "predicted for the same policies."
+    )
+    return table_of("On the culture, in closed loop", rows, columns, note=note, beside=TABLE)
 
 
 def _gap(row: ContextRow) -> str | None:
-    return None if row.gap is None else _least(row) + f"{row.gap:.2f}".replace("-", "−")
+    return None if row.gap is None else _least(row) + _hundredths(row.gap)
 
 
 def _score(row: ContextRow) -> str | None:

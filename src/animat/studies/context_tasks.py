@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, final
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import train_alone
-from animat.progress import Progress
+from animat.progress import InTurn, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.responses import Responses
 from animat.studies.draws import draw_seed
@@ -195,7 +195,7 @@ class Judge(RobotTask):
             seed=self.drawn("judge"),
             optimum_resolution=self.study.optimum_resolution,
             interventions=True,
-            progress=progress,
+            progress=InTurn(progress, 2),
         )
         return [write_json(self.beside(folder, SIMULATED), evaluation.to_dict())]
 
@@ -230,7 +230,8 @@ class Measure(RobotTask):
                 seed=self.drawn("measure"),
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
-                progress=progress,
+                # Best coupling, prediction, closed loop, optimal return.
+                progress=InTurn(progress, 4),
             )
         if gap.session.ending.by != "plan":
             raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to go on")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from animat.report.html import Picture, Section, table_of, write_page
+from animat.report.html import Picture, Section, cell, table_of, write_page
 from animat.report.over_cultures import Compared, draw_over_cultures
 from animat.report.style import FORMATS, save_figure
 from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
@@ -35,7 +35,7 @@ def _drawn(found: RanCultures, i: int, row: OverCultures) -> Compared:
 
 
 def _in_short(study: Study, found: RanCultures) -> Section:
-    points = tuple((f"{row.robot}, {row.comparison}", _told(row)) for row in found.summary)
+    points = tuple((f"{row.robot}, {row.comparison}", _told(study, row)) for row in found.summary)
     table = table_of(
         "Over cultures",
         found.summary,
@@ -50,7 +50,8 @@ def _in_short(study: Study, found: RanCultures) -> Section:
             ("found better in", "found_better"),
         ],
         note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
-        "narrow of fewer than ten.",
+        "narrow of fewer than ten. Larger in: cultures in which the second arm's mean return is the larger one. Found "
+        f"better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
         beside=SUMMARY,
     )
     picture = Picture(
@@ -61,22 +62,22 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         f"{len(found.comparisons)} cultures.",
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
-    said = (
-        f"The second arm is found to be better in a culture at p < {LEVEL:g}, as in its own report. Where that cannot "
-        "be reached with so few policies, it only counts in how many cultures its mean return is the larger one."
-    )
-    return Section("Results in short", (said,), points, (table,), (picture,))
+    return Section("Results in short", (), points, (table,), (picture,))
 
 
 def _interval(row: OverCultures) -> str:
-    return "–" if row.low_95 is None else f"{row.low_95:.1f} to {row.high_95:.1f}".replace("-", "−")
+    return "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"
 
 
-def _told(row: OverCultures) -> str:
-    larger = f"the second arm's mean return is larger in {row.larger_in} of {row.cultures} cultures"
+def _told(study: Study, row: OverCultures) -> str:
+    compared = next(each for each in study.comparisons if each.name == row.comparison)
+    larger = (
+        f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of {row.cultures} "
+        "cultures"
+    )
     if not row.tested:
         return f"{larger}; with so few policies no test finds a difference in one culture."
-    return f"{larger}; it is found to be better in {row.found_better}."
+    return f"{larger}; it is found to be better (p < {LEVEL:g}) in {row.found_better}."
 
 
 def _each(found: RanCultures) -> Section:

@@ -115,7 +115,7 @@ def _short(
         best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.mean, default=None)
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
-            sentences.append(f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}.{at_random}")
+            sentences.append(f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}{at_random}")
     rows = results.comparisons
     printed = [row for row in rows if row.paper_p is not None]
     if printed:
@@ -126,8 +126,8 @@ def _short(
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
-            f"With {study.policies} policies a side no p can fall below {smallest:.2g}: these are the figures of a "
-            "first look, and no results."
+            f"With {study.policies} policies a side no p can fall below {smallest:.2g}: this is a first look, not a "
+            "result."
         )
     picture = Picture(
         drawn[0],
@@ -140,17 +140,29 @@ def _short(
 
 
 def _beside(row: ArmReturns) -> str:
-    words = f"through “{row.arm}” policies have an interquartile mean return of {cell(row.mean)}"
+    """What came out in a sentence, then its numbers in another."""
     beside = [("random actions", row.random), ("the optimal controller", row.optimum)]
-    known = [f"{name} {cell(value)}" for name, value in beside if value is not None]
-    return words + (f"; {', '.join(known)}" if known else "")
+    known = [f"that of {name} {cell(value)}" for name, value in beside if value is not None]
+    numbers = ", ".join((f"interquartile mean return is {cell(row.mean)}", *known)) + "."
+    if row.random is None or row.low is None or row.high is None:
+        return f"of the policies trained as “{row.arm}” the {numbers}"
+    if row.low > row.random:
+        found = "do better than random actions"
+        if row.optimum is not None and row.optimum > row.random:
+            way = (row.mean - row.random) / (row.optimum - row.random)
+            found += f": {100 * way:.0f} % of the way to the optimal controller"
+    else:
+        found = (
+            "do worse than random actions" if row.high < row.random else "are not found to differ from random actions"
+        )
+    return f"policies trained as “{row.arm}” {found}. Their {numbers}"
 
 
 def _at_random(robot: str, arm: Arm, controls: Sequence[ControlReturns]) -> str:
     """What is left where the stimuli are drawn at random."""
     kind = robot, arm.mapping, arm.percentiles, "shuffled"
     of = [row for row in controls if (row.robot, row.mapping, row.percentiles, row.control) == kind]
-    return f" With stimuli delivered at random the return is {cell(of[-1].mean_return)}." if of else ""
+    return f" With stimuli delivered at random it is {cell(of[-1].mean_return)}." if of else ""
 
 
 def _compared(study: Study, results: Results) -> Section:
@@ -173,8 +185,10 @@ def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
     """How many of the paper's comparisons came out as there; what cannot be told is neither yes nor no."""
     told = Counter(row.as_in_paper for row in rows)
     if told["cannot tell"] == len(rows):
-        return f"Whether the {len(rows)} comparisons come out as in the paper is not known, with so few policies."
-    words = f"{told['yes']} of {len(rows)} comparisons came out as in the paper: the same one better, at p < {LEVEL:g}."
+        which = "comparison comes" if len(rows) == 1 else f"{len(rows)} comparisons come"
+        return f"Whether the {which} out as in the paper is not known, with so few policies."
+    comparisons = "1 comparison" if len(rows) == 1 else f"{len(rows)} comparisons"
+    words = f"{told['yes']} of {comparisons} came out as in the paper: the same one better, at p < {LEVEL:g}."
     if told["cannot tell"]:
         words += f" For {told['cannot tell']} there are too few policies."
     if told["no"]:
@@ -273,10 +287,16 @@ def _controls(study: Study, results: Results) -> Section:
     beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
     return Section(
         "Is it the culture?",
-        ("Each control takes something away.", *not_outperforming(results), *reflexes_told(results.reflexes)),
+        ("Each control takes something away.", *_sentences(results)),
         points,
         (*(table for table in beside if table.rows), controls_shown(study, results.controls)),
     )
+
+
+def _sentences(results: Results) -> list[str]:
+    """How policies stand beside the heuristic policy and the best reflex."""
+    told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
+    return [each[:1].upper() + each[1:] for each in told]
 
 
 def _done(study: Study, results: Results) -> Section:

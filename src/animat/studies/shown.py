@@ -127,7 +127,7 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
         note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses "
         "determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
         "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its "
-        "standard error: a return that can be had. The optimal return lies between the two; scores keep to "
+        "standard error: a return that is achievable. The optimal return lies between the two; scores keep to "
         "the value, the upper end. Highlighted: they part by more than 3 standard errors and the grid's "
         "error. Without clock: the same controller if it does not know the time left, as policies do not. On "
         "a rough grid at every recording: optima/." + left_out,

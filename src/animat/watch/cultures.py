@@ -10,7 +10,7 @@ from typing import Any
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
-from animat.watch.blocks import facts, table, time_left
+from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, newest_s
 from animat.watch.held import is_held, state_of
 from animat.watch.plain import listed, mapped, text
@@ -19,7 +19,7 @@ from animat.watch.view import View, in_blocks, titled
 
 _MANIFEST, _DONE, _COMPARISONS = "cultures.json", "jobs/report.json", "tables/comparisons.csv"
 _MOST_CULTURES, _MOST_BYTES = 10_000, 2**20
-_WORDS = "Means over the cultures that are done. Larger: in how many of them the second mean is the larger one."
+_WORDS = "Mean returns over the cultures that are done, and in how many of them that of the second arm is larger."
 _Means = list[tuple[str, str, float, float]]
 """Of one culture each comparison and robot, and the means of both arms."""
 
@@ -55,12 +55,13 @@ class CulturesView(View):
             ("failed", len(failed)),
             ("time left", time_left(self._speed.left_s(len(names) - worked), state)),
         ]
+        is_done = state["state"] == "ended"
         under_way = [[name, f"{100 * share:.0f} %"] for name, share in running.items()]
         blocks = [
             facts("Cultures", rows, "The list at the top has each culture's own page."),
-            table("Running", ["culture", "done"], under_way, "" if under_way else "nothing runs now"),
+            *([] if is_done else [_running(under_way)]),
             *([table("Failed", ["culture", "of what"], [[*each] for each in failed.items()])] if failed else ()),
-            self._comparisons(done),
+            self._comparisons(done, "two-thirds" if is_done else "whole"),
         ]
         return in_blocks(state, blocks)
 
@@ -70,7 +71,7 @@ class CulturesView(View):
             self._studies[name] = StudyView(self.folder / name)
         return self._studies[name].share() or 0.0
 
-    def _comparisons(self, done: list[str]) -> dict[str, Any]:
+    def _comparisons(self, done: list[str], width: Width) -> dict[str, Any]:
         over: dict[tuple[str, str], list[tuple[float, float]]] = {}
         left_out = 0
         for name in done:
@@ -87,11 +88,11 @@ class CulturesView(View):
             first, second = (sum(each) / len(pairs) for each in zip(*pairs, strict=True))
             larger = sum(after > before for before, after in pairs)
             rows.append([comparison, robot, first, second, f"{larger:,} of {len(pairs):,}"])
-        head = ["comparison", "robot", "mean of the first", "mean of the second", "larger"]
+        head = ["comparison", "robot", "mean, first arm", "mean, second arm", "second larger in"]
         words = _WORDS if rows else "none yet"
         if left_out:
             words += f" Left out, as their {_COMPARISONS} cannot be read: {left_out:,} of the cultures that are done."
-        return table("Comparisons", head, rows, words, width="whole")
+        return table("Comparisons", head, rows, words, width=width)
 
     def _failed(self) -> dict[str, str]:
         """Those that the last run could not finish, and what they failed of."""
@@ -108,6 +109,11 @@ class CulturesView(View):
         if not found:
             raise InvalidFile(f"{self.folder / _MANIFEST}: expected the names of cultures, got none")
         return found[:_MOST_CULTURES]
+
+
+def _running(under_way: list[list[str]]) -> dict[str, Any]:
+    words = "" if under_way else "nothing runs now"
+    return table("Running", ["culture", "done"], under_way, words, width="two-thirds")
 
 
 def _is_name(name: Any) -> bool:

@@ -27,7 +27,7 @@ def is_held(folder: Path) -> bool | None:
 def state_of(folder: Path, changed_s: float, *, is_done: bool) -> dict[str, Any]:
     """How work in a folder stands, in words, by when something of it changed last and whether nothing is left to do."""
     if is_done:
-        return {"state": "ended", "message": "all of it is done"}
+        return {"state": "ended", "message": "everything is done"}
     held = is_held(folder)
     silent_s = max(0.0, time.time() - changed_s)
     if held or (held is None and silent_s < _SILENT_S):

@@ -13,9 +13,19 @@ from animat.watch.blocks import chart, curve
 from animat.watch.plain import listed, mapped, number
 
 _LEARNER = (
-    ("entropy", "Entropy", "nats", "Of the actions: high while they are all but random, low once the policy is sure."),
-    ("alpha", "Alpha", "", "The weight of entropy beside reward, learned so that entropy comes to its target."),
-    ("critic_loss", "Critic loss", "", "How far critics are off what was met; in scaled rewards squared."),
+    (
+        "entropy",
+        "Entropy",
+        "nats",
+        "Of the policy's choice of actions: high while it is almost random, low once it is sure.",
+    ),
+    ("alpha", "Alpha", "", "The weight of entropy beside reward, adjusted so that entropy comes to its target."),
+    (
+        "critic_loss",
+        "Critic loss",
+        "",
+        "How far the critics are from the returns they learn to predict, in squared scaled rewards.",
+    ),
 )
 
 
@@ -46,10 +56,10 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
     if rows and minute is not None:
         told += f" They are on the simulator of minute {minute:g}, by evaluation.json."
     elif words and not rows:
-        told += " It is on the first simulator."
+        told = told[:-1] + ", on the first simulator."
     if missing := [name for name, value in known.items() if value is None]:
-        told += f" Not known: {', '.join(missing)}. animat evaluate --optimum --out evaluation.json, with the file in "
-        told += "this folder, shows them."
+        told += f" Not known: {', '.join(missing)}. To show them, run animat evaluate with --optimum and "
+        told += "--out evaluation.json, in this folder."
     if others:
         told += f" The evaluation.json in this folder is of another {' and '.join(others)}."
     return [(name, value) for name, value in known.items() if value is not None], told.strip()
@@ -74,15 +84,19 @@ def learning_charts(
     told = "No learning curve is in the folder yet: the first checkpoint is written some seconds after the start."
     if series:
         told = f"Mean return of the episodes that ended last: {'none ended yet' if last is None else f'{last:.1f}'}. "
-        told += "Grey: each policy; blue: their mean, of those that are as far; a point a sixtieth of the training."
-    told += " Dashed: the simulators were refreshed with the recording of that minute." if swaps else ""
+        told += (
+            "Grey: each policy; blue: the mean of those that have come so far. A point is a sixtieth of the training."
+        )
+    told += " Dashed upright: the simulators are refreshed with the recording of that minute." if swaps else ""
     told = f"{told} {missing}".strip()
     series += [curve(name, [0.0, iterations], [level] * 2, "dashed", _COLOURS[name]) for name, level in levels]
     charts = [chart("Learning curves", "iterations", "return", series, told, marks=swaps, until=iterations)]
     for column, title, unit, meaning in _LEARNER:
         series, last = _series(curves, column)
         words = f"{'Not known' if last is None else f'{last:.3g}'} on average, at the last checkpoint. {meaning}"
-        if series and last is None:
+        if not series:
+            words = f"Known from the first checkpoint on. {meaning}"
+        elif last is None:
             words = "Not in these files: they were written before it was kept."
         charts.append(chart(title, "iterations", unit, series, words, until=iterations, width="third"))
     return charts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ class RecordingView(View):
 
     def _facts(self, whole: int, newest: Path) -> list[tuple[str, Any]]:
         shown = "the one under way, as far as it is" if newest.name == UNDER_WAY else newest.name
-        rows: list[tuple[str, Any]] = [("whole ones", whole), ("shown", shown)]
+        rows: list[tuple[str, Any]] = [("complete", whole), ("shown", shown)]
         inspection = self._inspection
         if inspection is not None:
             rows += [
@@ -118,9 +119,9 @@ class RecordingView(View):
 def _message(whole: int, newest: Path, recording: Recording | None, *, running: bool, is_broken: bool) -> str:
     """How it stands, in words."""
     if is_broken:
-        return "the recording under way was broken off: what is there of it is shown, and is none of the recordings"
+        return "the recording under way was broken off: what there is of it is shown, and does not count as a recording"
     if not running:
-        return f"{whole} are there"
+        return "1 recording" if whole == 1 else f"{whole} recordings"
     if newest.name != UNDER_WAY:
         return "of the next recording nothing is known yet: stimulation is set up, or its first block is under way"
     return "" if recording is None else f"{recording.duration_s:.0f} s of the one under way are shown"
@@ -177,12 +178,18 @@ def _shares(shares: dict[Path, tuple[float, dict[str, float]]], files: int) -> d
     return table("P(x >= P50) of each condition", head, rows, words)
 
 
+def _median(rate_hz: float) -> str | None:
+    return f"{rate_hz:.2f}" if math.isfinite(rate_hz) else None
+
+
 def _inspected(inspection: Inspection | None) -> list[dict[str, Any]]:
     if inspection is None:
         return [table("Findings", ["severity", "what"], [], "the newest recording could not be inspected")]
-    conditions = [[c.label, c.n_responses, c.n_non_burst, c.median_rate_hz] for c in inspection.conditions]
+    conditions = [[c.label, c.n_responses, c.n_non_burst, _median(c.median_rate_hz)] for c in inspection.conditions]
     findings = [[each.severity, each.message] for each in inspection.findings]
     return [
-        table("Responses", ["condition", "responses", "without bursts", "median (Hz)"], conditions[:200]),
-        table("Findings", ["severity", "what"], findings, "" if findings else "none"),
+        table(
+            "Responses", ["condition", "responses", "without bursts", "median (Hz)"], conditions[:200], width="third"
+        ),
+        table("Findings", ["severity", "what"], findings, "" if findings else "none", width="two-thirds"),
     ]

@@ -194,7 +194,7 @@ class SessionView(View):
         last = {} if not len(self.tail) else (self.tail.peek(len(self.tail) - 1) or {})
         damage = self.tail.damage
         if last.get("kind") == "end":
-            told = {"state": "ended", "message": f"{text(last.get('by'))}: {text(last.get('message'))}"}
+            told = {"state": "ended", "message": text(last.get("message"))}
         elif silent_s < _SILENT_S + (number(mapped(self._words.get("loop")).get("pause_s")) or 0.0):
             # A record that is just being written looks as one that is cut off.
             told, damage = {"state": "running", "message": "stopping" if stop else ""}, ""

@@ -58,11 +58,11 @@ class StudyView(View):
             ("time left", time_left(self._speed.left_s(total - worked), state)),
         ]
         blocks = [
-            facts("Jobs", rows, _FAILED),
-            running_table(told if is_running else {}),
-            results_table(self.folder),
-            table("Done", ["job", "files"], [[n, files] for n, files in list(done.items())[-_MOST_SHOWN:]]),
-            table("Waiting", ["job"], [[each] for each in waiting[:_MOST_SHOWN]]),
+            facts("Jobs", rows, "" if is_done else _FAILED),
+            *([] if is_done else [running_table(told if is_running else {})]),
+            results_table(self.folder, "two-thirds" if is_done else "whole"),
+            _done(done, "whole" if is_done else "half"),
+            *([] if is_done else [table("Waiting", ["job"], [[each] for each in waiting[:_MOST_SHOWN]])]),
         ]
         return in_blocks(state, blocks)
 
@@ -148,13 +148,18 @@ def running_jobs(folder: Path, done: dict[str, int]) -> dict[str, tuple[float, s
     return {name: each for name, each in told.items() if name not in done and each[0] < 1}
 
 
+def _done(done: dict[str, int], width: Width) -> dict[str, Any]:
+    rows = [[name, files] for name, files in list(done.items())[-_MOST_SHOWN:]]
+    return table("Done", ["job", "files"], rows, width=width)
+
+
 def running_table(told: dict[str, tuple[float, str, float]], width: Width = "two-thirds") -> dict[str, Any]:
     """What runs."""
     rows = [[name, f"{100 * share:.0f} %", note] for name, (share, note, _) in told.items()]
     return table("Running", ["job", "done", "what it says"], rows, "" if rows else "nothing runs now", width=width)
 
 
-def results_table(folder: Path) -> dict[str, Any]:
+def results_table(folder: Path, width: Width = "whole") -> dict[str, Any]:
     """The mean return of each arm on each robot, as soon as its policies were evaluated."""
     rows = []
     for path in sorted(folder.glob("episodes/*/*/episodes.npz"))[:_MOST_SHOWN]:
@@ -166,4 +171,4 @@ def results_table(folder: Path) -> dict[str, Any]:
             told = [number(mapped(row).get(name)) for name in ("mean_return", "actors", "episodes")]
             rows.append([path.parts[-2], f"policies, {path.parts[-3]}", *told])
     words = "Over all policies, on the last recording; the report has their comparisons." if rows else "none yet"
-    return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, words, width="whole")
+    return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, words, width=width)

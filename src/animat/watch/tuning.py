@@ -8,7 +8,7 @@ from typing import Any
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import chart, curve, duration, facts, table, time_left
-from animat.watch.files import newest_s, told_by_jobs
+from animat.watch.files import json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
 from animat.watch.plain import listed, mapped, number, short, text, whole
 from animat.watch.study import running_table
@@ -45,10 +45,11 @@ class TuningView(View):
             ("diverged", states.count("diverged")),
             ("running", len(told) if is_running else 0),
             ("time left", self._left(planned - len(trials)) if is_running else time_left(None, state)),
-            ("best so far", "none yet" if best is None else f"trial {best['trial']}, {best['last']:.1f}"),
+            _won(mapped(json_of(self.folder / "results.json")))
+            or ("best so far", "none yet" if best is None else f"trial {best['trial']}, {best['last']:.1f}"),
         ]
-        running = running_table(told if is_running else {}, "whole")
-        return in_blocks(state, [facts("Trials", rows), _chart(trials), running, _table(trials)])
+        running = [] if is_done else [running_table(told if is_running else {}, "whole")]
+        return in_blocks(state, [facts("Trials", rows), _chart(trials), *running, _table(trials)])
 
     def _left(self, trials: int) -> str:
         if trials <= 0:
@@ -71,6 +72,16 @@ class TuningView(View):
         except InvalidFile:
             return []
         return [found for line in lines if (found := _trial(line)) is not None]
+
+
+def _won(results: dict[str, Any]) -> tuple[str, str] | None:
+    """The trial that came out best when the best ones were trained once more, once that is known."""
+    trial = whole(mapped(results.get("best")).get("trial"))
+    finals = {
+        whole(each.get("trial")): number(each.get("mean_return")) for each in map(mapped, listed(results.get("finals")))
+    }
+    mean = finals.get(trial)
+    return None if trial is None or mean is None else ("best, retrained", f"trial {trial}, {mean:.1f}")
 
 
 def _trial(line: str) -> dict[str, Any] | None:
@@ -102,7 +113,7 @@ def _chart(trials: list[dict[str, Any]]) -> dict[str, Any]:
     words = (
         "One dot for each trial: its mean return after its last rung. Trials that were stopped were trained for less."
     )
-    return chart("Trials", "trial", "mean return", series, words if series else "No trial has ended yet.")
+    return chart("Return of each trial", "trial", "mean return", series, words if series else "No trial has ended yet.")
 
 
 def _table(trials: list[dict[str, Any]]) -> dict[str, Any]:

@@ -34,6 +34,7 @@ class Frames:
         rates = np.array([moment.rate_hz for moment in scene.moments if math.isfinite(moment.rate_hz)])
         # Bursts would press all others to the ground: they are at the upper edge.
         self._most_hz = _round_up(max(1.0, float(np.percentile(rates, 95)))) if len(rates) else 1.0
+        self._has_room_for_all = sum(_font(14).getlength(label) + 14 for label in scene.conditions) < _LEFT - 28
         totals = np.array([moment.total for moment in scene.moments])
         self._totals = min(0.0, float(totals.min())), max(1.0, float(totals.max()))
 
@@ -65,6 +66,8 @@ class Frames:
             if math.isfinite(each.rate_hz):
                 response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
         command = _Strip(draw, strips[1], time_s, (-1.0, 1.0), "command", "", zero=True)
+        for i in range(scene.robot.n_commands if scene.robot.n_commands > 1 else 0):
+            command.name(i)
         total = _Strip(draw, strips[2], time_s, self._totals, "return so far", "")
         for episode in dict.fromkeys(each.episode for each in past):
             of_it = [each for each in past if each.episode == episode]
@@ -90,14 +93,16 @@ class Frames:
     def _draw_words(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
         step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration + 1:,}"
         draw.text((14, HEIGHT_PX - 48), f"{moment.agent}, episode {moment.episode}, {step}", _INK, _font(15))
+        if not self._has_room_for_all:
+            if moment.delivered:
+                draw.text((14, HEIGHT_PX - 8), f"stimulus: {moment.delivered}", _INK, _font(13), anchor="ls")
+            return
         x = 14
-        for label, colour in self._colours.items() if len(self._colours) <= 6 else ():
+        for label, colour in self._colours.items():
             is_now = label == moment.delivered
             font = _font(14 if is_now else 12)
             draw.text((x, HEIGHT_PX - 8), label, colour if is_now else _FAINT, font, anchor="ls")
             x += int(font.getlength(label)) + 14
-        if len(self._colours) > 6 and moment.delivered:
-            draw.text((14, HEIGHT_PX - 8), f"stimulus: {moment.delivered}", _INK, _font(13), anchor="ls")
 
     def _draw_raster(self, strip: _Strip, time_s: float) -> None:
         scene = self._scene
@@ -134,6 +139,11 @@ class _Strip:
     def dot(self, time_s: float, value: float, colour: str) -> None:
         if time_s >= self._now_s - SHOWN_S:
             self._draw.circle((self._x(time_s), self._y(value)), 3, colour)
+
+    def name(self, i: int) -> None:
+        """The number of a command, in its colour."""
+        at = (_LEFT + 64 + 14 * i, self._top - 3)
+        self._draw.text(at, f"{i + 1}", COMMANDS[i % len(COMMANDS)], _font(12), anchor="ls")
 
     def steps(self, known: Sequence[tuple[float, float]], until_s: float, colour: str) -> None:
         """What stays as it is until the next one is known."""

@@ -2,9 +2,9 @@
 
 import { Frame, colour, list, make, series, shown, spanOf, table, unpacked } from "./draw.js";
 
-// Of the house's kind, in texts as in numbers.
-const minus = (text) => text.replace(/(^|[\s(,])-(?=\d)/g, "$1\u2212");
-const cell = (value) => (typeof value === "number" ? shown(value, 5) : minus(value ?? "none"));
+// Signs of the house's kind, in texts as in numbers.
+const signs = (text) => text.replace(/(^|[\s(,])-(?=\d)/g, "$1\u2212").replaceAll(">=", "\u2265").replaceAll("+- ", "\u00b1\u00a0");
+const cell = (value) => (typeof value === "number" ? shown(value, 4) : signs(value ?? "none"));
 
 export class BlocksPage {
   constructor(main) {
@@ -13,7 +13,7 @@ export class BlocksPage {
   }
 
   draw(view) {
-    const key = view.blocks.map((each) => `${each.kind} ${each.title}`).join("\n");
+    const key = view.blocks.map((each) => `${each.kind} ${each.width} ${each.title}`).join("\n");
     if (this.key !== key) {
       this.key = key;
       this.main.replaceChildren();
@@ -28,25 +28,29 @@ export class BlocksPage {
     if (body instanceof HTMLCanvasElement) body.setAttribute("aria-label", block.title);
     const legend = make("div", { className: "legend" });
     const held = block.kind === "table" ? make("div", { className: "table" }, body) : body;
-    this.main.append(make("section", { className: block.width ?? (block.kind === "facts" ? "third" : "two-thirds") }, make("h2", { textContent: block.title }), held, legend, words));
+    this.main.append(make("section", { className: block.width ?? (block.kind === "facts" ? "third" : "two-thirds") }, make("h2", { textContent: signs(block.title) }), held, legend, words));
     return { body, words, legend };
   }
 
   table({ body, words }, block) {
-    table(body, block.head, block.rows.map((row) => row.map(cell)));
-    words.textContent = minus(block.rows.length ? block.words : block.words || "none");
+    // A head over nothing says nothing.
+    table(body, block.rows.length ? block.head : [], block.rows.map((row) => row.map(cell)));
+    words.textContent = signs(block.rows.length ? block.words : block.words || "none");
   }
 
   facts({ body, words }, block) {
     list(body, block.rows.map(([name, value]) => [name, cell(value)]));
-    words.textContent = minus(block.words);
+    words.textContent = signs(block.words);
   }
 
   chart({ body, words, legend }, block) {
-    words.textContent = minus(block.words);
+    words.textContent = signs(block.words);
+    body.hidden = !block.series.length;
+    if (body.hidden) { legend.replaceChildren(); return; }
     const xs = block.series.flatMap((each) => each.x), ys = block.series.flatMap((each) => each.y);
-    const frame = new Frame(body, spanOf([...xs, ...block.marks.map(([at]) => at), block.until]), spanOf(ys), { top: block.marks.length ? 22 : 6, xLabel: block.x });
-    frame.text(block.y, frame.left + 4, frame.top + 9, colour("faint"));
+    const frame = new Frame(body, spanOf([...xs, ...block.marks.map(([at]) => at), ...(block.until === null ? [] : [0, block.until])]), spanOf(ys), { top: block.marks.length || block.y ? 22 : 6, xLabel: block.x });
+    frame.text(block.y, 0, 10, colour("faint"));
+    let free = frame.g.measureText(block.y).width + 6;
     const named = block.series.filter((each) => each.name);
     const paint = (each) => (each.colour ? colour(each.colour) : series(named.indexOf(each)));
     for (const each of block.series) {
@@ -57,18 +61,22 @@ export class BlocksPage {
     }
     for (const [at, what] of block.marks) {
       frame.line([at, at], frame.y, colour("red"), { dashes: [4, 3], width: 1 });
-      frame.text(what, Math.min(frame.atX(at) - 2, frame.right - 60), 10, colour("faint"));
+      // A name that would run into the one before is left out.
+      const wide = frame.g.measureText(what).width, from = Math.min(frame.atX(at) - 2, frame.width - wide);
+      if (from < free) continue;
+      frame.text(what, from, 10, colour("faint"));
+      free = from + wide + 6;
     }
     legend.replaceChildren(...named.map((each) => {
-      const mark = make("i");
-      mark.style.background = paint(each);
+      const mark = make("i", { className: each.style === "dashed" ? "dashed" : "" });
+      mark.style.color = paint(each);
       return make("span", {}, mark, each.name);
     }));
   }
 
   raster({ body, words, legend }, block) {
     legend.replaceChildren();
-    words.textContent = minus(block.words);
+    words.textContent = signs(block.words);
     const frame = new Frame(body, [block.from_s, block.to_s], [-0.5, Math.max(0.5, block.n_channels - 0.5)], { top: 18, left: 52, xLabel: "recording's clock (s)" });
     frame.spikes(unpacked(block.spikes.times), unpacked(block.spikes.channels), block.n_channels);
     frame.g.fillStyle = colour("red");

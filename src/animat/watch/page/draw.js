@@ -1,7 +1,5 @@
 // Canvases in the house's colours: a frame with numbers at its axes, and what is drawn in it.
 
-const CIVIDIS = ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
-
 let style = null;
 
 export function colour(name) {
@@ -11,12 +9,12 @@ export function colour(name) {
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { style = null; });
 
-// One after the other for what has an order, as frequencies have: along cividis, which all eyes can tell apart.
+// One after the other for what has an order, as frequencies have: from blue to yellow, which all eyes can tell apart.
 export function ordered(i, n) {
-  const first = Number(colour("first")), last = Number(colour("last"));
-  const at = (n < 2 ? last : first + ((last - first) * i) / (n - 1)) * (CIVIDIS.length - 1);
-  const low = Math.min(Math.floor(at), CIVIDIS.length - 2), share = at - low;
-  const [a, b] = [CIVIDIS[low], CIVIDIS[low + 1]].map((hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16)));
+  const ramp = colour("ramp").split(" ");
+  const at = (n < 2 ? 1 : i / (n - 1)) * (ramp.length - 1);
+  const low = Math.min(Math.floor(at), ramp.length - 2), share = at - low;
+  const [a, b] = [ramp[low], ramp[low + 1]].map((hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16)));
   return `rgb(${a.map((x, k) => Math.round(x + share * (b[k] - x))).join(",")})`;
 }
 
@@ -86,7 +84,7 @@ export class Frame {
     if (options.xMarks !== null) {
       g.textAlign = "center";
       g.textBaseline = "top";
-      const most = Math.max(2, Math.floor((this.right - this.left) / 80));
+      const most = Math.max(2, Math.floor((this.right - this.left) / 70));
       for (const each of options.xMarks ?? marks(this.x[0], this.x[1], most)) {
         const at = this.atX(each);
         if (at < this.left - 1 || at > this.right + 1) continue;
@@ -211,7 +209,8 @@ export function spanOf(values, least = 1e-9) {
   if (!known.length) return [0, 1];
   let low = Infinity, high = -Infinity;
   for (const each of known) { low = Math.min(low, each); high = Math.max(high, each); }
-  const more = Math.max((high - low) * 0.06, least, Math.abs(high) * 1e-6);
+  // Around a single value there is room too: ten equal numbers at an axis say nothing.
+  const more = Math.max((high - low) * 0.06, least, Math.abs(high) * (high > low ? 1e-6 : 0.1));
   return [low - more, high + more];
 }
 
@@ -231,9 +230,9 @@ export function list(target, pairs) {
   target.replaceChildren(...pairs.flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: value })]));
 }
 
-// Numbers to the right, texts to the left; a column is as most of it is.
+// Numbers to the right, texts to the left; in a column of numbers "none yet" stands where they will.
 export function table(target, head, rows) {
-  const isText = head.map((_, i) => rows.some((row) => /[a-z]{3}/i.test(row[i])));
+  const isText = head.map((_, i) => rows.some((row) => /[a-z]{3}/i.test(row[i]) && !/^(none|not)\b/.test(row[i])));
   const line = (cells, kind) => make("tr", {}, ...cells.map((each, i) => make(kind, { textContent: each.replaceAll(" %", "\u00a0%"), className: isText[i] ? "text" : "" })));
   target.replaceChildren(make("thead", {}, line(head, "th")), make("tbody", {}, ...rows.map((row) => line(row, "td"))));
 }

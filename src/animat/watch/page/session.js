@@ -3,7 +3,7 @@
 import { Frame, colour, duration, list, make, ordered, series, shown, spanOf, table, unpacked } from "./draw.js";
 
 // Of every canvas over the last seconds, so that their times stand below each other.
-const LEFT = 52;
+const LEFT = 52, CLOCK = "session's clock (s)";
 const units = (column) => column.replaceAll("_per_", "/").replace(/_([^_]+)$/, (all, unit) => (/^(m|s|rad|deg|Hz|V|N)(\/.*)?$/.test(unit) ? ` (${unit})` : all)).replaceAll("_", " ");
 
 function card(main, kind, title, canvasKind, extra = []) {
@@ -126,7 +126,7 @@ export class SessionPage {
 
   #drawRaster(view) {
     const n = this.about.channels.x_um.length;
-    const frame = new Frame(this.raster.canvas, this.span, [-0.5, Math.max(n - 0.5, 0.5)], { top: 18, left: LEFT, xLabel: "session's clock (s)" });
+    const frame = new Frame(this.raster.canvas, this.span, [-0.5, Math.max(n - 0.5, 0.5)], { top: 18, left: LEFT, xLabel: CLOCK });
     frame.spikes(unpacked(view.spikes.times), unpacked(view.spikes.channels), n);
     const { ticks } = view;
     ticks.pulse_time_s.forEach((pulses, i) => {
@@ -145,7 +145,7 @@ export class SessionPage {
       this.legendOf = colour("paper");
       this.legend.replaceChildren(...this.about.conditions.map((label, i) => {
         const mark = make("i");
-        mark.style.background = this.condition(i);
+        mark.style.color = this.condition(i);
         return make("span", {}, mark, label);
       }));
     }
@@ -173,7 +173,7 @@ export class SessionPage {
     const wider = (span, px) => { const middle = (span[0] + span[1]) / 2, half = (px * scale) / 2; return [middle - half, middle + half]; };
     across = wider(across, frame0.width);
     down = wider(down, frame0.height);
-    const frame = new Frame(canvas, across, [down[1], down[0]], { xLabel: "x (um)", left: 44 });
+    const frame = new Frame(canvas, across, [down[1], down[0]], { xLabel: "x and y (µm)", left: 44 });
     const steps = 12;
     rates.forEach((rate, i) => {
       if (!known[i]) return;
@@ -203,7 +203,7 @@ export class SessionPage {
     // Bursts would press all others to the ground: they are at the upper edge.
     const sorted = ticks.rate_hz.filter((each, i) => each !== null && !ticks.is_burst[i]).sort((a, b) => a - b);
     const high = sorted[Math.floor(0.97 * (sorted.length - 1))] ?? 1;
-    const frame = new Frame(this.response.canvas, this.span, [0, Math.max(high, now[9] ?? 0, 1e-6) * 1.25], { left: LEFT });
+    const frame = new Frame(this.response.canvas, this.span, [0, Math.max(high, now[9] ?? 0, 1e-6) * 1.25], { left: LEFT, xLabel: CLOCK });
     const changes = [[-Infinity, this.about.percentiles_hz], ...view.percentiles].filter(([from], i, all) => from <= this.span[1] && (all[i + 1]?.[0] ?? Infinity) > this.span[0]);
     for (const which of this.about.thresholds) {
       const xs = [...changes.map(([from]) => Math.max(from, this.span[0])), this.span[1]];
@@ -230,7 +230,7 @@ export class SessionPage {
   }
 
   #drawCommand(ticks, last) {
-    const frame = new Frame(this.command.canvas, this.span, [-1.1, 1.1], { left: LEFT, yMarks: [-1, -0.5, 0, 0.5, 1] });
+    const frame = new Frame(this.command.canvas, this.span, [-1.1, 1.1], { left: LEFT, xLabel: CLOCK, yMarks: [-1, -0.5, 0, 0.5, 1] });
     const n = Math.max(0, ...ticks.command.map((each) => each.length));
     for (const { at } of this.#runs(ticks)) {
       const moved = at.filter((i) => ticks.command[i].length);
@@ -245,7 +245,7 @@ export class SessionPage {
   #drawObservations(ticks, last) {
     this.observations.forEach(({ canvas, words }, k) => {
       const values = ticks.observation.map((each) => each[k] ?? null);
-      const frame = new Frame(canvas, this.span, spanOf(values, 1e-6), { top: 4, left: LEFT });
+      const frame = new Frame(canvas, this.span, spanOf(values, 1e-6), { top: 4, left: LEFT, xLabel: CLOCK });
       for (const { at } of this.#runs(ticks)) {
         const seen = at.filter((i) => values[i] !== null);
         frame.line(seen.map((i) => ticks.time_s[i]), seen.map((i) => values[i]), series(k));
@@ -256,7 +256,7 @@ export class SessionPage {
   }
 
   #drawTotal(ticks, last) {
-    const frame = new Frame(this.total.canvas, this.span, spanOf([0, ...ticks.total], 0.5), { left: LEFT });
+    const frame = new Frame(this.total.canvas, this.span, spanOf([0, ...ticks.total], 0.5), { left: LEFT, xLabel: CLOCK });
     for (const { at } of this.#runs(ticks)) {
       const known = at.filter((i) => ticks.total[i] !== null);
       frame.line(known.map((i) => ticks.time_s[i]), known.map((i) => ticks.total[i]), colour("blue"), { steps: true });
@@ -271,13 +271,13 @@ export class SessionPage {
   #drawLate(view, last) {
     const { ticks } = view;
     const late = ticks.late_s.map((each) => (each === null ? null : each * 1000)), decided = ticks.decided_s.map((each) => (each === null ? null : each * 1000));
-    const frame = new Frame(this.late.canvas, this.span, [0, spanOf([1, ...late, ...decided])[1]], { left: LEFT });
+    const frame = new Frame(this.late.canvas, this.span, [0, spanOf([1, ...late, ...decided])[1]], { left: LEFT, xLabel: CLOCK });
     ticks.time_s.forEach((time, i) => {
       if (time === null) return;
       if (decided[i] !== null) frame.dot(time, decided[i], colour("blue"), { radius: 1.8 });
       if (late[i]) frame.dot(time, late[i], colour("red"), { radius: 3, ring: true });
     });
-    this.late.words.textContent = last < 0 ? "no tick here" : `last pulse ${late[last] ? `${shown(late[last], 3)} ms late` : "in time"} (late: red rings), decided in ${shown(decided[last], 3)} ms (blue dots); in all ${shown(view.late)} ticks were late, the latest by ${shown(view.latest_s === null ? null : view.latest_s * 1000, 3)} ms`;
+    this.late.words.textContent = last < 0 ? "no tick here" : `last pulse ${late[last] ? `${shown(late[last], 3)} ms late` : "in time"} (late: red rings), decided in ${shown(decided[last], 3)} ms (blue dots); ${view.late ? `late ticks in all: ${shown(view.late)}, the latest by ${shown(view.latest_s === null ? null : view.latest_s * 1000, 3)} ms` : "no tick was late so far"}`;
   }
 
   #drawAgents(view) {
@@ -302,15 +302,14 @@ export class SessionPage {
         g.fillStyle = colour("ink");
         g.fillRect(frame.atX(mean) - 1, y - 9, 2, 18);
       }
-      for (const total of each.returns) frame.dot(total, i, colour("sky"), { radius: 2, ring: true });
-      if (each.mean !== null) {
-        if (each.half !== null) frame.line([each.mean - each.half, each.mean + each.half], [i, i], colour("orange"), { width: 3 });
-        frame.dot(each.mean, i, colour("orange"), { radius: 5 });
-      }
+      if (each.half !== null) frame.line([each.mean - each.half, each.mean + each.half], [i, i], colour("orange"), { width: 3 });
+      if (each.mean !== null) frame.dot(each.mean, i, colour("orange"), { radius: 5 });
+      for (const total of each.returns) frame.dot(total, i, colour("blue"), { radius: 3, ring: true });
     });
+    const goesOn = agents.some((each) => each.half !== null && (each.mean - each.half < frame.x[0] || each.mean + each.half > frame.x[1]));
     const predicted = agents.some((each) => each.predicted) ? "Grey: predicted, the bar its 95 % interval, the line its mean." : "The folder has no prediction of these returns.";
-    this.returns.words.textContent = `${predicted} Small rings: whole episodes. Orange: their mean and its 95 % interval, which narrows as episodes are added.`;
-    const within = (low, high) => ` (${shown(low, 3)} to ${shown(high, 3)})`;
+    this.returns.words.textContent = `${predicted} Blue rings: whole episodes. Orange: their mean and its 95 % interval, which narrows as episodes are added${goesOn ? "; one that reaches the frame goes on beyond it" : ""}.`;
+    const within = (low, high) => ` (${shown(low, 3)} to\u00a0${shown(high, 3)})`;
     const measured = ({ mean, half }) => (mean === null ? "none yet" : `${shown(mean, 4)}${half === null ? "" : within(mean - half, mean + half)}`);
     table(this.agentTable, ["agent", "episodes", "measured (95 % interval)", "predicted (95 % interval)"], agents.map((each) => [
       each.name, shown(each.n), measured(each), each.predicted ? `${shown(each.predicted[0], 4)}${within(each.predicted[1], each.predicted[2])}` : "not in the folder",
@@ -321,7 +320,7 @@ export class SessionPage {
     const rows = [[0, this.about.percentiles_hz], ...view.percentiles];
     const xs = rows.map(([time]) => time), end = Math.max(view.end_s, 1);
     const shownOnes = [1, 5, 9];
-    const frame = new Frame(this.drift.canvas, [0, end], [0, spanOf([1e-6, ...rows.map(([, of]) => of[9] ?? null)])[1]], { xLabel: "session's clock (s)", right: 40 });
+    const frame = new Frame(this.drift.canvas, [0, end], [0, spanOf([1e-6, ...rows.map(([, of]) => of[9] ?? null)])[1]], { xLabel: CLOCK, right: 40 });
     shownOnes.forEach((which, k) => {
       const ys = rows.map(([, of]) => of[which] ?? null);
       frame.line([...xs, end], [...ys, ys.at(-1)], series(k), { steps: true });

@@ -1,0 +1,58 @@
+"""What a report says first, what came out in a sentence by the numbers beside it; and figures that hold their words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from animat.report.controls import Controls, draw_controls
+from animat.report.headline import ArmReturns, draw_headline
+from animat.report.over_cultures import Compared, draw_over_cultures
+from animat.studies.publishing import _beside
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "found"),
+    [
+        (40.0, 60.0, "do better than random actions: 75 % of the way to the optimal controller. Their"),
+        (-30.0, 90.0, "are not found to differ from random actions. Their"),
+        (-90.0, -30.0, "do worse than random actions. Their"),
+    ],
+)
+def test_the_first_sentence_goes_by_the_interval(low: float, high: float, found: str) -> None:
+    told = _beside(ArmReturns("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
+    assert told.startswith(f"policies trained as “1 threshold” {found}")
+    assert "return is 50, that of random actions −10, that of the optimal controller 70." in told
+
+
+def test_without_an_interval_nothing_is_claimed() -> None:
+    told = _beside(ArmReturns("cartpole", "linear", 50.0, None, None, None, None))
+    assert told == "of the policies trained as “linear” the interquartile mean return is 50."
+
+
+def left_out(figure: Figure) -> list[str]:
+    """Titles, labels and legends that reach beyond the figure."""
+    figure.canvas.draw()
+    width = figure.bbox.width
+    texts = [*(text for axes in figure.axes for text in (axes.xaxis.label, axes._left_title))]  # type: ignore[attr-defined]
+    texts += [text for legend in figure.legends for text in legend.get_texts()]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in texts]
+    return [words for words, box in boxes if words and (box.x0 < 0 or box.x1 > width)]
+
+
+def test_words_of_narrow_figures_are_within_them() -> None:
+    rows = [
+        ArmReturns("navigation", name, 1.0, 0.0, 2.0, 0.5, 3.0, (0.5, 1.5)) for name in ("before training", "linear")
+    ]
+    assert left_out(draw_headline(rows)) == left_out(draw_headline(rows, narrow=True)) == []
+    over = [Compared("before and after training", "navigation", (0.1, 0.3), 0.2, 0.1, 0.3)]
+    assert left_out(draw_over_cultures(over)) == []
+    panels = [
+        Controls(f"9-thresholds, percentiles fixed, recording at {at} min", (("trained: without neurons", 1.0, 0.1),))
+        for at in (0, 140)
+    ]
+    assert left_out(draw_controls(panels, "navigation: controls")) == []
