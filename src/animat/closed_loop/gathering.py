@@ -18,6 +18,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
+from animat.stimulation.stimulus import NOTHING
 from animat.writing import atomic_write
 
 LOG_FILE = "session.log"
@@ -167,7 +168,7 @@ def expecting_a_session(file: Path) -> Iterator[None]:
 
 def unanswered_pulses(outline: Outline) -> int:
     """How many pulses were asked for and never answered."""
-    return sum(len(words["stimuli"]) for words in outline.unanswered)
+    return sum(pattern != NOTHING for words in outline.unanswered for _, pattern, *_ in words["stimuli"])
 
 
 def in_words(left_out: Mapping[str, int]) -> str:

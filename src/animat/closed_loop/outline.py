@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from animat.closed_loop.tick import Ending
+from animat.stimulation.stimulus import NOTHING
 
 
 @dataclass
@@ -97,7 +98,11 @@ class Outline:
     def unanswered(self) -> tuple[dict[str, Any], ...]:
         """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
         known, and they are in no recording. The words of its record: when, which stimuli."""
-        return tuple(words for words in self._asked.values() if words["stimuli"] and words.get("is_admitted", True))
+        return tuple(
+            words
+            for words in self._asked.values()
+            if any(pattern != NOTHING for _, pattern, *_ in words["stimuli"]) and words.get("is_admitted", True)
+        )
 
     def add(self, words: Mapping[str, Any]) -> None:
         """Count one record in."""
@@ -122,6 +127,7 @@ class Outline:
 
     def _add_tick(self, tick: Mapping[str, Any]) -> None:
         number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
+        n_pulses -= list(tick["patterns"]).count(NOTHING)
         episode = self._episodes.get(number)
         if episode is None:
             episode = Episode(number, tick["agent"], self._starts.pop(number, ()))

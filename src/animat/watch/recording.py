@@ -147,7 +147,7 @@ def _raster(recording: Recording, to_s: float | None, span_s: float) -> tuple[di
     first, last = np.searchsorted(recording.spike_times_s, (from_s, to_s))
     times_s, channels = recording.spike_times_s[first:last], recording.spike_channels[first:last]
     spikes, _ = packed_spikes(times_s, channels, from_s, to_s, len(recording.channels))
-    pulses_s = recording.stimuli.time_s
+    pulses_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
     pulses_s = pulses_s[(pulses_s >= from_s) & (pulses_s <= to_s)]
     every = f"; each {spikes['every']}th is drawn" if spikes["every"] > 1 else ""
     words = (
