@@ -74,7 +74,7 @@ def test_a_rest_is_said_and_no_set_that_is_empty_by_mistake() -> None:
         with pytest.raises(UnsafeStimulus, match="expected 1 to 32 electrodes, got 0"):
             culture.deliver([replace(REST, pattern=-1)], 0.1)
         for times_s in ((0.06, 0.01), (-0.01, 0.06), (float("nan"), 0.06)):
-            with pytest.raises(InvalidArgument, match="stimuli: expected times (from 0 s on that do not fall|before)"):
+            with pytest.raises(InvalidArgument, match=r"stimuli: expected times (from 0 s on that do not fall|before)"):
                 culture.deliver([replace(each, time_s=t) for each, t in zip((REST, PULSE), times_s, strict=True)], 0.1)
         assert culture.delivered == 0
 
@@ -106,7 +106,7 @@ def test_rests_are_recorded_sorted_and_read_as_other_trials(pulses: int, tmp_pat
     np.testing.assert_allclose(np.diff(read.stimuli.time_s), 1 / 20, atol=6e-5)
     assigned = ByElectrode().assign(read.stimuli)
     assert [each.electrodes for each in assigned.conditions] == [RESTING, (sites[:1],), (sites[2:5],)]
-    assert [each.label for each in assigned.conditions][0] == "no electrode"
+    assert assigned.conditions[0].label == "no electrode"
     assert not any(each.only_last for each in assigned.conditions)
     responses = extract_responses(read, burst_threshold=1.0)
     assert responses.by == "electrode" and np.bincount(responses.condition).tolist() == [12, 12, 12]

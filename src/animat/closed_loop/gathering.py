@@ -9,7 +9,7 @@ from typing import Self
 
 from animat.closed_loop.header import Header
 from animat.closed_loop.log import Record, Records
-from animat.closed_loop.outline import Outline
+from animat.closed_loop.outline import Outline, electrode_pulses_of
 from animat.closed_loop.pulses import Pulses
 from animat.closed_loop.tick import Ending
 from animat.closed_loop.tick_table import TickTable
@@ -132,7 +132,7 @@ class SessionFiles:
         """
         self.gathered.add(record)
         if record.words["kind"] == "seen" and record.words["tick"]:
-            self._table.add(record.words["tick"])
+            self._table.add(record.words["tick"], electrode_pulses_of(record.words))
 
     def finish(self, records: Records, ending: Ending) -> None:
         """Put the ticks in their place, and the recording after it: once it is there, so are both.

@@ -37,6 +37,7 @@ class Control:
         environment, simulator: that it is run in.
         actor: who acts.
         n_actors: how many they are.
+        is_stimulated: whether any pulse is delivered.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Control:
     simulator: NeuronSimulator | None
     actor: Actor
     n_actors: int = 1
+    is_stimulated: bool = True
 
 
 def controls_of(
@@ -135,7 +137,7 @@ def _without_effect(
     """Policies whose choices decide nothing."""
     silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
     return [
-        Control("silent", "the culture always answers 0", environment, silent, policies, n_policies),
+        Control("silent", "the culture always answers 0", environment, silent, policies, n_policies, False),
         Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),
     ]
 

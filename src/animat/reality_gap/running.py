@@ -18,6 +18,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, expect_no_session
+from animat.coding.electrode_pulses import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
@@ -56,7 +57,7 @@ from animat.robots.capabilities import lacking
 from animat.robots.grid import grid_for, no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
-from animat.wrappers import NeuralObservation
+from animat.wrappers import NeuralObservation, TrialCosts
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
@@ -159,6 +160,7 @@ def run_policies(
         )
         findings += (Finding("few-predicted", "note", message),)
     account = account or Account()
+    of_trials = electrode_pulses(loop.conditions, loop.pulses)
 
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -211,7 +213,10 @@ def run_policies(
         progress=in_phase(progress, "predicting"),
     )
     # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
-    optimum = _meanwhile(lambda: _best_return(animat, simulator)) if why_not is None else None
+    cases: list[Environment[Any]] = [animat]
+    if of_trials is not None and first.pulse_cost:
+        cases.append(TrialCosts(animat, tuple(first.pulse_cost * count for count in of_trials)))
+    optimum = _meanwhile(lambda: _best_returns(cases, simulator)) if why_not is None else None
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and optimum is not None:
         _wait_for(optimum, progress)
@@ -239,7 +244,8 @@ def run_policies(
             best = _wait_for(optimum, progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
-    rows = _rows(agents, tuple(policies), predicted, session, outcomes(loop.robot, session))
+    met = outcomes(loop.robot, session)
+    rows = _rows(agents, tuple(policies), predicted, session, met, of_trials, first.pulse_cost)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
@@ -251,7 +257,7 @@ def run_policies(
         loop.mapping.name,
         loop,
         calibration.start_min,
-        best,
+        None if best is None else best[0],
         rows,
         session,
         account,
@@ -260,6 +266,7 @@ def run_policies(
         ahead,
         found,
         () if ideal is None else replaced(rows, *ideal),
+        best[1] if best is not None and len(best) > 1 else None,
     )
 
 
@@ -274,16 +281,16 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
-    """The value alone, which is told as "about": how well it is known would take a third as long again."""
-    grid = grid_for(environment.robot).scaled(OPTIMUM_RESOLUTION)
-    (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
-    return float(value)
+def _best_returns(environments: Sequence[Environment[Any]], simulator: NeuronSimulator) -> list[float]:
+    """The values alone, which are told as "about": how well they are known would take a third as long again."""
+    grid = grid_for(environments[0].robot).scaled(OPTIMUM_RESOLUTION)
+    values, _ = rough_values([(environment, simulator) for environment in environments], grid, seed=1)
+    return [float(value) for value in values]
 
 
-def _meanwhile(compute: Callable[[], float]) -> Future[float]:
+def _meanwhile(compute: Callable[[], list[float]]) -> Future[list[float]]:
     """Begin to compute in a thread of its own."""
-    found: Future[float] = Future()
+    found: Future[list[float]] = Future()
 
     def work() -> None:
         try:
@@ -296,7 +303,7 @@ def _meanwhile(compute: Callable[[], float]) -> Future[float]:
     return found
 
 
-def _wait_for(optimum: Future[float], progress: Progress | None) -> float:
+def _wait_for(optimum: Future[list[float]], progress: Progress | None) -> list[float]:
     if not optimum.done():
         in_phase(progress, "optimal return").update(0, 1, "working it out on the simulator")
     return optimum.result()
@@ -310,7 +317,7 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
         Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, or in how the
             simulators were made that they were trained on.
     """
-    alike = ("robot", "mapping", "readouts", "conditions", "presentation", "window_ms", "fitted")
+    alike = ("robot", "mapping", "readouts", "conditions", "presentation", "window_ms", "fitted", "pulse_cost")
     return first_of_alike(policies, alike, "run it alone")
 
 
@@ -342,10 +349,14 @@ def _rows(
     predicted: Mapping[str, Predicted],
     session: Session,
     came_to: Mapping[int, Outcome],
+    of_trials: tuple[float, ...] | None,
+    pulse_cost: float,
 ) -> tuple[Row, ...]:
+    unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
+
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         episodes = [episode for episode in session.episodes if episode.agent in of]
-        acted = [episode.acted for episode in episodes]
+        acted, whole = [episode.acted for episode in episodes], [each for each in episodes if each.is_whole]
         actions = max(1, sum(each.actions for each in acted))
         trials = max(1, sum(each.trials for each in acted))
         of_them = together([predicted[each] for each in of])
@@ -355,8 +366,13 @@ def _rows(
             meaning=meaning,
             predicted=of_them.returns,
             predicted_anew=of_them.anew,
-            measured=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
+            measured=np.array([episode.total for episode in whole], np.float64),
             pulses_per_action=sum(each.pulses for each in acted) / actions,
+            electrode_pulses=sum(each.acted.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
+            predicted_electrode_pulses=None
+            if of_trials is None
+            else float(of_them.presented @ of_trials) * (name not in unstimulated),
+            pulse_cost=pulse_cost,
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,
             bursts=sum(each.bursts for each in acted) / trials,
             late=sum(each.late for each in acted) / trials,

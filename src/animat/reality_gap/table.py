@@ -41,6 +41,7 @@ class RealityGap:
         outlook: how long the session would be and could be, as it was known beforehand.
         reasons: why the policies' measured return differs from the predicted one, as far as the session's data show it.
         whose_work: what the policies' return becomes with something in the culture's place; empty if it was not asked.
+        net_optimum: the optimal return less the cost of pulses on the same simulator; None where they cost nothing.
     """
 
     robot: str
@@ -56,6 +57,7 @@ class RealityGap:
     outlook: Outlook
     reasons: tuple[Finding, ...]
     whose_work: tuple[Replaced, ...] = ()
+    net_optimum: float | None = None
 
     @property
     def beside_controls(self) -> Verdict | None:
@@ -102,6 +104,8 @@ class RealityGap:
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
             "optimum": self.optimum,
+            "pulse_cost": self.rows[0].pulse_cost,
+            "net_optimum": self.net_optimum,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
@@ -119,7 +123,7 @@ class RealityGap:
 
     def to_text(self) -> str:
         """A table for a terminal."""
-        cells, objectives = [], objectives_of(self.loop.robot)
+        cells, objectives, cost = [], objectives_of(self.loop.robot), self.rows[0].pulse_cost
         for row in self.rows:
             told, prediction = row.to_dict(), row.prediction
             anew = f"{prediction.low:.1f} to {prediction.high:.1f}"
@@ -132,6 +136,8 @@ class RealityGap:
                 *(cells_of(row.met) if objectives else []),
                 str(len(row.measured)),
                 f"{row.pulses_per_action:.1f}",
+                f"{row.electrode_pulses:.1f}" if len(row.measured) else "-",
+                *(["-" if net is None else f"{net:.1f}" for net in (row.predicted_net, row.net)] if cost else []),
             ]
             cells.append([row.name, f"{told['predicted']:.1f}", anew, *measured, *counts, p, row.meaning])
         interval = "95 % interval"
@@ -145,6 +151,8 @@ class RealityGap:
             *(MEANS if objectives else ()),
             "episodes",
             "pulses/action",
+            "electrode pulses",
+            *(("predicted net", "net") if cost else ()),
             "p",
             "",
         ]
@@ -160,6 +168,9 @@ class RealityGap:
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
             lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
+        if cost:
+            best = "" if self.net_optimum is None else f", at most about {self.net_optimum:.1f} on this simulator"
+            lines.append(f"  electrode pulses: in an episode; net: return - {cost:g} x electrode pulses{best}")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
