@@ -320,7 +320,7 @@ def evaluate(
         minute,
         tuple(policies),
         tuple(rows),
-        (*findings, *(() if optimum is None else optimum.findings())),
+        (*findings, *(finding for each in (optimum, net_optimum) if each is not None for finding in each.findings())),
         optimum,
         no_optimum,
         fixed_from_min,

@@ -57,7 +57,7 @@ from animat.robots.capabilities import lacking
 from animat.robots.grid import grid_for, no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
-from animat.wrappers import NeuralObservation, TrialCosts
+from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
@@ -213,10 +213,7 @@ def run_policies(
         progress=in_phase(progress, "predicting"),
     )
     # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
-    cases: list[Environment[Any]] = [animat]
-    if of_trials is not None and first.pulse_cost:
-        cases.append(TrialCosts(animat, tuple(first.pulse_cost * count for count in of_trials)))
-    optimum = _meanwhile(lambda: _best_returns(cases, simulator)) if why_not is None else None
+    optimum = _meanwhile(lambda: _best_return(animat, simulator)) if why_not is None else None
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and optimum is not None:
         _wait_for(optimum, progress)
@@ -257,7 +254,7 @@ def run_policies(
         loop.mapping.name,
         loop,
         calibration.start_min,
-        None if best is None else best[0],
+        best,
         rows,
         session,
         account,
@@ -266,7 +263,6 @@ def run_policies(
         ahead,
         found,
         () if ideal is None else replaced(rows, *ideal),
-        best[1] if best is not None and len(best) > 1 else None,
     )
 
 
@@ -281,16 +277,16 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _best_returns(environments: Sequence[Environment[Any]], simulator: NeuronSimulator) -> list[float]:
-    """The values alone, which are told as "about": how well they are known would take a third as long again."""
-    grid = grid_for(environments[0].robot).scaled(OPTIMUM_RESOLUTION)
-    values, _ = rough_values([(environment, simulator) for environment in environments], grid, seed=1)
-    return [float(value) for value in values]
+def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
+    """The value alone, which is told as "about": how well it is known would take a third as long again."""
+    grid = grid_for(environment.robot).scaled(OPTIMUM_RESOLUTION)
+    (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
+    return float(value)
 
 
-def _meanwhile(compute: Callable[[], list[float]]) -> Future[list[float]]:
+def _meanwhile(compute: Callable[[], float]) -> Future[float]:
     """Begin to compute in a thread of its own."""
-    found: Future[list[float]] = Future()
+    found: Future[float] = Future()
 
     def work() -> None:
         try:
@@ -303,7 +299,7 @@ def _meanwhile(compute: Callable[[], list[float]]) -> Future[list[float]]:
     return found
 
 
-def _wait_for(optimum: Future[list[float]], progress: Progress | None) -> list[float]:
+def _wait_for(optimum: Future[float], progress: Progress | None) -> float:
     if not optimum.done():
         in_phase(progress, "optimal return").update(0, 1, "working it out on the simulator")
     return optimum.result()

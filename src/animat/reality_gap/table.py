@@ -41,7 +41,6 @@ class RealityGap:
         outlook: how long the session would be and could be, as it was known beforehand.
         reasons: why the policies' measured return differs from the predicted one, as far as the session's data show it.
         whose_work: what the policies' return becomes with something in the culture's place; empty if it was not asked.
-        net_optimum: the optimal return less the cost of pulses on the same simulator; None where they cost nothing.
     """
 
     robot: str
@@ -57,7 +56,6 @@ class RealityGap:
     outlook: Outlook
     reasons: tuple[Finding, ...]
     whose_work: tuple[Replaced, ...] = ()
-    net_optimum: float | None = None
 
     @property
     def beside_controls(self) -> Verdict | None:
@@ -105,7 +103,6 @@ class RealityGap:
             "calibrated_at_min": self.calibrated_at_min,
             "optimum": self.optimum,
             "pulse_cost": self.rows[0].pulse_cost,
-            "net_optimum": self.net_optimum,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
@@ -169,8 +166,8 @@ class RealityGap:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
             lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
         if cost:
-            best = "" if self.net_optimum is None else f", at most about {self.net_optimum:.1f} on this simulator"
-            lines.append(f"  electrode pulses: in an episode; net: return - {cost:g} x electrode pulses{best}")
+            ignores = "" if self.optimum is None else "; the optimal return ignores the cost"
+            lines.append(f"  electrode pulses: in an episode; net: return - {cost:g} x electrode pulses{ignores}")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
