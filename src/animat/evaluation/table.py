@@ -140,15 +140,16 @@ class Evaluation:
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         goal = MEANS if self.objectives else ()
         are_counted, cost = first_row.electrode_pulses is not None, first_row.pulse_cost
-        paid = [*["electrode pulses"] * are_counted, *["net return"] * bool(cost)]
-        head = ["", "mean return", "s.e.", "iterations", "ended early", *paid, *goal, "score", ""]
+        paid = [*["electrode_pulses"] * are_counted, *["net_return"] * bool(cost)]
+        names = [name.replace("_", " ") for name in paid]
+        head = ["", "mean return", "s.e.", "iterations", "ended early", *names, *goal, "score", ""]
         cells = []
         for row in self.rows:
             told, score = row.to_dict(), self.score(row)
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
             numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
             numbers.append(f"{100 * told['terminated_share']:.0f} %")
-            numbers += [f"{told['electrode_pulses']:.1f}"] * are_counted + [f"{told['net_return']:.1f}"] * bool(cost)
+            numbers += ["" if (given := told[name]) is None else f"{given:.1f}" for name in paid]
             numbers += cells_of(row.met) if goal else []
             cells.append([row.name, *numbers, "" if score is None else f"{score:.2f}", row.meaning])
         if self.optimum is None:
