@@ -132,7 +132,7 @@ class SessionFiles:
         """
         self.gathered.add(record)
         if record.words["kind"] == "seen" and record.words["tick"]:
-            self._table.add(record.words["tick"], electrode_pulses_of(record.words))
+            self._table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
 
     def finish(self, records: Records, ending: Ending) -> None:
         """Put the ticks in their place, and the recording after it: once it is there, so are both.

@@ -57,18 +57,16 @@ class TickTable:
         head = [each for column in HEAD for each in (commands if column == "command" else [column])]
         self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))
 
-    def add(self, tick: Mapping[str, Any], electrode_pulses: int) -> None:
-        """Write a tick, as in the words of its record, and how many electrodes its pulses were on together.
+    def add(self, tick: Mapping[str, Any]) -> None:
+        """Write a tick, as in the words of its record, with its `electrode_pulses`.
 
         Raises:
             OSError: if it cannot be written.
         """
-        self._writer.writerow(_row(tick, electrode_pulses, self._conditions, self._observed, self._readouts))
+        self._writer.writerow(_row(tick, self._conditions, self._observed, self._readouts))
 
 
-def _row(
-    tick: Mapping[str, Any], electrode_pulses: int, conditions: Sequence[str], observed: int, readouts: int
-) -> list[Any]:
+def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int, readouts: int) -> list[Any]:
     command = tick["command"]
     row = [
         tick["number"],
@@ -81,7 +79,7 @@ def _row(
         tick["frequency_hz"],
         " ".join(map(str, tick["patterns"])),
         " ".join(map(str, tick["pulse_time_s"])),
-        electrode_pulses,
+        tick["electrode_pulses"],
         tick["spikes"],
         tick["rate_hz"],
         tick["active_ratio"],
