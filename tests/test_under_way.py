@@ -119,7 +119,7 @@ def test_one_that_fails_leaves_nothing_and_one_that_was_killed_is_told(tmp_path:
     assert read_recording(tmp_path / UNDER_WAY).spike_times_s.tolist() == recording.spike_times_s.tolist()
     found = RecordingView(tmp_path).view(None, 1.0)
     assert found["state"] == "silent"
-    assert "was broken off" in found["message"]
+    assert "was interrupted" in found["message"]
     # The next run is rid of it.
     (tmp_path / f".{UNDER_WAY}.ab12.partial.npz").write_bytes(b"half")
     with exclusive_lock(tmp_path), UnderWay(tmp_path):

@@ -127,6 +127,52 @@ class NeuralObservation(Wrapper[RobotState]):
 
 @final
 @dataclass(frozen=True)
+class TrialCosts(Wrapper[RobotState]):
+    """Counts what the trials of an episode cost, in `State.info["cost"]`; rewards stay what they are (`net_reward`).
+
+    Attributes:
+        costs: of a trial of each condition, in the units of the reward.
+
+    Raises:
+        InvalidArgument: around an environment without neurons, or for other conditions than it has.
+    """
+
+    costs: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        _expect_neurons(self)
+        if len(self.costs) != self.n_actions:
+            raise InvalidArgument(f"costs: expected one for each of {self.n_actions} conditions, got {self.costs}")
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        return _remembering(self.inside.reset(key), {_COST: jnp.float32(0.0)})
+
+    def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
+        after = self.inside.advance(uniforms, state, action, simulator)
+        return _remembering(after, {_COST: state.info[_COST] + self.of(after.info["delivered"])})
+
+    def of(self, delivered: Array) -> Array:
+        """What trials of these conditions cost."""
+        return jnp.asarray(self.costs, jnp.float32)[delivered]
+
+
+def net_reward(before: State, after: State) -> Array:
+    """The reward of an iteration less what its trial cost, where that is counted (`TrialCosts`)."""
+    return after.reward - (after.info[_COST] - before.info[_COST]) if _COST in after.info else after.reward
+
+
+def net_return(returns: Array, after: State) -> Array:
+    """The return of an episode so far less what its trials cost, where that is counted."""
+    return returns - after.info[_COST] if _COST in after.info else returns
+
+
+def costing(state: State, more: Array) -> State:
+    """A state after another trial, of bodies that are moved outside of JAX."""
+    return _remembering(state, {_COST: state.info[_COST] + more})
+
+
+@final
+@dataclass(frozen=True)
 class YokedDelivery(Wrapper[RobotState]):
     """Delivers what was chosen for another episode, which goes on beside this one: as many stimuli, to no end here.
 
@@ -238,8 +284,8 @@ def other_goal(robot: Robot[RobotState], own: RobotState, key: PRNGKeyArray) -> 
     return first
 
 
-_OTHER, _START, _GOAL = "other_episode", "other_start", "other_goal"
-"""In `State.info`: the other episode and where it starts; and the state whose goal is switched to."""
+_OTHER, _START, _GOAL, _COST = "other_episode", "other_start", "other_goal", "cost"
+"""In `State.info`: the other episode and where it starts; the state whose goal is switched to; and what trials cost."""
 
 
 def _remembering(state: State, remembered: dict[str, Any]) -> State:

@@ -65,6 +65,9 @@ class Train(Fitting):
     """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
     neural_observation: bool = False
     """Policies see what the neurons remember too, trace and load of the last stimuli and responses"""
+    pulse_cost: float = 0.0
+    """What each electrode that is pulsed costs, in the units of the reward: policies are trained on the rewards less
+    that. For conditions that differ in how many electrodes they pulse (animat record --places FILE)"""
     lessons: Path | None = None
     """Lessons in turn, a TOML file: ranges of parameters, starts and recordings, and when to go on"""
     assess: int | None = None
@@ -91,7 +94,7 @@ class Train(Fitting):
         from animat.coding.mapping import mapping_named
         from animat.goals.robot import with_goal
         from animat.progress import Bar
-        from animat.responses.readouts import ALL, count_readouts, read_readouts
+        from animat.responses.readouts import ALL, USUAL_READOUTS, count_readouts, read_readouts
         from animat.robots.registry import robot_named
         from animat.training.lessons import read_lessons
         from animat.training.specification import Training
@@ -105,7 +108,7 @@ class Train(Fitting):
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
-        usual_readouts = "all" if mapping == "none" else _READOUTS.get(robot.n_commands, "all")
+        usual_readouts = "all" if mapping == "none" else USUAL_READOUTS.get(robot.n_commands, "all")
         readouts = read_readouts(self.readouts or usual_readouts)
         if mapping != "none":
             expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
@@ -124,6 +127,7 @@ class Train(Fitting):
             commands=robot.baseline_commands if mapping == "none" else None,
             algorithm=read_sac(self.sac),
             neural_observation=self.neural_observation,
+            pulse_cost=self.pulse_cost,
             lessons=() if self.lessons is None else read_lessons(self.lessons),
             assess=self.assess,
         )
@@ -146,6 +150,7 @@ class Train(Fitting):
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
                 "(to allow it: --allow one-condition)"
             )
+        training.environment_on(timeline)
         was_finished = is_finished(training, self.out)
         if timeline is not None:
             print(_control(timeline))
@@ -177,6 +182,12 @@ class Train(Fitting):
         counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{control['mean_return']:.1f}"
         print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
+        if self.pulse_cost:
+            net, given = f"{policies['net_return']:.1f}", f"{policies['electrode_pulses']:.1f}"
+            print(
+                f"less {self.pulse_cost:g} for each electrode pulse ({given} in an episode): {net}, of random actions "
+                f"{control['net_return']:.1f} ({control['electrode_pulses']:.1f})"
+            )
         assessed = {name: _assessed(policy, policy.best) for name, policy in trained.items() if policy.best is not None}
         for name, told in assessed.items():
             print(_standing(name, told))
@@ -184,6 +195,7 @@ class Train(Fitting):
             "policies": [str(self.out / f"{name}.safetensors") for name in trained],
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
             "random": control["mean_return"],
+            **{name: policies[name] for name in ("electrode_pulses", "net_return")},
             "recorded_at_min": evaluation.recorded_at_min,
             "findings": [finding.to_dict() for finding in evaluation.findings],
             **({"assessed": assessed} if assessed else {}),
@@ -192,8 +204,6 @@ class Train(Fitting):
 
 _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
 """What works in a closed loop; `share`: of the paper's iterations, in per cent."""
-_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
-"""By how many commands a robot takes."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
 
 

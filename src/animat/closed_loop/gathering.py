@@ -9,7 +9,7 @@ from typing import Self
 
 from animat.closed_loop.header import Header
 from animat.closed_loop.log import Record, Records
-from animat.closed_loop.outline import Outline
+from animat.closed_loop.outline import Outline, electrode_pulses_of
 from animat.closed_loop.pulses import Pulses
 from animat.closed_loop.tick import Ending
 from animat.closed_loop.tick_table import TickTable
@@ -18,6 +18,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
+from animat.stimulation.stimulus import NOTHING
 from animat.writing import atomic_write
 
 LOG_FILE = "session.log"
@@ -131,7 +132,7 @@ class SessionFiles:
         """
         self.gathered.add(record)
         if record.words["kind"] == "seen" and record.words["tick"]:
-            self._table.add(record.words["tick"])
+            self._table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
 
     def finish(self, records: Records, ending: Ending) -> None:
         """Put the ticks in their place, and the recording after it: once it is there, so are both.
@@ -167,7 +168,7 @@ def expecting_a_session(file: Path) -> Iterator[None]:
 
 def unanswered_pulses(outline: Outline) -> int:
     """How many pulses were asked for and never answered."""
-    return sum(len(words["stimuli"]) for words in outline.unanswered)
+    return sum(pattern != NOTHING for words in outline.unanswered for _, pattern, *_ in words["stimuli"])
 
 
 def in_words(left_out: Mapping[str, int]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from animat.closed_loop.tick import Ending
+from animat.stimulation.stimulus import NOTHING
 
 
 @dataclass
@@ -17,6 +18,7 @@ class Acted:
         trials: repeated ones among them.
         actions: that the robot was moved by.
         pulses: that the culture was given.
+        electrode_pulses: one for each electrode of each pulse.
         pulses_s: of each presentation, its pulses over its frequency.
         bursts: responses that were bursts.
         late: trials that came late.
@@ -25,6 +27,7 @@ class Acted:
     trials: int = 0
     actions: int = 0
     pulses: int = 0
+    electrode_pulses: int = 0
     pulses_s: float = 0.0
     bursts: int = 0
     late: int = 0
@@ -97,7 +100,11 @@ class Outline:
     def unanswered(self) -> tuple[dict[str, Any], ...]:
         """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
         known, and they are in no recording. The words of its record: when, which stimuli."""
-        return tuple(words for words in self._asked.values() if words["stimuli"] and words.get("is_admitted", True))
+        return tuple(
+            words
+            for words in self._asked.values()
+            if any(pattern != NOTHING for _, pattern, *_ in words["stimuli"]) and words.get("is_admitted", True)
+        )
 
     def add(self, words: Mapping[str, Any]) -> None:
         """Count one record in."""
@@ -108,7 +115,7 @@ class Outline:
                 self._asked.pop(stretch, None)
                 self._answered = max(self._answered, stretch)
             if words["tick"]:
-                self._add_tick(words["tick"])
+                self._add_tick(words["tick"], electrode_pulses_of(words))
         elif kind in ("asked", "event"):
             # What is under way is looked at while it is answered: it may be written down after its answer.
             # So may it be after the event that ended it, which knows more.
@@ -120,8 +127,9 @@ class Outline:
             self.ending = Ending(words["by"], words["message"])
             self.left_out = words.get("left_out", {})
 
-    def _add_tick(self, tick: Mapping[str, Any]) -> None:
+    def _add_tick(self, tick: Mapping[str, Any], electrode_pulses: int) -> None:
         number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
+        n_pulses -= list(tick["patterns"]).count(NOTHING)
         episode = self._episodes.get(number)
         if episode is None:
             episode = Episode(number, tick["agent"], self._starts.pop(number, ()))
@@ -144,6 +152,12 @@ class Outline:
             acted.trials += 1
             acted.actions += tick["command"] is not None
             acted.pulses += n_pulses
+            acted.electrode_pulses += electrode_pulses
             acted.pulses_s += self._presented / tick["frequency_hz"]
             acted.bursts += tick["is_burst"]
             acted.late += is_late
+
+
+def electrode_pulses_of(seen: Mapping[str, Any]) -> int:
+    """How many electrodes were pulsed in a stretch of time, each as often as it was, from the words of its record."""
+    return sum(len(electrodes) for _, _, _, electrodes in seen["stimuli"])

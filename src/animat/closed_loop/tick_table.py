@@ -17,6 +17,7 @@ HEAD = (
     "frequency_hz",
     "patterns",
     "pulse_times_s",
+    "electrode_pulses",
     "spikes",
     "rate_hz",
     "active_ratio",
@@ -57,7 +58,7 @@ class TickTable:
         self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))
 
     def add(self, tick: Mapping[str, Any]) -> None:
-        """Write a tick, as in the words of its record.
+        """Write a tick, as in the words of its record, with its `electrode_pulses`.
 
         Raises:
             OSError: if it cannot be written.
@@ -78,6 +79,7 @@ def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int, read
         tick["frequency_hz"],
         " ".join(map(str, tick["patterns"])),
         " ".join(map(str, tick["pulse_time_s"])),
+        tick["electrode_pulses"],
         tick["spikes"],
         tick["rate_hz"],
         tick["active_ratio"],

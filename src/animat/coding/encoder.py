@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, UnusableData
-from animat.responses.condition import Condition
+from animat.responses.condition import RESTING, Condition
+from animat.stimulation.stimulus import NOTHING
 from animat.tables import UNKNOWN
 
 SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
@@ -59,7 +60,7 @@ class Encoder:
     def electrodes(self) -> tuple[int, ...]:
         """All that its conditions name, rising."""
         sets = (one for condition in self.conditions for one in condition.electrodes or ())
-        return tuple(sorted({electrode for one in sets for electrode in one}))
+        return tuple(sorted({electrode for one in sets for electrode in one} - {NOTHING}))
 
     @property
     def takes_patterns(self) -> bool:
@@ -71,8 +72,8 @@ class Target(NamedTuple):
     """What one pulse is on.
 
     Attributes:
-        electrodes: pulsed together.
-        pattern: number of the culture's pattern that they are, -1 where they are none.
+        electrodes: pulsed together; none where nothing is delivered.
+        pattern: number of the culture's pattern that they are, -1 where they are none, -2 where nothing is delivered.
     """
 
     electrodes: tuple[int, ...]
@@ -101,7 +102,7 @@ class Dealer:
         self._decks = [
             self._any
             if each.electrodes is None
-            else _Deck([Target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
+            else _Deck([_target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
             for each in encoder.conditions
         ]
 
@@ -117,6 +118,10 @@ class Dealer:
             return deck.hand(pulses)
         last = deck.hand(1)
         return [*self._any.hand(pulses - 1, but=last), *last]
+
+
+def _target(electrodes: tuple[int, ...], pattern: int) -> Target:
+    return Target((), NOTHING) if (electrodes,) == RESTING else Target(electrodes, pattern)
 
 
 class _Deck:

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 from animat.coding.encoder import Encoder
 from animat.errors import InvalidArgument
+from animat.responses.condition import RESTING
+from animat.stimulation.places import NONE
 from animat.stimulation.protocol import CLOSED_LOOP, PAPER, Order, Protocol
 from animat.stimulation.pulse import Pulse
 
@@ -44,6 +46,6 @@ def protocol_of(encoder: Encoder, order: Order, n_patterns: int, pulse: Pulse) -
         frequencies_hz=frequencies_hz,
         pulses=encoder.pulses,
         patterns=min(MOST_PATTERNS, n_patterns),
-        places=places,
+        places=tuple(NONE if (place,) == RESTING else place for place in places),
         pulse=pulse,
     )

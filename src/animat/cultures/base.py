@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failing import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, presented
+from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, presented, with_rests
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import Admitted
@@ -102,7 +102,8 @@ class Culture(Openable):
         not later by that. Where the first one's time is past, it comes now and the others as long after it as asked.
 
         Args:
-            stimuli: in the order of time, counted from now, or from `since_s`.
+            stimuli: in the order of time, counted from now, or from `since_s`. Of one that is a rest
+                (`Stimulus.is_rest`) nothing is delivered.
             duration_s: how long, zero or more; all stimuli begin within. All times are float64.
             since_s: a reading of `now_s`; None: now.
 
@@ -119,8 +120,9 @@ class Culture(Openable):
                 now_s = seconds("now_s", self.now_s)
                 if since_s is not None and since_s != now_s:
                     request = request.counted_from(seconds("since_s", since_s), now_s)
-                admitted = guard.admit(request.stimuli, now_s)
-                return self._deliver(admitted, request.duration_s)
+                # What is no pulse is nobody's to deliver: it comes neither to the guard nor to the backend.
+                admitted = guard.admit([each for each in request.stimuli if not each.is_rest], now_s)
+                return with_rests(self._deliver(admitted, request.duration_s), request.stimuli, now_s)
         except AnimatError as error:
             error.is_admitted = admitted is not None and len(admitted.stimuli) > 0
             raise
@@ -275,7 +277,8 @@ class Culture(Openable):
         for block in schedule.blocks:
             offset_s += block.setup_s
             for stimulus in schedule.deliveries(block):
-                stimuli.append(Stimulus(offset_s + stimulus.time_s, stimulus.electrodes, stimulus.pulse))
+                if not stimulus.is_rest:
+                    stimuli.append(Stimulus(offset_s + stimulus.time_s, stimulus.electrodes, stimulus.pulse))
             offset_s += block.duration_s
         with turns as guard:
             guard.check(stimuli, self.now_s)

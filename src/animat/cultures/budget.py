@@ -60,9 +60,10 @@ class Account:
             BudgetSpent: naming what would be exceeded; nothing is written down.
         """
         budget = self.budget
-        if budget.pulses is not None and self.pulses + len(stimuli) > budget.pulses:
+        wanted = _pulses(stimuli)
+        if budget.pulses is not None and self.pulses + wanted > budget.pulses:
             raise BudgetSpent(
-                f"budget.pulses: {self.pulses} of {budget.pulses} pulses are spent, and {len(stimuli)} more were wanted"
+                f"budget.pulses: {self.pulses} of {budget.pulses} pulses are spent, and {wanted} more were wanted"
             )
         most = budget.pulses_per_electrode
         if most is None:
@@ -76,12 +77,12 @@ class Account:
 
     def spend(self, stimuli: Sequence[Stimulus]) -> None:
         """Write stimuli down as delivered."""
-        self.pulses += len(stimuli)
+        self.pulses += _pulses(stimuli)
         self._on.update(_counted(stimuli))
 
     def take_back(self, stimuli: Sequence[Stimulus]) -> None:
         """Write stimuli down as not delivered after all: the culture refused them."""
-        self.pulses -= len(stimuli)
+        self.pulses -= _pulses(stimuli)
         self._on -= _counted(stimuli)
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,6 +100,11 @@ class Account:
             f"{self.pulses:,}{'' if of is None else f' of {of:,}'} pulses; at most {self.most_on_an_electrode:,}"
             f"{'' if each is None else f' of {each:,}'} on an electrode"
         )
+
+
+def _pulses(stimuli: Sequence[Stimulus]) -> int:
+    """How many of them are delivered."""
+    return sum(not stimulus.is_rest for stimulus in stimuli)
 
 
 def _counted(stimuli: Sequence[Stimulus]) -> Counter[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +43,29 @@ class Observed:
     duration_s: float
     spikes: Spikes
     stimulus_time_s: Float64[np.ndarray, " stimuli"]
+
+
+def with_rests(observed: Observed, stimuli: Sequence[Stimulus], now_s: float) -> Observed:
+    """What was seen with the times of rests among those of the stimuli that were delivered.
+
+    A rest comes when it was asked for, as late as what was delivered before it.
+
+    Args:
+        observed: of the delivery, in which rests have no times.
+        stimuli: all that was asked for, in the order of time.
+        now_s: that their times count from, on the culture's clock.
+    """
+    if not any(stimulus.is_rest for stimulus in stimuli):
+        return observed
+    is_rest = np.array([stimulus.is_rest for stimulus in stimuli])
+    asked_s = np.array([stimulus.time_s for stimulus in stimuli]) + (now_s - observed.start_s)
+    late_s = np.zeros(len(stimuli))
+    late_s[~is_rest] = observed.stimulus_time_s - asked_s[~is_rest]
+    before = np.maximum.accumulate(np.where(is_rest, -1, np.arange(len(stimuli))))
+    late_s = np.where(before < 0, 0.0, late_s[before])
+    time_s = np.maximum(0.0, asked_s + late_s)
+    time_s[~is_rest] = observed.stimulus_time_s
+    return replace(observed, stimulus_time_s=time_s)
 
 
 def stimulus_table(stimuli: Sequence[Stimulus], time_s: Float64[np.ndarray, " stimuli"]) -> Stimuli:

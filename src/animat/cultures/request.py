@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from animat.errors import InvalidArgument
@@ -36,6 +37,11 @@ class Request(NamedTuple):
                     f"stimuli: expected times before the delivery ends ({request.duration_s:g} s), got "
                     f"{stimulus.time_s:g} s"
                 )
+        if any(stimulus.is_rest for stimulus in request.stimuli):
+            # The guard, who looks at the times of pulses, does not see it.
+            times_s = [0.0, *(stimulus.time_s for stimulus in request.stimuli)]
+            if not all(before <= after for before, after in pairwise(times_s)):
+                raise InvalidArgument(f"stimuli: expected times from 0 s on that do not fall, got {times_s[1:][:5]}")
         return request
 
     def counted_from(self, since_s: float, now_s: float) -> Request:

@@ -119,7 +119,7 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     else:
         levels, probabilities = _quantiles(animat.mapping, simulator)
     n_actions = animat.n_conditions
-    if _is_shuffled(environment):
+    if is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: every action leads to the mixture of all.
         levels = np.tile(levels.reshape(1, -1), (n_actions, 1))
         probabilities = np.tile(probabilities.reshape(1, -1) / n_actions, (n_actions, 1))
@@ -186,7 +186,7 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
         return [[commands_of(environment, simulator)]]
     levels, histories = _answers(animat, simulator, _histories(simulator))
     levels, classes = np.asarray(levels), np.asarray(class_of(simulator, histories))
-    if _is_shuffled(environment):
+    if is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: one action stands for all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
     actions, even = np.arange(levels.shape[1]), np.full(levels.shape[1:], 1 / levels.shape[-1])
@@ -197,10 +197,11 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
     ]
 
 
-def _is_shuffled(environment: Environment[Any]) -> bool:
+def is_shuffled(environment: Environment[Any]) -> bool:
+    """Whether any condition is delivered whatever is chosen."""
     if isinstance(environment, ShuffledDelivery):
         return True
-    return isinstance(environment, Wrapper) and _is_shuffled(environment.inside)
+    return isinstance(environment, Wrapper) and is_shuffled(environment.inside)
 
 
 def _recorded(simulator: MemorySimulator) -> Float[Array, "responses 2"]:

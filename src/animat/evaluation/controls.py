@@ -34,6 +34,7 @@ class Control:
     Attributes:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`.
         meaning: what it does, in a few words.
+        is_stimulated: whether any pulse is delivered.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Control:
     simulator: NeuronSimulator | None
     actor: Actor
     n_actors: int = 1
+    is_stimulated: bool = True
 
 
 def controls_of(
@@ -136,7 +138,7 @@ def _without_effect(
     """Policies whose choices decide nothing."""
     silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
     return [
-        Control("silent", "the culture always answers 0", environment, silent, policies, n_policies),
+        Control("silent", "the culture always answers 0", environment, silent, policies, n_policies, False),
         Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),
     ]
 

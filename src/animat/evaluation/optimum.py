@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
 from animat.environment import Environment
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import CLASSES, class_of, commands_after, layers_of, nodes_for
+from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, layers_of, nodes_for
 from animat.evaluation.landings import Motion
 from animat.evaluation.outcomes import Outcomes, side_by_side
 from animat.evaluation.statistics import Interval
@@ -26,6 +26,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
+from animat.wrappers import TrialCosts, net_reward
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
 """What an optimum is asked for: an environment, and the simulator in it (None without neurons)."""
@@ -138,7 +139,8 @@ def best_returns(
 
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 
-    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. Where the
+    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. Where
+    trials cost something (`animat.wrappers.TrialCosts`) r is the reward less the cost of a. Where the
     neurons remember, s holds the class of the history too (`commands_after`). V is kept
     at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
     `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
@@ -230,6 +232,14 @@ def _mean_with_error(returns: Float64[np.ndarray, " episodes"] | None) -> tuple[
     return float(returns.mean()), float(returns.std(ddof=1) / math.sqrt(len(returns)))
 
 
+def _costs_of(environment: Environment[Any], n_actions: int) -> Float32[np.ndarray, " actions"]:
+    """What the trial of each action costs; where any condition is delivered whatever is chosen, their mean."""
+    if not isinstance(environment, TrialCosts):
+        return np.zeros(n_actions, np.float32)
+    costs = np.array(environment.costs, np.float32)
+    return np.full(n_actions, costs.mean()) if is_shuffled(environment) else costs
+
+
 class _Tables:
     """Values for every time left, for the controller to look up: in 16 bits each, as all of them must be kept."""
 
@@ -278,6 +288,7 @@ class _Programme:
         ends = np.cumsum([len(of_case) for of_case in after]).tolist()
         self._layers = [slice(end - len(of_case), end) for end, of_case in zip(ends, after, strict=True)]
         self.n_layers = ends[-1]
+        self._costs = [_costs_of(environment, len(a)) for (environment, _), a in zip(cases, self._actions, strict=True)]
         self._motion = Motion(robot, grid, nodes, uniforms)
         self.bounds = -math.inf, math.inf
 
@@ -286,10 +297,15 @@ class _Programme:
         grid = self._grid
         landings = self._motion.from_grid()
         pairs, weights = side_by_side(self._outcomes)
+        # Of a case of fewer actions the last one is there again.
+        costs = [np.pad(of_case, (0, weights.shape[1] - len(of_case)), mode="edge") for of_case in self._costs]
+        costs_of_layers = np.repeat(costs, [len(each.weights) for each in self._outcomes], axis=0)
+        dearest = float(np.max(costs_of_layers))
         shape = (grid.n_rows, self.n_layers, grid.along.stored)
         values = np.zeros(math.prod(shape), np.float32)
         before = np.empty_like(values)
         for remaining, (lowest, highest) in zip(range(self._robot.episode_limit), landings.bounds(), strict=False):
+            lowest -= dearest * (remaining + 1)
             self.bounds = lowest, highest
             if tables is not None:
                 tables.keep(remaining, values.reshape(shape))
@@ -303,6 +319,7 @@ class _Programme:
                 grid.row_offsets,
                 pairs,
                 weights,
+                costs_of_layers,
                 remaining,
                 np.float32(lowest),
                 np.float32(highest),
@@ -342,12 +359,13 @@ class _Programme:
                 self._layer(case, state.neurons),
                 pairs,
                 outcomes.weights,
+                self._costs[case],
                 remaining,
                 chosen,
             )
             action = actions[np.minimum(chosen, len(actions) - 1)]
-            state = _step(environment, episodes, key, state, action, simulator)
-            returns += np.where(going, np.asarray(state.reward, np.float64), 0.0)
+            before, state = state, _step(environment, episodes, key, state, action, simulator)
+            returns += np.where(going, np.asarray(net_reward(before, state), np.float64), 0.0)
             going &= ~np.asarray(state.ended.terminated)
             if not going.any():
                 break

@@ -53,6 +53,7 @@ def bellman_backup(
     row_offsets: Int32[np.ndarray, " taps"],
     outcomes: Int32[np.ndarray, "layers outcomes 2"],
     weights: Float32[np.ndarray, "layers actions outcomes"],
+    costs: Float32[np.ndarray, "layers actions"],
     remaining: int,
     lowest: np.float32,
     highest: np.float32,
@@ -60,7 +61,8 @@ def bellman_backup(
 ) -> None:
     """What each state is worth under its best action, given what the states that follow are worth.
 
-        best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))),    (k, m) = outcomes_l(o)
+        best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))) - costs_l(a),
+        (k, m) = outcomes_l(o)
 
     There is one layer of values for each case; for one whose neurons remember, a layer for each class of the
     history. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
@@ -72,6 +74,7 @@ def bellman_backup(
         row_offsets: of the rows around a landing.
         outcomes: what an action can lead to in each layer: which landing, and which layer then.
         weights: of the outcomes, for each layer and action.
+        costs: of the trial of each action.
         remaining: iterations left after this one.
         lowest, highest: what no value can be outside of; interpolation near a cliff could pass them.
         best: filled, as `values`.
@@ -135,7 +138,7 @@ def bellman_backup(
             here = best[start : start + n_nodes]
             here[:] = f4(-np.inf)
             for action in range(n_actions):
-                worth[:] = f4(0)
+                worth[:] = -costs[layer, action]
                 for outcome in range(n_outcomes):
                     weight = weights[layer, action, outcome]
                     if weight != f4(0):
@@ -161,6 +164,7 @@ def look_ahead(
     layers: Int32[np.ndarray, " states"],
     outcomes: Int32[np.ndarray, "layers outcomes 2"],
     weights: Float32[np.ndarray, "layers actions outcomes"],
+    costs: Float32[np.ndarray, " actions"],
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
@@ -172,6 +176,7 @@ def look_ahead(
         row_offsets: of the rows around a landing.
         layers: of the states.
         outcomes, weights: as in `bellman_backup`, of the case's layers.
+        costs: of the trial of each action.
         remaining: iterations left after this one.
         chosen: filled.
     """
@@ -198,7 +203,7 @@ def look_ahead(
                     )
         highest = f4(-np.inf)
         for action in range(n_actions):
-            worth = f4(0)
+            worth = -costs[action]
             for outcome in range(n_outcomes):
                 worth += weights[layer, action, outcome] * landed[outcome]
             if worth > highest:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from animat.brief import briefly
+from animat.coding.electrode_pulses import electrode_pulses
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
@@ -17,7 +17,8 @@ from animat.evaluation.controls import Control, controls_of
 from animat.evaluation.coupling import ContextGap, best_coupling, context_gap, least_context_gap
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import Counted
-from animat.evaluation.rollouts import Episodes, networks_of, roll_out
+from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.row import Row
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
 from animat.evaluation.whose_work import WhoseWork, whose_work
@@ -32,51 +33,7 @@ from animat.robots.base import Robot
 from animat.robots.capabilities import lacking
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
-from animat.wrappers import NeuralObservation, ShuffledDelivery, unwrapped
-
-
-@dataclass(frozen=True, eq=False)
-class Row:
-    """One line of the table: who acted, and the returns.
-
-    Attributes:
-        name: `policies`, or the control.
-        meaning: what the control takes away, in a few words.
-        episodes: one row an actor.
-        changed: whether it was run in something else than the policies: another culture, or another delivery.
-    """
-
-    name: str
-    meaning: str
-    episodes: Episodes
-    changed: bool = False
-
-    @property
-    def mean_returns(self) -> Float64[np.ndarray, " actors"]:
-        """Each actor's mean return over its episodes: what the paper calls a policy's performance."""
-        return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The line as plain data."""
-        means = self.mean_returns
-        return {
-            "name": self.name,
-            "meaning": self.meaning,
-            "actors": len(means),
-            "episodes": self.episodes.returns.shape[1],
-            "mean_return": float(means.mean()),
-            # Over actors, as each is one sample; a control has one actor, whose episodes are the samples.
-            "standard_error": _standard_error(means if len(means) > 1 else self.episodes.returns[0]),
-            "mean_length": float(self.episodes.lengths.mean()),
-            "terminated_share": float(self.episodes.terminated.mean()),
-            "mean_returns": means.tolist(),
-            **self.met,
-        }
-
-    @property
-    def met(self) -> dict[str, Any]:
-        """How the goal was met (`animat.goals.tally.Outcome.means`); empty for a robot without one."""
-        return {} if self.episodes.outcome is None else self.episodes.outcome.means()
+from animat.wrappers import NeuralObservation, ShuffledDelivery, TrialCosts, unwrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +54,7 @@ class Evaluation:
         fixed_from_min: the recording whose percentiles the mapping keeps to, as in training; None where they move.
         objectives: of the robot's goal, as texts; none of a robot without one.
         whose_work: what the policies lose with each intervention; None where that was not asked for.
+        net_optimum: the optimal return less the cost of pulses, of any controller, where these cost something.
     """
 
     __repr__ = briefly
@@ -113,6 +71,7 @@ class Evaluation:
     context: ContextGap | None = None
     objectives: tuple[str, ...] = ()
     whose_work: WhoseWork | None = None
+    net_optimum: Optimum | None = None
 
     @property
     def context_score(self) -> Interval | None:
@@ -160,6 +119,8 @@ class Evaluation:
             "rows": [{**row.to_dict(), "normalised_score": self.score(row)} for row in self.rows],
             "optimum": None if self.optimum is None else self.optimum.to_dict(),
             "no_optimum": self.no_optimum,
+            "pulse_cost": self.rows[0].pulse_cost,
+            "net_optimum": None if self.net_optimum is None else self.net_optimum.to_dict(),
             "context": None if self.context is None else self.context.to_dict(),
             "context_score": None if self.context_score is None else self.context_score.to_dict(),
             "whose_work": None if self.whose_work is None else self.whose_work.to_dict(),
@@ -172,19 +133,23 @@ class Evaluation:
 
     def to_text(self) -> str:
         """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
-        first = self.rows[0].episodes.returns
+        first_row, first = self.rows[0], self.rows[0].episodes.returns
         on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
         if self.fixed_from_min is not None:
             on += f", percentiles fixed from {self.fixed_from_min:g} min"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         goal = MEANS if self.objectives else ()
-        head = ["", "mean return", "s.e.", "iterations", "ended early", *goal, "score", ""]
+        are_counted, cost = first_row.electrode_pulses is not None, first_row.pulse_cost
+        paid = [*["electrode_pulses"] * are_counted, *["net_return"] * bool(cost)]
+        names = [name.replace("_", " ") for name in paid]
+        head = ["", "mean return", "s.e.", "iterations", "ended early", *names, *goal, "score", ""]
         cells = []
         for row in self.rows:
             told, score = row.to_dict(), self.score(row)
             error = "" if told["standard_error"] is None else f"{told['standard_error']:.1f}"
             numbers = [f"{told['mean_return']:.1f}", error, f"{told['mean_length']:.1f}"]
             numbers.append(f"{100 * told['terminated_share']:.0f} %")
+            numbers += ["" if (given := told[name]) is None else f"{given:.1f}" for name in paid]
             numbers += cells_of(row.met) if goal else []
             cells.append([row.name, *numbers, "" if score is None else f"{score:.2f}", row.meaning])
         if self.optimum is None:
@@ -193,6 +158,8 @@ class Evaluation:
         lines = [f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each", *lined_up(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
+        if cost:
+            lines.append(f"  electrode pulses: in an episode; net return: mean return - {cost:g} x electrode pulses")
         if self.objectives:
             lines.append(f"  {told_satisfaction(self.objectives, self.rows[0].met)}")
         if self.verdict is not None:
@@ -222,6 +189,8 @@ class Evaluation:
             if changed:
                 meaning += f"; none for {' and '.join(changed)}, whose optimum is another"
         lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
+        if self.net_optimum is not None:
+            lines.append(f"  with the cost of pulses: {self.net_optimum.to_text()}")
         if self.context is not None:
             lines.append(f"  {self.context.to_text(self.context_score)}")
         return lines
@@ -264,7 +233,7 @@ def evaluate(
             seed or a resolution that is none.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
-    alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery")
+    alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery", "pulse_cost")
     first = first_of_alike(policies, alike, "evaluate it alone")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, which the policies were trained on, got {robot.name}")
@@ -312,14 +281,17 @@ def evaluate(
         acting.append(Control("coupling", "the best reflex: no memory, no goal", environment, simulator, reflex))
     if controls is None and (without := lacking(body).get("heuristic")):
         findings += (Finding("no-heuristic", "note", without),)
+    pulses = 1 if first.presentation is None else first.presentation.pulses
+    of_trials = electrode_pulses(first.conditions, pulses) if simulator is not None else None
     rows = []
     for each in acting:
         ran = roll_out(each.environment, each.simulator, each.actor, each.n_actors, episodes=episodes, seed=seed)
         changed = each.environment is not environment or each.simulator is not simulator
-        rows.append(Row(each.name, each.meaning, ran, changed))
+        given = None if of_trials is None else ran.presented @ of_trials * each.is_stimulated / episodes
+        rows.append(Row(each.name, each.meaning, ran, changed, given, first.pulse_cost))
         if progress is not None:
             progress.update(len(rows), steps, each.name)
-    optimum, no_optimum = None, None
+    optimum, no_optimum, net_optimum = None, None, None
     if optimum_resolution is not None:
         if progress is not None:
             progress.update(len(rows), steps, "optimal return")
@@ -329,6 +301,10 @@ def evaluate(
             )
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
+        if optimum is not None and first.pulse_cost and of_trials is not None:
+            costs = tuple(first.pulse_cost * count for count in of_trials)
+            costing = TrialCosts(unwrapped(environment), costs)
+            net_optimum = best_return(costing, simulator, resolution=optimum_resolution, seed=seed)
     context = None
     by_name = {each.name: each.episodes.returns[0] for each in rows}
     if {"coupling", "random"} <= set(by_name):
@@ -345,7 +321,7 @@ def evaluate(
         minute,
         tuple(policies),
         tuple(rows),
-        (*findings, *(() if optimum is None else optimum.findings())),
+        (*findings, *(finding for each in (optimum, net_optimum) if each is not None for finding in each.findings())),
         optimum,
         no_optimum,
         fixed_from_min,
@@ -362,6 +338,7 @@ def evaluate(
         )
         if interventions
         else None,
+        net_optimum,
     )
 
 
@@ -389,7 +366,3 @@ def _action_labels(policy: Policy) -> list[str]:
     if policy.mapping is not None:
         return [condition.label for condition in policy.conditions]
     return [] if policy.commands is None else [f"{command:+g}" for command in policy.commands]
-
-
-def _standard_error(samples: Float64[np.ndarray, " samples"]) -> float | None:
-    return float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None

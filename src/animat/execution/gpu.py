@@ -35,7 +35,8 @@ def find_gpu() -> str | None:
 def programs_among(tasks: Sequence[Task]) -> list[list[int]]:
     """Tasks that one program does, by their numbers: of each program; those that are in none stay on cores.
 
-    A program trains all policies of the same environment, settings and length; with lessons, of the same training.
+    A program trains all policies of the same environment, settings and length; with lessons or a cost of pulses, of
+    the same training.
     Bodies that are stepped outside JAX stay on cores.
     """
     from animat.execution.trains import Trains
@@ -46,7 +47,7 @@ def programs_among(tasks: Sequence[Task]) -> list[list[int]]:
         training = task.training if isinstance(task, Trains) else None
         if training is None or isinstance(training.robot, HostRobot):
             continue
-        of_its_own = training if training.is_varied else None
+        of_its_own = training if training.is_varied or training.pulse_cost else None
         program = (training.environment(_CONDITIONS), training.algorithm, training.rounds, of_its_own)
         same = next((numbers for other, numbers in programs if other == program), None)
         if same is None:

@@ -79,6 +79,10 @@ def check_plan(
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
     if training.neural_observation:
         raise InvalidArgument("neural_observation: expected False, as a live run shows none, got True")
+    if training.pulse_cost:
+        raise InvalidArgument(
+            f"pulse_cost: expected 0, as conditions of a live run do not differ in it, got {training.pulse_cost:g}"
+        )
     if training.lessons or training.assess:
         raise InvalidArgument("lessons, assess: expected none, as a live run has no end that is known, got some")
     if (n := training.robot.n_commands) > 1:

@@ -24,7 +24,10 @@ class Row:
         predicted: returns on the simulator, shape (episodes,).
         predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
         measured: returns of whole episodes on the culture, shape (episodes,).
-        pulses_per_action: that the culture was given, without the warm-up; so are the next three.
+        pulses_per_action: that the culture was given, without the warm-up; so is all that follows of the culture.
+        electrode_pulses: in whole episodes, on average; NaN without any. One for each electrode of each pulse.
+        predicted_electrode_pulses: in an episode on the simulator; None where conditions do not say.
+        pulse_cost: of an electrode pulse, in the units of the return.
         seconds_per_action: of the culture's time.
         bursts: share of responses that were.
         late: share of trials that came late.
@@ -39,6 +42,9 @@ class Row:
     predicted_anew: Float64[np.ndarray, " bootstraps"]
     measured: Float64[np.ndarray, " measured"]
     pulses_per_action: float
+    electrode_pulses: float
+    predicted_electrode_pulses: float | None
+    pulse_cost: float
     seconds_per_action: float
     bursts: float
     late: float
@@ -65,6 +71,17 @@ class Row:
         return between(value, measured - rng.choice(self.predicted_anew, len(measured)))
 
     @property
+    def net(self) -> float | None:
+        """Mean measured return less the cost of pulses; None where no episode came to its end."""
+        return float(self.measured.mean() - self.pulse_cost * self.electrode_pulses) if len(self.measured) else None
+
+    @property
+    def predicted_net(self) -> float | None:
+        """Mean predicted return less the cost of pulses; None where these are not known."""
+        given = self.predicted_electrode_pulses
+        return None if given is None else float(self.predicted.mean() - self.pulse_cost * given)
+
+    @property
     def gap_sign(self) -> Literal[-1, 0, 1]:
         """-1 where less was measured than predicted, 1 where more, 0 where that cannot be told."""
         if not len(self.measured):
@@ -85,6 +102,10 @@ class Row:
             "episodes": len(self.measured),
             "measured_returns": self.measured.tolist(),
             "pulses_per_action": self.pulses_per_action,
+            "electrode_pulses": self.electrode_pulses if measured else None,
+            "predicted_electrode_pulses": self.predicted_electrode_pulses,
+            "net": self.net,
+            "predicted_net": self.predicted_net,
             "seconds_per_action": self.seconds_per_action,
             "bursts": self.bursts,
             "late": self.late,

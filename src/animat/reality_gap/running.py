@@ -18,6 +18,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, expect_no_session
+from animat.coding.electrode_pulses import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
@@ -149,6 +150,7 @@ def run_policies(
         )
         findings += (Finding("few-predicted", "note", message),)
     account = account or Account()
+    of_trials = electrode_pulses(loop.conditions, loop.pulses)
 
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -229,7 +231,8 @@ def run_policies(
             best = _wait_for(optimum, progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
-    rows = _rows(agents, tuple(policies), predicted, session, outcomes(loop.robot, session))
+    met = outcomes(loop.robot, session)
+    rows = _rows(agents, tuple(policies), predicted, session, met, of_trials, first.pulse_cost)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
@@ -300,7 +303,7 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
         Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, or in how the
             simulators were made that they were trained on.
     """
-    alike = ("robot", "mapping", "readouts", "conditions", "presentation", "window_ms", "fitted")
+    alike = ("robot", "mapping", "readouts", "conditions", "presentation", "window_ms", "fitted", "pulse_cost")
     return first_of_alike(policies, alike, "run it alone")
 
 
@@ -332,10 +335,14 @@ def _rows(
     predicted: Mapping[str, Predicted],
     session: Session,
     came_to: Mapping[int, Outcome],
+    of_trials: tuple[float, ...] | None,
+    pulse_cost: float,
 ) -> tuple[Row, ...]:
+    unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
+
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         episodes = [episode for episode in session.episodes if episode.agent in of]
-        acted = [episode.acted for episode in episodes]
+        acted, whole = [episode.acted for episode in episodes], [each for each in episodes if each.is_whole]
         actions = max(1, sum(each.actions for each in acted))
         trials = max(1, sum(each.trials for each in acted))
         of_them = together([predicted[each] for each in of])
@@ -345,8 +352,13 @@ def _rows(
             meaning=meaning,
             predicted=of_them.returns,
             predicted_anew=of_them.anew,
-            measured=np.array([episode.total for episode in episodes if episode.is_whole], np.float64),
+            measured=np.array([episode.total for episode in whole], np.float64),
             pulses_per_action=sum(each.pulses for each in acted) / actions,
+            electrode_pulses=sum(each.acted.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
+            predicted_electrode_pulses=None
+            if of_trials is None
+            else float(of_them.presented @ of_trials) * (name not in unstimulated),
+            pulse_cost=pulse_cost,
             seconds_per_action=sum(each.pulses_s for each in acted) / actions,
             bursts=sum(each.bursts for each in acted) / trials,
             late=sum(each.late for each in acted) / trials,

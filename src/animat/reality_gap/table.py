@@ -98,6 +98,7 @@ class RealityGap:
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
             "optimum": self.optimum,
+            "pulse_cost": self.rows[0].pulse_cost,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
             "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
@@ -115,7 +116,7 @@ class RealityGap:
 
     def to_text(self) -> str:
         """A table for a terminal."""
-        cells, objectives = [], objectives_of(self.loop.robot)
+        cells, objectives, cost = [], objectives_of(self.loop.robot), self.rows[0].pulse_cost
         for row in self.rows:
             told, prediction = row.to_dict(), row.prediction
             anew = f"{prediction.low:.1f} to {prediction.high:.1f}"
@@ -128,6 +129,8 @@ class RealityGap:
                 *(cells_of(row.met) if objectives else []),
                 str(len(row.measured)),
                 f"{row.pulses_per_action:.1f}",
+                f"{row.electrode_pulses:.1f}" if len(row.measured) else "-",
+                *(["-" if net is None else f"{net:.1f}" for net in (row.predicted_net, row.net)] if cost else []),
             ]
             cells.append([row.name, f"{told['predicted']:.1f}", anew, *measured, *counts, p, row.meaning])
         interval = "95 % interval"
@@ -141,6 +144,8 @@ class RealityGap:
             *(MEANS if objectives else ()),
             "episodes",
             "pulses/action",
+            "electrode pulses",
+            *(("predicted net", "net") if cost else ()),
             "p",
             "",
         ]
@@ -156,6 +161,9 @@ class RealityGap:
             if self.gap_share is not None:
                 share = f"; the policies' gap is {100 * self.gap_share:+.0f} % of the range from random to it"
             lines.append(f"  the optimal return on this simulator is about {self.optimum:.1f}{share}")
+        if cost:
+            ignores = "" if self.optimum is None else "; the optimal return ignores the cost"
+            lines.append(f"  electrode pulses: in an episode; net: return - {cost:g} x electrode pulses{ignores}")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")

@@ -48,7 +48,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield from channel_findings(recording)
     yield from time_findings(recording)
     yield from _stimulus_rows(recording)
-    unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1)))
+    unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest))
     if unknown:
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))

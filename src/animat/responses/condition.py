@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 
 from animat.errors import InvalidArgument, shown
+from animat.stimulation.stimulus import NOTHING
 
 _LONGEST_LABEL = 10_000
 """A condition may be a set of very many electrodes, and its label names all of them."""
 _LARGEST_VALUE = 2.0**63
+RESTING = ((NOTHING,),)
+"""The electrodes of a condition that delivers nothing."""
 _MOST_LISTED = 5
 """Electrodes of a set that its label lists: the paper's patterns have as many."""
 
@@ -33,7 +36,7 @@ class Condition:
         frequencies_hz: of its presentations, each at one of them; empty: not known. That of a condition in Hz is its
             value.
         electrodes: sets of electrodes, each pulse on one of them; empty: not known; None: any of the culture's
-            patterns.
+            patterns; `RESTING`: nothing is delivered.
         only_last: of a presentation only the last pulse is on these electrodes, and those before are on any pattern.
 
     Raises:
@@ -82,7 +85,9 @@ class Condition:
             ) from error
         if self.unit != "Hz" and not all(0 < each <= _LARGEST_VALUE for each in frequencies_hz):
             raise InvalidArgument(f"condition {self.label}: expected positive frequencies, got {shown(frequencies_hz)}")
-        if not all(one and all(0 <= each < _LARGEST_VALUE for each in one) for one in electrodes or ()):
+        if electrodes != RESTING and not all(
+            one and all(0 <= e < _LARGEST_VALUE for e in one) for one in electrodes or ()
+        ):
             raise InvalidArgument(f"condition {self.label}: expected numbers of electrodes, got {shown(electrodes)}")
         if not isinstance(self.only_last, bool):
             raise InvalidArgument(f"condition.only_last: expected true or false, got {shown(self.only_last)}")
@@ -91,7 +96,9 @@ class Condition:
 
 
 def listed(electrodes: Sequence[int]) -> str:
-    """A set of electrodes in words: `"electrodes 909+23923"`."""
+    """A set of electrodes in words: `"electrodes 909+23923"`; `"no electrode"` where nothing is delivered."""
+    if (tuple(electrodes),) == RESTING:
+        return "no electrode"
     return f"electrode{'s' if len(electrodes) > 1 else ''} {'+'.join(map(str, electrodes))}"
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument
-from animat.responses.condition import Condition, abbreviated, listed
+from animat.responses.condition import RESTING, Condition, abbreviated, listed
 from animat.stimulation.protocol import Protocol
-from animat.stimulation.stimulus import Stimuli
+from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
@@ -154,15 +154,18 @@ class ByElectrode(Conditions):
         return "electrode" + (":" + ",".join("+".join(map(str, s)) for s in self.sets) if self.sets else "")
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Put each pulse to its set of electrodes; a pulse on no known electrode has no condition."""
+        """Put each pulse to its set of electrodes, a rest to `RESTING`; a pulse on no known one has no condition."""
         # Sorted rows make a set out of a list; a repeated electrode is one electrode.
         rows, row_of = np.unique(np.sort(stimuli.electrodes, axis=1), axis=0, return_inverse=True)
         set_of_row = [tuple(sorted(set(row.tolist()) - {UNKNOWN})) for row in rows]
-        sets = self.sets or tuple(sorted({s for s in set_of_row if s}, key=lambda s: (len(s), s)))
+        resting = RESTING if np.any(stimuli.is_rest) else ()
+        sets = self.sets or (*resting, *sorted({s for s in set_of_row if s}, key=lambda s: (len(s), s)))
         index_of = {electrodes: i for i, electrodes in enumerate(sets)}
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
+        index = index_of_row[row_of.reshape(-1)]
+        index[stimuli.is_rest] = index_of.get(RESTING[0], NO_CONDITION)
         found = [Condition(listed(electrodes), float(i), electrodes=(electrodes,)) for i, electrodes in enumerate(sets)]
-        return _recorded(stimuli, index_of_row[row_of.reshape(-1)], abbreviated(found))
+        return _recorded(stimuli, index, abbreviated(found))
 
 
 @dataclass(frozen=True)
@@ -187,7 +190,8 @@ class ByPattern(Conditions):
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Put each pulse to its pattern; unknown patterns, and ones not asked for, have no condition."""
-        patterns = np.array(self.patterns or np.unique(stimuli.pattern[stimuli.pattern != UNKNOWN]), dtype=np.int64)
+        is_known = (stimuli.pattern != UNKNOWN) & ~stimuli.is_rest
+        patterns = np.array(self.patterns or np.unique(stimuli.pattern[is_known]), dtype=np.int64)
         index = np.full(len(stimuli), NO_CONDITION)
         for i, pattern in enumerate(patterns):
             index[stimuli.pattern == pattern] = i
@@ -291,7 +295,7 @@ def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions
             sets = {frozenset(row) - {UNKNOWN} for row in stimuli.electrodes[rows].tolist()}
             electrodes = () if frozenset() in sets else tuple(sorted(tuple(sorted(one)) for one in sets))
         before = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
-        ours = {frozenset(one) for one in electrodes or ()}
+        ours = {frozenset(one) - {NOTHING} for one in electrodes or ()}
         only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in before)
         found.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
     return Assignment(index, tuple(found))

@@ -22,6 +22,8 @@ _NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", 
 """Of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
 _MOST_BYTES = 2**20
 MOST_READOUTS = 64
+USUAL_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
+"""By how many commands a robot takes."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -20,8 +20,11 @@ SITES = 8
 _MOST_BYTES = 2**20
 _MOST_PLACES = 1000
 
-Places = str | tuple[tuple[int, ...], ...]
-"""One of `NAMED`, or the electrodes of each place."""
+NONE: Literal["none"] = "none"
+"""The place without electrodes: its trials take their time, and nothing is delivered."""
+
+Places = str | tuple[tuple[int, ...] | Literal["none"], ...]
+"""One of `NAMED`, or the electrodes of each place, one of which may be `NONE`."""
 
 
 def check_places(given: Any) -> Places:
@@ -32,13 +35,14 @@ def check_places(given: Any) -> Places:
     """
     if isinstance(given, str) and given in NAMED:
         return given
-    is_listed = isinstance(given, list | tuple) and all(isinstance(place, list | tuple) and place for place in given)
-    if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in given for e in place):
+    groups = [place for place in given if place != NONE] if isinstance(given, list | tuple) else None
+    is_listed = groups is not None and all(isinstance(place, list | tuple) and place for place in groups)
+    if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in groups or () for e in place):
         raise InvalidArgument(
-            f"places: expected {', '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], got "
-            f"{shown(given)}"
+            f"places: expected {', '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], one of "
+            f'which may be "{NONE}", got {shown(given)}'
         )
-    places = tuple(tuple(sorted(set(place))) for place in given)
+    places = tuple(NONE if place == NONE else tuple(sorted(set(place))) for place in given)
     if len(set(places)) < len(places) or len(places) > _MOST_PLACES:
         raise InvalidArgument(f"places: expected at most {_MOST_PLACES:,} groups, each once, got {shown(given)}")
     return places
@@ -79,7 +83,7 @@ def electrodes_of(
     x_um: Float64[np.ndarray, " electrodes"],
     y_um: Float64[np.ndarray, " electrodes"],
 ) -> tuple[tuple[int, ...], ...]:
-    """The electrodes of each place on an array.
+    """The electrodes of each place on an array; none of `NONE`.
 
     Halves are those with the smaller and the larger x; each is cut by y for quadrants. Electrodes at the same x (or y)
     go by their numbers. Corners are what puts two commands, read from the halves, into all four corners: `SITES`
@@ -92,7 +96,7 @@ def electrodes_of(
         InvalidArgument: for named places of electrodes that are too few, or whose positions are not known.
     """
     if not isinstance(places, str):
-        return places
+        return tuple(() if place == NONE else place for place in places)
     known = np.isfinite(x_um) & np.isfinite(y_um)
     if not np.all(known) or len(electrodes) < count_places(places):
         missing = (

@@ -69,7 +69,7 @@ class Protocol:
         trials: at each frequency; each pattern is read equally often, in random order.
         places: groups of electrodes, `"corners"`, `"halves"` or `"quadrants"` (`animat.stimulation.places`), in place
             of patterns: each at each frequency is then a condition of its own, presented as often, all pulses on the
-            whole group.
+            whole group. One of the groups may be `"none"`: its trials deliver nothing.
         setup_s: before each block (mixed: before the one block), the time that setting up takes. Nothing is recorded
             meanwhile, and the recording's clock leaves it out.
         pause_s: recorded without stimuli before each block.

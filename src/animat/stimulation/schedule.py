@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument
 from animat.stimulation.protocol import Protocol
-from animat.stimulation.stimulus import Stimuli, Stimulus
+from animat.stimulation.stimulus import NOTHING, Stimuli, Stimulus
 from animat.tables import UNKNOWN
 
 TICK_S = 50e-6
@@ -111,7 +111,7 @@ def make_schedule(
         protocol: what to do.
         patterns: the culture's patterns, electrodes of each, padded with -1.
         seed: zero or more.
-        places: electrodes of each of the protocol's places, where it has any.
+        places: electrodes of each of the protocol's places, where it has any; of one that is none, none.
 
     Raises:
         InvalidArgument: if the culture has fewer patterns than the protocol uses, for other places than it has, or for
@@ -158,8 +158,8 @@ def _at_places(
 ) -> tuple[Block, ...]:
     """Blocks of which each presentation is all on one place; one that is a pattern of the culture has its number."""
     number_of = {frozenset(row) - {UNKNOWN}: number for number, row in enumerate(patterns.tolist())}
-    pattern = np.array([number_of.get(frozenset(place), UNKNOWN) for place in places])
-    electrodes = np.full((len(places), max(map(len, places))), UNKNOWN)
+    pattern = np.array([number_of.get(frozenset(place), UNKNOWN) if place else NOTHING for place in places])
+    electrodes = np.full((len(places), max((1, *map(len, places)))), UNKNOWN)
     for number, place in enumerate(places):
         electrodes[number, : len(place)] = place
     blocks, presentation = [], 0

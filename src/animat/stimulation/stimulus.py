@@ -14,7 +14,10 @@ from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
 from animat.stimulation.plain import number, seconds, whole_number
 from animat.stimulation.pulse import Pulse
-from animat.tables import FASTEST_HZ, expect_rising_times, freeze
+from animat.tables import FASTEST_HZ, UNKNOWN, expect_rising_times, freeze
+
+NOTHING = -2
+"""Stands for the pattern of a stimulus without electrodes, of the place `animat.stimulation.places.NONE`."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,13 @@ class Stimulus:
         electrodes: numbers on the array.
         pulse: what each electrode delivers.
         frequency_hz: the frequency it is presented at, NaN where it has none.
-        pattern: index of the pattern that the electrodes make, -1 where they make none.
+        pattern: index of the pattern that the electrodes make, -1 where they make none; `NOTHING` where nothing is
+            delivered.
         presentation: number of the presentation it belongs to.
 
     Raises:
-        InvalidArgument: for numbers of another type, a time in float32 among them, or what is no pulse.
+        InvalidArgument: for numbers of another type, a time in float32 among them, what is no pulse, or electrodes
+            where nothing is delivered.
     """
 
     time_s: float
@@ -57,6 +62,13 @@ class Stimulus:
         for name in ("pattern", "presentation"):
             if type(value := getattr(self, name)) is not int:
                 object.__setattr__(self, name, whole_number(name, value))
+        if self.pattern == NOTHING and self.electrodes:
+            raise InvalidArgument(f"electrodes: expected none where nothing is delivered, got {self.electrodes}")
+
+    @property
+    def is_rest(self) -> bool:
+        """Whether nothing is delivered; a stimulus that has no electrodes by mistake is none, and is refused."""
+        return self.pattern == NOTHING
 
 
 def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
@@ -94,7 +106,8 @@ class Stimuli:
     Attributes:
         time_s: start of each pulse on the recording's clock, shape (stimuli,).
         frequency_hz: the stimulus frequency it was presented at, NaN where it is not known, shape (stimuli,).
-        pattern: index of the stimulation pattern, `UNKNOWN` where it is not known, shape (stimuli,).
+        pattern: index of the stimulation pattern, `UNKNOWN` where it is not known, `NOTHING` where nothing was
+            delivered, shape (stimuli,).
         electrodes: electrodes pulsed together, padded with `UNKNOWN`, shape (stimuli, electrodes).
         presentation: number of the presentation each pulse belongs to; a response is read after the last pulse of a
             presentation, shape (stimuli,).
@@ -135,3 +148,8 @@ class Stimuli:
         last = np.ones(len(self), dtype=bool)
         last[:-1] = self.presentation[1:] != self.presentation[:-1]
         return last
+
+    @property
+    def is_rest(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether nothing was delivered, shape (stimuli,)."""
+        return (self.pattern == NOTHING) & np.all(self.electrodes == UNKNOWN, axis=1)  # type: ignore[no-any-return]

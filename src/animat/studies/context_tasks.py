@@ -13,6 +13,7 @@ from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import train_alone
 from animat.progress import InTurn, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
+from animat.responses.readouts import USUAL_READOUTS
 from animat.responses.responses import Responses
 from animat.studies.draws import draw_seed
 
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 SIMULATED, MEASURED = "simulated.json", "measured.json"
-READOUTS = {1: "all", 2: "halves"}
-"""By how many commands a robot takes."""
 
 
 @record
@@ -61,7 +60,7 @@ class ContextStudy:
                 raise InvalidArgument(f"{what}: expected at least one, each once, got {given}")
         for name in self.robots:
             robot = robot_named(name)
-            if robot.n_commands not in READOUTS or isinstance(robot, HostRobot):
+            if robot.n_commands not in (1, 2) or isinstance(robot, HostRobot):
                 raise InvalidArgument(f"robots: expected ones in JAX with one or two commands, got {name!r}")
 
 
@@ -141,7 +140,7 @@ class RobotTask(ContextTask):
         from animat.responses.series import extract_series
 
         recordings = read_sources([self.recordings(folder, self.n_commands)])
-        return extract_series(recordings, readouts=READOUTS[self.n_commands])
+        return extract_series(recordings, readouts=USUAL_READOUTS[self.n_commands])
 
     def drawn(self, what: str) -> int:
         """A seed of its own for each culture and robot: else sessions of all begin at the same few starts."""

@@ -46,11 +46,11 @@ def _in_short(study: Study, found: RanCultures) -> Section:
             ("mean second", "mean_second"),
             ("difference", "difference"),
             ("95 % interval", _interval),
-            ("larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
-            ("found better in", "found_better"),
+            ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
+            ("significantly better in", "found_better"),
         ],
         note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
-        "narrow of fewer than ten. Larger in: cultures in which the second arm's mean return is the larger one. Found "
+        "narrow of fewer than ten. Second mean larger in: cultures in which the second arm's mean return is the larger one. Significantly "
         f"better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
         beside=SUMMARY,
     )

@@ -215,6 +215,8 @@ def groups_of(
     training: Training, timeline: SimulatorTimeline | None, manifest: dict[str, Any], *, fewest: int = 1
 ) -> list[Group]:
     """All policies of a training in groups, `fewest` at least, that can go to other processes."""
+    # Where trials cost something and it is not known what, before any process begins.
+    training.environment_on(timeline)
     if timeline is not None:
         timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))
     return [

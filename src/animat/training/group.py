@@ -199,7 +199,7 @@ class SideBySide:
         self._groups = groups = (group, *others)
         self._places = [(each, member) for each in groups for member in each.members]
         self._own_simulators = len({each.fingerprint for each in groups}) > 1
-        self._environment = training.environment(0 if group.timeline is None else len(group.timeline.conditions))
+        self._environment = training.environment_on(group.timeline)
         self._course = None
         if training.is_varied:
             self._course = Course(training, self._environment, group.timeline, len(self._places))
@@ -327,6 +327,7 @@ def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> 
         presentation=timeline.presentation if timeline else None,
         readouts=timeline.readouts if timeline else ALL,
         neural_observation=training.neural_observation,
+        pulse_cost=training.pulse_cost,
         provenance=group.provenance,
         learning_curve=curve,
     )

@@ -35,7 +35,7 @@ from animat.training.sac import (
     uniforms_of,
 )
 from animat.training.settings import SAC
-from animat.wrappers import EpisodeLimit
+from animat.wrappers import EpisodeLimit, TrialCosts, costing, net_return
 
 
 class Acted(NamedTuple):
@@ -45,11 +45,13 @@ class Acted(NamedTuple):
         action: as drawn.
         command: that the body is to be moved by.
         neurons: what they remember after their answer.
+        cost: of the trial; None where trials cost nothing.
     """
 
     action: Array
     command: Float[Array, "environments *commands"]
     neurons: Float[Array, "environments 2"]
+    cost: Float[Array, " environments"] | None = None
 
 
 class Moved(NamedTuple):
@@ -95,10 +97,13 @@ def learn_and_act(
 
     before, (observation, reward, terminated, ended, begun) = learner.episodes, moved
     after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons)
+    net = reward
+    if acted.cost is not None:
+        after, net = costing(after, acted.cost), reward - acted.cost
     state, next_state = state_of(environment, before), state_of(environment, after)
     # Critics see the time left: at the limit the return ends. Where a body cut an episode off before, it goes on.
     is_last = terminated | (after.iteration >= environment.robot.episode_limit)
-    rows = transitions(settings, state, next_state, acted.action, reward, is_last)
+    rows = transitions(settings, state, next_state, acted.action, net, is_last)
     returns = learner.returns + reward
     finished = finished_alone(learner.exploration, ended, returns)
     learner = learner._replace(
@@ -107,9 +112,10 @@ def learn_and_act(
             robot=begun,
             iteration=jnp.where(ended, 0, after.iteration),
             neurons=jnp.where(ended[:, None], jnp.array(AT_FIRST, jnp.float32), after.neurons),
+            info=jax.tree.map(lambda cost: jnp.where(ended, 0.0, cost), after.info),
         ),
         returns=jnp.where(ended, 0.0, returns),
-        exploration=ended_episodes(learner.exploration, ended, returns),
+        exploration=ended_episodes(learner.exploration, ended, net_return(returns, after)),
         key=key,
     )
     available = jnp.minimum(written + settings.environments, settings.replay)
@@ -125,7 +131,10 @@ def _acted(
     action, exploration, noise = choose(environment, learner, observation, uniforms)
     responded = jax.vmap(environment.respond, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     return learner._replace(exploration=exploration), Acted(
-        action, responded.command, jnp.broadcast_to(responded.answer.history, (len(observation), 2))
+        action,
+        responded.command,
+        jnp.broadcast_to(responded.answer.history, (len(observation), 2)),
+        environment.of(responded.delivered) if isinstance(environment, TrialCosts) else None,
     )
 
 

@@ -29,7 +29,7 @@ def bytes_at_once(groups: Sequence[Group]) -> int:
         groups: that can be trained at once.
     """
     training, timeline = groups[0].training, groups[0].timeline
-    environment = training.environment(0 if timeline is None else len(timeline.conditions))
+    environment = training.environment_on(timeline)
     own_simulators = len({group.fingerprint for group in groups}) > 1
     compiled: tuple[Any, Any] = programs(environment, training.algorithm, own_simulators)
     beginning, chunk = compiled

@@ -33,6 +33,7 @@ from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
 from animat.training.provenance import expect_provenance
+from animat.training.settings import PulseCost
 from animat.writing import atomic_write
 
 FORMAT = "animat-policy-1"
@@ -73,6 +74,7 @@ class Policy:
         learning_curve: how it went, a row a chunk of training, columns as `CURVE`, shape (chunks, 6).
         readouts: what is read of the neurons, by the electrodes of each command.
         neural_observation: whether it sees what the neurons remember, too (`animat.wrappers.NeuralObservation`).
+        pulse_cost: what an electrode pulse cost while it was trained, in the units of the reward.
         assessments: iterations, minute of the simulators, lesson (from 1), share of successes (NaN where the robot does
             not tell) and mean return, a row each, shape (assessments, 5); none where it was not assessed.
         best: what it was at its best assessment, from the training; its own file has none, and lies in `best/`.
@@ -95,8 +97,10 @@ class Policy:
     neural_observation: bool = False
     assessments: Float[np.ndarray, "assessments 5"] = field(default_factory=lambda: np.zeros((0, 5)))
     best: Policy | None = None
+    pulse_cost: float = 0.0
 
     def __post_init__(self) -> None:
+        read_record(PulseCost, self.pulse_cost, "pulse_cost")
         self._expect_network()
         if self.window_ms is not None:
             check_window(read_record(tuple[Number, Number], self.window_ms, "window_ms"))
@@ -261,6 +265,8 @@ class Policy:
             "provenance": dict(self.provenance),
             "readouts": self.readouts.to_dict(),
             "neural_observation": self.neural_observation,
+            # Files of before have none, and those without a cost are as theirs.
+            **({"pulse_cost": self.pulse_cost} if self.pulse_cost else {}),
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
@@ -295,6 +301,7 @@ class Policy:
                 # Files of before read all channels as one, and their policies saw the robot alone.
                 readouts=Readouts.from_dict(described.get("readouts")),
                 neural_observation=described.get("neural_observation", False),
+                pulse_cost=described.get("pulse_cost", 0.0),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
             said = f"nothing called {error}" if isinstance(error, KeyError) else error

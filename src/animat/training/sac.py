@@ -30,7 +30,7 @@ from animat.robots.base import Robot
 from animat.training.exploration import Exploration, ended_episodes, explore, n_uniforms, nothing_held, paid_for_entropy
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
 from animat.training.settings import SAC
-from animat.wrappers import EpisodeLimit
+from animat.wrappers import EpisodeLimit, net_return, net_reward
 
 
 class Trained(NamedTuple):
@@ -82,6 +82,7 @@ class Batch(NamedTuple):
 class Finished(NamedTuple):
     """The policy's episodes that ended in a chunk of training: how many, and the sum of their returns, in task's units.
 
+    What trials cost (`animat.wrappers.TrialCosts`) is learned from, and not taken off here.
     Those in which actions were held (`animat.training.exploration`) are not among them.
     """
 
@@ -250,7 +251,8 @@ def _act(
     action, exploration, noise = choose(environment, learner, state[:, :-1], uniforms)
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = jnp.logical_or(*after.ended)
-    reward = shaped(environment.robot, settings, learner.episodes.robot, after.robot, after.reward, ended)
+    reward = net_reward(learner.episodes, after)
+    reward = shaped(environment.robot, settings, learner.episodes.robot, after.robot, reward, ended)
     rows = transitions(settings, state, state_of(environment, after), action, reward, ended)
 
     returns = learner.returns + after.reward
@@ -259,7 +261,7 @@ def _act(
         replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
         episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried),
         returns=jnp.where(ended, 0.0, returns),
-        exploration=ended_episodes(exploration, ended, returns),
+        exploration=ended_episodes(exploration, ended, net_return(returns, after)),
     )
     return learner, finished_alone(exploration, ended, returns)
 

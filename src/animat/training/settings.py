@@ -14,6 +14,8 @@ LEARNER = 2
 MOST_POLICIES = 1_000
 MOST_ITERATIONS = 2_000_000_000
 """Iterations are counted in 32 bits, with room for a last round of all environments."""
+PulseCost = Annotated[Number, Field(ge=0, le=1e6)]
+"""What an electrode pulse costs, in the units of a reward."""
 FORMER = {
     "updates": "gradient_steps",
     "follow": "tau",

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from animat.coding.decoder import expect_one_command
+from animat.coding.electrode_pulses import expect_electrode_pulses
 from animat.coding.mapping import Mapping, mapping_named, mapping_to_data, register_mapping
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
@@ -22,8 +23,8 @@ from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named
 from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
-from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
-from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery
+from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC, PulseCost
+from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
 Percentiles = Literal["moving", "first"]
 Shadowing = bool | Literal["drawn"]
@@ -77,6 +78,8 @@ class Training:
         commands: without neurons, the commands to pick from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
         lessons: ranges that episodes are drawn from, in turn; after a last one that goes on comes the task itself.
+        pulse_cost: what an electrode pulse costs, in the units of the reward: policies are trained on the rewards less
+            the costs of their trials (`animat.coding.electrode_pulses`). Returns that are reported are without.
         assess: episodes of the assessment at the end of each chunk, by which the best policy so far is kept; None:
             no assessments, but where lessons are gone on with 20.
 
@@ -98,6 +101,7 @@ class Training:
     algorithm: SAC = field(default_factory=SAC)
     lessons: tuple[Lesson, ...] = ()
     assess: int | None = None
+    pulse_cost: float = 0.0
 
     def __post_init__(self) -> None:
         for what, kind in (("robot", Robot), ("mapping", Mapping)):
@@ -123,6 +127,9 @@ class Training:
         expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
         if self.assess is not None:
             read_record(Annotated[Whole, Field(ge=1, le=MOST_EPISODES)], self.assess, "assess")  # type: ignore[arg-type]
+        read_record(PulseCost, self.pulse_cost, "pulse_cost")
+        if self.pulse_cost and self.mapping is None:
+            raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
         if self.shadowing == "drawn" and self.mapping is None:
             raise InvalidArgument("shadowing: expected True or False without neurons, got 'drawn'")
         if self.is_varied and isinstance(self.robot, HostRobot):
@@ -186,11 +193,24 @@ class Training:
             environment = ShuffledDelivery(environment)
         return NeuralObservation(environment) if self.neural_observation else environment
 
+    def environment_on(self, timeline: SimulatorTimeline | None) -> Environment[Any]:
+        """The same on a culture's simulators, with what the trials cost, where they do.
+
+        Raises:
+            UnusableData: for a cost, and conditions that do not say their electrodes.
+        """
+        environment = self.environment(0 if timeline is None else len(timeline.conditions))
+        if timeline is None or not self.pulse_cost:
+            return environment
+        pulses = 1 if timeline.presentation is None else timeline.presentation.pulses
+        of_each = expect_electrode_pulses(timeline.conditions, pulses)
+        return TrialCosts(environment, tuple(self.pulse_cost * count for count in of_each))
+
     def to_dict(self) -> dict[str, Any]:
         """The same as plain data, for a file."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         # Folders of before have none of these, and go on.
-        for name in ("neural_observation", "lessons", "assess"):
+        for name in ("neural_observation", "lessons", "assess", "pulse_cost"):
             if not plain[name]:
                 del plain[name]
         return plain | {

@@ -119,7 +119,9 @@ class RecordingView(View):
 def _message(whole: int, newest: Path, recording: Recording | None, *, running: bool, is_broken: bool) -> str:
     """How it stands, in words."""
     if is_broken:
-        return "the recording under way was broken off: what there is of it is shown, and does not count as a recording"
+        return (
+            "the recording under way was interrupted: what there is of it is shown, and does not count as a recording"
+        )
     if not running:
         return "1 recording" if whole == 1 else f"{whole} recordings"
     if newest.name != UNDER_WAY:
@@ -143,7 +145,7 @@ def _raster(recording: Recording, to_s: float | None, span_s: float) -> tuple[di
     first, last = np.searchsorted(recording.spike_times_s, (from_s, to_s))
     times_s, channels = recording.spike_times_s[first:last], recording.spike_channels[first:last]
     spikes, _ = packed_spikes(times_s, channels, from_s, to_s, len(recording.channels))
-    pulses_s = recording.stimuli.time_s
+    pulses_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
     pulses_s = pulses_s[(pulses_s >= from_s) & (pulses_s <= to_s)]
     every = f"; each {spikes['every']}th is drawn" if spikes["every"] > 1 else ""
     words = (

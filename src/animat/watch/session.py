@@ -11,6 +11,7 @@ from animat.closed_loop.gathering import LOG_FILE, STOP_FILE, unanswered_pulses
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
 from animat.errors import InvalidArgument, InvalidFile
+from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
 from animat.watch.blocks import duration
 from animat.watch.held import is_held
@@ -260,7 +261,7 @@ class SessionView(View):
             "time_s": number(tick.get("read_after_s")),
             "agent": text(tick.get("agent", "")),
             "handled": text(tick.get("handled", "")),
-            "pulse_time_s": numbers(tick.get("pulse_time_s")),
+            "pulse_time_s": [] if NOTHING in listed(tick.get("patterns")) else numbers(tick.get("pulse_time_s")),
             "command": numbers(tick.get("command")),
             "observation": numbers(tick.get("observation")),
             "readout_hz": numbers(tick.get("readout_hz")),

@@ -20,7 +20,7 @@ from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.told import in_words
-from animat.stimulation.stimulus import Stimuli
+from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
 UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
@@ -132,6 +132,7 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
     for column in range(columns):
         lengths[known[:, column]] = column + 1
     kept = np.arange(columns)[None, :] < lengths[:, None]
+    rests = f"; {NOTHING}: nothing was delivered" if np.any(stimuli.is_rest) else ""
     electrodes = VectorData(
         name="electrode_ids", description="electrodes on the array pulsed together", data=stimuli.electrodes[kept]
     )
@@ -140,7 +141,7 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
         # NWB demands an end; the pulse's length is not kept, and readers take an empty interval for a mistake.
         VectorData(name="stop_time", description="nominal: 1 us after start_time", data=stimuli.time_s + 1e-6),
         VectorData(name="frequency_hz", description="stimulus frequency; NaN: unknown", data=stimuli.frequency_hz),
-        VectorData(name="pattern", description="stimulation pattern; -1: unknown", data=stimuli.pattern),
+        VectorData(name="pattern", description=f"stimulation pattern; -1: unknown{rests}", data=stimuli.pattern),
         VectorData(
             name="presentation", description="presentation that the pulse belongs to", data=stimuli.presentation
         ),

@@ -17,6 +17,7 @@ from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, UnusableData
 from animat.goals.robot import robot_of
 from animat.report.film.scene import Moment, Scene
+from animat.stimulation.stimulus import NOTHING
 
 USUAL_S = 60.0
 """That are shown where nothing else is asked for."""
@@ -107,7 +108,8 @@ class _Reading:
     def _add_tick(self, tick: dict[str, Any]) -> None:
         before = self.moments[-1] if self.moments else None
         agent, episode = str(tick["agent"]), int(tick["episode"])
-        self.pulses_s += tick["pulse_time_s"]
+        is_rest = NOTHING in tick["patterns"]
+        self.pulses_s += () if is_rest else tick["pulse_time_s"]
         if before is None or before.episode != episode:
             # Of a session that is broken off before it moves nothing more is known than where it starts.
             start = Moment(tick["read_after_s"], agent, episode, -1, self._turns[agent], (), None, 0.0, "", math.nan)

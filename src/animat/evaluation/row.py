@@ -1,0 +1,72 @@
+"""A line of the table of policies and controls on a simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from animat.evaluation.rollouts import Episodes
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One line of the table: who acted, and the returns.
+
+    Attributes:
+        name: `policies`, or the control.
+        meaning: what the control takes away, in a few words.
+        episodes: one row an actor.
+        changed: whether it was run in something else than the policies: another culture, or another delivery.
+        electrode_pulses: that each actor gave in an episode, on average; None where conditions do not say.
+        pulse_cost: of one of them, in the units of the return.
+    """
+
+    name: str
+    meaning: str
+    episodes: Episodes
+    changed: bool = False
+    electrode_pulses: Float64[np.ndarray, " actors"] | None = None
+    pulse_cost: float = 0.0
+
+    @property
+    def mean_returns(self) -> Float64[np.ndarray, " actors"]:
+        """Each actor's mean return over its episodes: what the paper calls a policy's performance."""
+        return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
+
+    @property
+    def net_return(self) -> float | None:
+        """The mean return less the cost of pulses; None where these are not known."""
+        if self.electrode_pulses is None:
+            return None
+        return float(self.mean_returns.mean() - self.pulse_cost * self.electrode_pulses.mean())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The line as plain data."""
+        means, given = self.mean_returns, self.electrode_pulses
+        return {
+            "name": self.name,
+            "meaning": self.meaning,
+            "actors": len(means),
+            "episodes": self.episodes.returns.shape[1],
+            "mean_return": float(means.mean()),
+            # Over actors, as each is one sample; a control has one actor, whose episodes are the samples.
+            "standard_error": _standard_error(means if len(means) > 1 else self.episodes.returns[0]),
+            "mean_length": float(self.episodes.lengths.mean()),
+            "terminated_share": float(self.episodes.terminated.mean()),
+            "mean_returns": means.tolist(),
+            "electrode_pulses": None if given is None else float(given.mean()),
+            "net_return": self.net_return,
+            **self.met,
+        }
+
+    @property
+    def met(self) -> dict[str, Any]:
+        """How the goal was met (`animat.goals.tally.Outcome.means`); empty for a robot without one."""
+        return {} if self.episodes.outcome is None else self.episodes.outcome.means()
+
+
+def _standard_error(samples: Float64[np.ndarray, " samples"]) -> float | None:
+    return float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
