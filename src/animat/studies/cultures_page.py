@@ -50,8 +50,8 @@ def _in_short(study: Study, found: RanCultures) -> Section:
             ("significantly better in", "found_better"),
         ],
         note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
-        "narrow of fewer than ten. Second mean larger in: cultures in which the second arm's mean return is the larger one. Significantly "
-        f"better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
+        "narrow of fewer than ten. Second mean larger in: cultures in which the second arm's mean return is the larger "
+        f"one. Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
         beside=SUMMARY,
     )
     picture = Picture(

@@ -119,9 +119,7 @@ class RecordingView(View):
 def _message(whole: int, newest: Path, recording: Recording | None, *, running: bool, is_broken: bool) -> str:
     """How it stands, in words."""
     if is_broken:
-        return (
-            "the recording under way was interrupted: what there is of it is shown, and does not count as a recording"
-        )
+        return "the recording under way was interrupted: what there is of it is shown, and is no recording"
     if not running:
         return "1 recording" if whole == 1 else f"{whole} recordings"
     if newest.name != UNDER_WAY:
