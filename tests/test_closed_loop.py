@@ -281,7 +281,7 @@ def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_pat
 
     def may() -> bool:
         with ThreadPoolExecutor(1) as thread:
-            asked = thread.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(2))
+            asked = thread.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(1))
             return asked.exception() is None
 
     if real_time and not may():
@@ -299,7 +299,7 @@ def test_a_thread_that_is_left_alone_is_no_longer_ahead_of_other_programs() -> N
     began, may_end, policies = threading.Event(), threading.Event(), list[int]()
 
     def run() -> None:
-        with ahead_of_other_programs(2):
+        with ahead_of_other_programs(with_those_it_starts=False):
             policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
             began.set()
             may_end.wait(60)

@@ -245,13 +245,10 @@ def test_a_body_that_is_stepped_on_the_host_pays_too() -> None:
     np.testing.assert_allclose(free[:n, -2] - costing[:n, -2], SMALL.reward_scale * 0.25, atol=1e-6)
 
 
-def test_assessments_are_by_what_is_learned_from(tmp_path: Path, responses: Responses) -> None:
-    given: dict[str, Any] = {"policies": 1, "iterations": 960, "algorithm": SMALL, "assess": 3, "duration_min": 1.0}
-    dear = Training(Navigation(episode_limit=8), Thresholds(1), pulse_cost=1e4, **given)
-    policy = trained(dear, fit_timeline([responses]), tmp_path)["p0"]
-    tables = policy.assessments[:, 4]
-    # Nobody who gives a pulse in an episode has a return as low as that in the task's units.
-    assert np.all((tables < -1e3) | (tables > -500)) and np.nanmin(policy.learning_curve[:, 2]) > -1e3
+def test_assessments_are_of_the_task_alone_and_not_with_a_cost() -> None:
+    with pytest.raises(InvalidArgument, match="pulse_cost: expected 0 with assessments"):
+        Training(Navigation(), Thresholds(1), pulse_cost=0.1, assess=3)
+    Training(Navigation(), Thresholds(1), pulse_cost=0.0, assess=3)
 
 
 # --- what is asked for, and what travels --------------------------------------------------------------------------

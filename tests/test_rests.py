@@ -119,6 +119,16 @@ def test_rests_are_recorded_sorted_and_read_as_other_trials(pulses: int, tmp_pat
     assert [tuple(each) for each in dealt] == [((), NOTHING)] * pulses
 
 
+def test_after_an_emergency_stop_there_is_no_rest_either() -> None:
+    with FakeCulture() as culture:
+        culture.deliver([REST], 0.1)
+        culture.stop("seen enough")
+        with pytest.raises(UnsafeStimulus, match="an emergency stop is in force"):
+            culture.deliver([REST], 0.1)
+        # Looking on is no stimulation.
+        culture.deliver([], 0.1)
+
+
 def test_stimuli_on_unknown_electrodes_are_no_rests() -> None:
     recording = recorded(small_culture(), NONE)
     unknown = replace(recording.stimuli, pattern=np.full(12, -1))

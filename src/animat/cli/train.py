@@ -66,7 +66,7 @@ class Train(Fitting):
     neural_observation: bool = False
     """Policies see what the neurons remember too, trace and load of the last stimuli and responses"""
     pulse_cost: float = 0.0
-    """What each electrode that is pulsed costs, in the units of the reward: policies are trained on the rewards less
+    """What each electrode pulse costs, in the units of the reward: policies are trained on the rewards less
     that. For conditions that differ in how many electrodes they pulse (animat record --places FILE)"""
     lessons: Path | None = None
     """Lessons in turn, a TOML file: ranges of parameters, starts and recordings, and when to go on"""

@@ -146,7 +146,12 @@ class _Supervisor:
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
-        with told_instead(self._stop_for_a_person), _without_collector(), _switching_every(_SWITCH_S), self._ahead(1):
+        with (
+            told_instead(self._stop_for_a_person),
+            _without_collector(),
+            _switching_every(_SWITCH_S),
+            self._ahead(with_those_it_starts=True),
+        ):
             thread.start()
             try:
                 ending = self._watch(thread)
@@ -169,19 +174,22 @@ class _Supervisor:
         self._driver.is_stopped = True
         self._halt(ending)
         thread.join(_GRACE_S)
-        among_other_programs(thread)
+        if thread.is_alive():
+            among_other_programs(thread)
         self._halt(ending)
         return self._finish(ending)
 
     def _drive(self) -> None:
-        # Before the thread that writes, which would else have its turns on the same core.
-        with self._ahead(2):
+        # What the robot or an agent starts has no deadlines.
+        with self._ahead(with_those_it_starts=False):
             self._ending = self._driver.run()
 
-    def _ahead(self, priority: int) -> contextlib.AbstractContextManager[None]:
+    def _ahead(self, *, with_those_it_starts: bool) -> contextlib.AbstractContextManager[None]:
         """Ahead of other programs, if there are deadlines: what computes as fast as it can would leave them nothing."""
         has_deadlines = self._loop.real_time or self._culture.device is not None
-        return ahead_of_other_programs(priority) if has_deadlines else contextlib.nullcontext()
+        if not has_deadlines:
+            return contextlib.nullcontext()
+        return ahead_of_other_programs(with_those_it_starts=with_those_it_starts)
 
     def _watch(self, thread: threading.Thread) -> Ending | None:
         """Write and watch while the loop runs; returns why it must be ended from outside, None if it ended."""

@@ -40,18 +40,20 @@ class WallClock:
 
 
 @contextlib.contextmanager
-def ahead_of_other_programs(priority: int) -> Iterator[None]:
-    """Run the calling thread before all that has no deadline, where the system lets it; not those that it starts.
+def ahead_of_other_programs(*, with_those_it_starts: bool) -> Iterator[None]:
+    """Run the calling thread before all that has no deadline, where the system lets it.
 
-    Linux lets root, and whoever was given a real-time priority (`ulimit -r`). Elsewhere nothing changes.
+    Linux lets root, and whoever was given a real-time priority (`ulimit -r`). Elsewhere nothing changes. Threads that
+    are ahead take turns, also on a single core.
 
     Args:
-        priority: among threads that are ahead; the larger one comes first.
+        with_those_it_starts: whether threads and programs that it starts meanwhile are ahead, too.
     """
     before = None
     with contextlib.suppress(AttributeError, OSError):
         given = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        policy = os.SCHED_RR if with_those_it_starts else os.SCHED_RR | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(1))
         before = given
     try:
         yield

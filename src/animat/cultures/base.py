@@ -121,7 +121,10 @@ class Culture(Openable):
                 if since_s is not None and since_s != now_s:
                     request = request.counted_from(seconds("since_s", since_s), now_s)
                 # What is no pulse is nobody's to deliver: it comes neither to the guard nor to the backend.
-                admitted = guard.admit([each for each in request.stimuli if not each.is_rest], now_s)
+                pulses = [each for each in request.stimuli if not each.is_rest]
+                if request.stimuli and not pulses:
+                    guard.expect_not_stopped()
+                admitted = guard.admit(pulses, now_s)
                 return with_rests(self._deliver(admitted, request.duration_s), request.stimuli, now_s)
         except AnimatError as error:
             error.is_admitted = admitted is not None and len(admitted.stimuli) > 0

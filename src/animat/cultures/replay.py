@@ -160,7 +160,8 @@ class ReplayCulture(Culture):
         same = (frequency_hz == stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
         number_of, set_of_pulse = self._sets[row]
         electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
-        for narrower in (recording.stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
+        is_rest = recording.stimuli.is_rest == stimulus.is_rest
+        for narrower in (is_rest, recording.stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
             same = same & narrower if np.any(same & narrower) else same
         pool = np.flatnonzero(same)
         if not len(pool):

@@ -114,6 +114,11 @@ class Guard:
         self._delivered += len(events)
         return admitted
 
+    def expect_not_stopped(self) -> None:
+        """Refuse what goes on after an emergency stop (UnsafeStimulus)."""
+        if self._stopped is not None:
+            raise UnsafeStimulus("stopped", f"an emergency stop is in force ({self._stopped}): close and open again")
+
     def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> tuple[list[Event], dict[int, float]]:
         """What the stimuli are on the culture's clock, and the charge that is left on electrodes after them."""
         limits = self.limits
@@ -121,8 +126,7 @@ class Guard:
             return [], {}
         if not isfinite(now_s):
             raise InvalidArgument(f"now_s: expected a finite time on the culture's clock, got {now_s}")
-        if self._stopped is not None:
-            raise UnsafeStimulus("stopped", f"an emergency stop is in force ({self._stopped}): close and open again")
+        self.expect_not_stopped()
         if self._delivered + len(stimuli) > limits.stimuli_per_session:
             raise UnsafeStimulus(
                 "stimuli_per_session",

@@ -301,7 +301,8 @@ def evaluate(
             )
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
-        if optimum is not None and first.pulse_cost and of_trials is not None:
+        # Conditions of few responses would promise what is not there.
+        if optimum is not None and not optimum.left_out and first.pulse_cost and of_trials is not None:
             costs = tuple(first.pulse_cost * count for count in of_trials)
             costing = TrialCosts(unwrapped(environment), costs)
             net_optimum = best_return(costing, simulator, resolution=optimum_resolution, seed=seed)

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from animat.closed_loop.loop import Loop
 from animat.cultures.budget import Account
 from animat.reality_gap.calibration import Calibration
+from animat.responses.condition import RESTING
 from animat.responses.quality.drift import LARGE
 
 
@@ -69,12 +70,13 @@ def outlook(
             culture gets pulses then.
         now_min: on the culture's clock.
     """
+    gives = np.array([condition.electrodes != RESTING for condition in loop.conditions])
     interval_s = loop.pulses * np.array([condition.interval_s for condition in loop.conditions])
     total_s = pulses = 0.0
     for n, acted, is_stimulated in episodes:
         presented = acted + (loop.warm_up or 0) * is_stimulated
         total_s += n * (loop.pause_s + float(presented @ interval_s))
-        pulses += n * is_stimulated * loop.pulses * float(presented.sum())
+        pulses += n * is_stimulated * loop.pulses * float(presented[gives].sum())
     of, drift, since_min = account.budget.pulses, calibration.drift, calibration.start_min - now_min
     return Outlook(
         total_s / 60,

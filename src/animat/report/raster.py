@@ -45,7 +45,7 @@ def draw_raster(recording: Recording, responses: Responses) -> Figure:
 
 def _draw_stretch(axes: Axes, recording: Recording) -> None:
     """All channels over the time of the recording's middle six stimuli; without any, over the whole recording."""
-    times_s = recording.stimuli.time_s
+    times_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
     from_s, to_s = recording.start_s, max(recording.stop_s, recording.start_s + 1e-3)
     shown = times_s[max(0, len(times_s) // 2 - 3) : len(times_s) // 2 + 3]
     if len(shown):

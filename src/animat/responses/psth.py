@@ -82,7 +82,7 @@ def post_stimulus_histogram(
     if not (math.isfinite(bin_ms) and bin_ms > 0):
         raise InvalidArgument(f"bin_ms: expected a width above 0 ms, got {bin_ms:g}")
     table = recording.stimuli
-    times_s = table.time_s[table.is_last_of_presentation if stimuli is None else stimuli]
+    times_s = table.time_s[table.is_last_of_presentation & ~table.is_rest if stimuli is None else stimuli]
     # The small number keeps 70.000000001 bins from becoming 71.
     n_bins = max(1, math.ceil((to_ms - from_ms) / bin_ms - 1e-9))
     edges_ms = from_ms + bin_ms * np.arange(n_bins + 1)
@@ -134,7 +134,7 @@ def find_response(
     """
     table = recording.stimuli
     rate_hz, _ = spontaneous_rate(recording)
-    read = table.is_last_of_presentation if stimuli is None else stimuli
+    read = table.is_last_of_presentation & ~table.is_rest if stimuli is None else stimuli
     if not read.any() or math.isnan(rate_hz):
         return None
     gap_ms = 1e3 * np.append(np.diff(table.time_s), np.inf)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from animat.neurons.simulator import NeuronSimulator
 from animat.training.networks import Network, likeliest_action
 from animat.training.varied import Varied
-from animat.wrappers import EpisodeLimit, net_reward
+from animat.wrappers import EpisodeLimit
 
 
 def assess(
@@ -27,7 +27,7 @@ def assess(
         key: the same in each assessment of a training, so that policies and minutes compare.
 
     Returns:
-        of each episode the return, less what its trials cost where they do, and whether it succeeded.
+        of each episode the return, and whether it succeeded.
     """
     limited = EpisodeLimit(environment)
     of_starts, of_iterations = jax.random.split(key)
@@ -45,7 +45,7 @@ def assess(
             index + 1,
             after.carried,
             going & ~ends,
-            returns + jnp.where(going, net_reward(state, after), 0.0),
+            returns + jnp.where(going, after.reward, 0.0),
             succeeded,
         )
 

@@ -219,6 +219,7 @@ class _Chunks:
         anew = episodes._replace(
             robot=observation,
             iteration=jnp.zeros_like(episodes.iteration),
+            info=jax.tree.map(jnp.zeros_like, episodes.info),
             neurons=jnp.broadcast_to(jnp.array(AT_FIRST, jnp.float32), episodes.neurons.shape),
         )
         return learners._replace(episodes=anew, returns=jnp.zeros_like(learners.returns)), self._bodies

@@ -130,6 +130,10 @@ class Training:
         read_record(PulseCost, self.pulse_cost, "pulse_cost")
         if self.pulse_cost and self.mapping is None:
             raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
+        if self.pulse_cost and self.episodes_assessed:
+            raise InvalidArgument(
+                f"pulse_cost: expected 0 with assessments, which are by the task's own return, got {self.pulse_cost:g}"
+            )
         if self.shadowing == "drawn" and self.mapping is None:
             raise InvalidArgument("shadowing: expected True or False without neurons, got 'drawn'")
         if self.is_varied and isinstance(self.robot, HostRobot):

@@ -39,8 +39,7 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
     They are in the training's description and in an evaluation of its policies, which is empty where there is none.
     """
     training = mapped(manifest.get("training"))
-    own = {"robot": mapped(training.get("robot")).get("name"), "mapping": training.get("mapping")}
-    others = [name for name, value in own.items() if evaluation.get(name, value) != value]
+    others = [name for name in ("robot", "mapping") if _differs(training.get(name), evaluation.get(name))]
     if others:
         evaluation = {}
     rows = {str(row.get("name")): number(row.get("mean_return")) for row in map(mapped, listed(evaluation.get("rows")))}
@@ -63,6 +62,12 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
     if others:
         told += f" The evaluation.json in this folder is of another {' and '.join(others)}."
     return [(name, value) for name, value in known.items() if value is not None], told.strip()
+
+
+def _differs(described: Any, named: Any) -> bool:
+    """Whether what a training describes has another name in an evaluation; of a family only that is looked at."""
+    own = mapped(described).get("name") if isinstance(described, Mapping) else described
+    return isinstance(own, str) and isinstance(named, str) and own.partition(":")[0] != named.partition(":")[0]
 
 
 def learning_charts(

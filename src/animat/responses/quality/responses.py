@@ -11,6 +11,7 @@ from jaxtyping import Bool
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.responses.bursts import BurstSeparation
+from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment
 from animat.responses.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.quality.drift import drift_findings
@@ -179,6 +180,8 @@ def _dead_conditions(
     start_ms, end_ms = responses.window_ms
     dead, worst = [], math.inf
     for i, condition in enumerate(assignment.conditions if len(assignment.conditions) > 1 else ()):
+        if condition.electrodes == RESTING:
+            continue
         of = recording.stimuli.is_last_of_presentation & (assignment.condition == i)
         parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS, of)
         if parts.n_stimuli and _without_artefact(parts) <= per_stimulus * parts.n_stimuli:

@@ -47,7 +47,7 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
         window_ms: of the responses.
     """
     stimuli = recording.stimuli
-    read = stimuli.is_last_of_presentation
+    read = stimuli.is_last_of_presentation & ~stimuli.is_rest
     if not read.any():
         return
     gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
