@@ -119,6 +119,12 @@ def test_rests_are_recorded_sorted_and_read_as_other_trials(pulses: int, tmp_pat
     assert [tuple(each) for each in dealt] == [((), NOTHING)] * pulses
 
 
+@pytest.mark.parametrize("places", [["none"], ["none", []], ["none", "none"], ["nothing"]])
+def test_places_that_are_none_alone_are_refused(places: list[Any]) -> None:
+    with pytest.raises(InvalidArgument, match=r"^places: expected"):
+        check_places(places)
+
+
 def test_after_an_emergency_stop_there_is_no_rest_either() -> None:
     with FakeCulture() as culture:
         culture.deliver([REST], 0.1)

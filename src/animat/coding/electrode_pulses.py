@@ -39,7 +39,7 @@ def expect_electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tup
     if found is None:
         raise UnusableData(
             "pulse_cost: expected conditions that say the electrodes of all their pulses, got "
-            f"{', '.join(condition.label for condition in conditions)}; record with places and train on --conditions "
-            "electrode, or leave the cost out"
+            f"{', '.join(condition.label for condition in conditions)}; record places of several sizes, or leave the "
+            "cost out"
         )
     return found
