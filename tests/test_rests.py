@@ -119,8 +119,8 @@ def test_rests_are_recorded_sorted_and_read_as_other_trials(pulses: int, tmp_pat
     assert [tuple(each) for each in dealt] == [((), NOTHING)] * pulses
 
 
-@pytest.mark.parametrize("places", [["none"], ["none", []], ["none", "none"], ["nothing"]])
-def test_places_that_are_none_alone_are_refused(places: list[Any]) -> None:
+@pytest.mark.parametrize("places", [["none", []], ["none", "none"], ["nothing"]])
+def test_places_that_are_empty_or_twice_the_same_are_refused(places: list[Any]) -> None:
     with pytest.raises(InvalidArgument, match=r"^places: expected"):
         check_places(places)
 

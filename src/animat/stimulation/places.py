@@ -37,8 +37,6 @@ def check_places(given: Any) -> Places:
         return given
     groups = [place for place in given if place != NONE] if isinstance(given, list | tuple) else None
     is_listed = groups is not None and all(isinstance(place, list | tuple) and place for place in groups)
-    # A protocol that never stimulates is a mistake.
-    is_listed = is_listed and (bool(groups) or not given)
     if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in groups or () for e in place):
         raise InvalidArgument(
             f"places: expected {', '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], one of "
