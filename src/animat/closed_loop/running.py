@@ -186,8 +186,7 @@ class _Supervisor:
 
     def _ahead(self, *, with_those_it_starts: bool) -> contextlib.AbstractContextManager[None]:
         """Ahead of other programs, if there are deadlines: what computes as fast as it can would leave them nothing."""
-        has_deadlines = self._loop.real_time or self._culture.device is not None
-        if not has_deadlines:
+        if not self._loop.real_time and self._culture.device is None:
             return contextlib.nullcontext()
         return ahead_of_other_programs(with_those_it_starts=with_those_it_starts)
 
