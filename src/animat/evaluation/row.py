@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.evaluation.rollouts import Episodes
+from animat.evaluation.statistics import standard_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +47,15 @@ class Row:
     def to_dict(self) -> dict[str, Any]:
         """The line as plain data."""
         means, given = self.mean_returns, self.electrode_pulses
+        # Over actors, as each is one sample; a control has one actor, whose episodes are the samples.
+        samples = means if len(means) > 1 else self.episodes.returns[0]
         return {
             "name": self.name,
             "meaning": self.meaning,
             "actors": len(means),
             "episodes": self.episodes.returns.shape[1],
             "mean_return": float(means.mean()),
-            # Over actors, as each is one sample; a control has one actor, whose episodes are the samples.
-            "standard_error": _standard_error(means if len(means) > 1 else self.episodes.returns[0]),
+            "standard_error": standard_error(samples) if len(samples) > 1 else None,
             "mean_length": float(self.episodes.lengths.mean()),
             "terminated_share": float(self.episodes.terminated.mean()),
             "mean_returns": means.tolist(),
@@ -66,7 +68,3 @@ class Row:
     def met(self) -> dict[str, Any]:
         """How the goal was met (`animat.goals.tally.Outcome.means`); empty for a robot without one."""
         return {} if self.episodes.outcome is None else self.episodes.outcome.means()
-
-
-def _standard_error(samples: Float64[np.ndarray, " samples"]) -> float | None:
-    return float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
