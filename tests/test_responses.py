@@ -189,20 +189,21 @@ def test_agrees_with_plain_loops(
     assert len(responses) + left_out == np.count_nonzero(source.stimuli.is_last_of_presentation)
 
 
-def test_blocks_of_windows_give_the_same_channels(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    source = poisson(rng, rate_hz=50, n_channels=7, duration_s=20)
-    whole = extract_responses(source)
-    monkeypatch.setattr("animat.responses.windows._BLOCK", 30)
-    assert extract_responses(source).active_ratio.tolist() == whole.active_ratio.tolist()
-
-
 def poisson(rng: np.random.Generator, rate_hz: float, n_channels: int, duration_s: float) -> Recording:
     """Spikes at a constant rate whatever the stimulus, with a stimulus every 0.25 s."""
     n = rng.poisson(rate_hz * n_channels * duration_s)
     spikes = np.column_stack([np.sort(rng.uniform(0, duration_s, n)), rng.integers(0, n_channels, n)])
     stimulus_s = np.arange(0.5, duration_s - 0.5, 0.25)
     return recording(spikes, stimulus_s, n_channels, duration_s, frequency_hz=np.full(len(stimulus_s), 4.0))
+
+
+def test_active_channels_are_those_with_a_spike_in_the_window() -> None:
+    source = poisson(np.random.default_rng(0), rate_hz=50, n_channels=7, duration_s=20)
+    responses, times_s = extract_responses(source), source.spike_times_s
+    assert responses.time_s is not None
+    for stimulus_s, ratio in zip(responses.time_s, responses.active_ratio, strict=True):
+        inside = (times_s >= stimulus_s + 0.002) & (times_s < stimulus_s + 0.01)
+        assert ratio == len(set(source.spike_channels[inside].tolist())) / 7
 
 
 def test_poisson_spikes_give_their_rate() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -101,7 +102,7 @@ class Driver:
 
     def stopped_by_file(self) -> Ending | None:
         """The ending that a person asks for by a file, if they do."""
-        is_there = self._stop_file.exists()
+        is_there = os.access(self._stop_file, os.F_OK)
         return Ending("person", f"stopped by a person (the file {self._stop_file.name})") if is_there else None
 
     def run(self) -> Ending:

@@ -14,8 +14,6 @@ from animat.errors import InvalidArgument
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
 
-_BLOCK = 1 << 26
-
 
 class Spiking(Protocol):
     """Spikes on channels, in the order of time: a `Recording`, or the piece of one that a closed loop has just seen.
@@ -51,9 +49,14 @@ def read_windows(
     """
     from_s, to_s = after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3
     n_channels = len(recording.channels)
-    spikes = count_spikes(recording, from_s, to_s)
+    first, spikes = _first_and_count(recording, from_s, to_s)
     rate_hz = spikes / ((window_ms[1] - window_ms[0]) * 1e-3 * n_channels)
-    return rate_hz, count_active_channels(recording, from_s, to_s) / n_channels
+    active = np.zeros(len(spikes))
+    for window, (start, count) in enumerate(zip(first.tolist(), spikes.tolist(), strict=True)):
+        is_active = np.zeros(n_channels, np.bool_)
+        is_active[recording.spike_channels[start : start + count]] = True
+        active[window] = np.count_nonzero(is_active)
+    return rate_hz, active / n_channels
 
 
 def check_window(window_ms: tuple[float, float]) -> None:
@@ -81,33 +84,22 @@ def count_spikes(
     Args:
         from_s, to_s: the windows, in seconds on the recording's clock, shape (windows,).
     """
-    times_s = recording.spike_times_s
-    return np.searchsorted(times_s, to_s, side="left") - np.searchsorted(times_s, from_s, side="left")
-
-
-def count_active_channels(
-    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
-) -> Int64[np.ndarray, " windows"]:
-    """The number of channels with at least one spike in each window; edges and arguments as in `count_spikes`."""
-    n_channels = len(recording.channels)
-    active = np.zeros(len(from_s), dtype=np.int64)
-    # One mark a window and channel, in blocks of windows so that a long recording does not fill the memory.
-    block = max(1, _BLOCK // max(n_channels, 1))
-    for start in range(0, len(from_s), block):
-        rows = slice(start, start + block)
-        window, spike = spikes_in(recording, from_s[rows], to_s[rows])
-        marked = np.zeros((len(from_s[rows]), n_channels), dtype=bool)
-        marked[window, recording.spike_channels[spike]] = True
-        active[rows] = marked.sum(axis=1)
-    return active
+    return _first_and_count(recording, from_s, to_s)[1]
 
 
 def spikes_in(
     recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
 ) -> tuple[Int64[np.ndarray, " pairs"], Int64[np.ndarray, " pairs"]]:
     """All pairs of a window and a spike in it, as rows of both; edges and arguments as in `count_spikes`."""
-    first = np.searchsorted(recording.spike_times_s, from_s, side="left")
-    counts = np.searchsorted(recording.spike_times_s, to_s, side="left") - first
+    first, counts = _first_and_count(recording, from_s, to_s)
     # The spikes of window i are first[i], first[i] + 1, ...: count up over all, restarting at each window.
     spike = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
     return np.repeat(np.arange(len(counts)), counts), spike
+
+
+def _first_and_count(
+    recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
+) -> tuple[Int64[np.ndarray, " windows"], Int64[np.ndarray, " windows"]]:
+    """The number of the first spike of each window, and how many there are; edges as in `count_spikes`."""
+    first = recording.spike_times_s.searchsorted(from_s)
+    return first, recording.spike_times_s.searchsorted(to_s) - first
