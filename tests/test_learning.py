@@ -66,11 +66,11 @@ CULTURES = (1, 2, 3)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[int, SimulatorTimeline]:
-    """Each virtual culture's simulator at 0 min."""
+    """The simulator at 0 min of each culture; one with memory would tell the optimum what policies do not see."""
     timelines = {}
     for seed in CULTURES:
         folder = tmp_path_factory.mktemp(f"culture{seed}")
-        assert animat(["record", "--seed", str(seed), "--sessions", "1", "--out", str(folder)]) == 0
+        assert animat(["record", "--paper", "--seed", str(seed), "--sessions", "1", "--out", str(folder)]) == 0
         timelines[seed] = fit_timeline(extract_series(read_recordings(folder)))
     return timelines
 
