@@ -7,6 +7,7 @@ from pathlib import Path
 from animat.report.html import Picture, Section, cell, table_of, write_page
 from animat.report.over_cultures import Compared, draw_over_cultures
 from animat.report.style import FORMATS, save_figure
+from animat.studies.arms import arms_shown, many_arms
 from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
 from animat.studies.places import REPORT
 from animat.studies.specification import Study
@@ -24,7 +25,7 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         sections.append(_in_short(study, found))
     sections.append(_each(found))
     cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
-    lead = f"{cultures}; {len(study.arms)} arms with {study.policies} policies each on every one."
+    lead = f"{cultures}. {many_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
 
 
@@ -62,7 +63,7 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         f"{len(found.comparisons)} cultures.",
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
-    return Section("Results in short", (), points, (table,), (picture,))
+    return Section("Results in short", (), points, (arms_shown(study), table), (picture,))
 
 
 def _interval(row: OverCultures) -> str:
