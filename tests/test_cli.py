@@ -592,6 +592,7 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --neural-observation --mapping none", "--neural-observation: expected True only with a mapping"),
         ("train --shadowing drawn --mapping none", "--shadowing: expected a mapping with 'drawn', got none"),
         ("train --goal higher", "--goal: 'higher': expected avoid"),
+        ("inspect --optimum unicycle .", "--optimum: expected one of arm, cartpole"),
         ("record --interval-min -1", "--interval-min: expected more than 0 minutes"),
         ("reproduce --workers 0", "--workers: expected at least 1, got 0"),
         ("reproduce --seed -1", "--seed: expected at least 0, got -1"),
