@@ -22,6 +22,8 @@ from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arms_shown, what_parts
+from animat.studies.cultures import OverCultures, RanCultures
+from animat.studies.cultures_page import _in_short
 from animat.studies.differences import came_out_otherwise, decisions, explain
 from animat.studies.learned import beside_the_optimum, known_of, learned_of
 from animat.studies.optima import kinds_of, rough_kinds
@@ -96,6 +98,16 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     ]
     assert parts["control"] == ["In “control” the delivered stimulus is drawn at random, whatever the policy chooses."]
     assert [each.split("”")[0] for each in parts["linear"]] == ["In “linear", "In “1 threshold"]
+
+
+def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
+    names = [("control and 1 threshold", robot) for robot in ("cartpole", "navigation")]
+    rows = [OverCultures(*name, 4, 1.0, 2.0, 1.0, None, None, larger_in=4, holds_in=4, tested=4) for name in names]
+    section = _in_short(paper_study(), RanCultures(Path(), {}, {}, {}, tuple(rows), None))
+    (_, first), (_, second) = section.points
+    assert first.endswith("In “control” the delivered stimulus is drawn at random, whatever the policy chooses.")
+    assert first.startswith(second)
+    assert section.tables[0].title == "The arms"
 
 
 def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
